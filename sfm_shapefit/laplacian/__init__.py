@@ -1,0 +1,1 @@
+"""Linear algebra of view graphs; knows nothing of cameras."""

@@ -1,0 +1,69 @@
+"""What the solver is told and what it answers: `SolverOptions`, `Status`, `SolverResult`.
+
+Pure data, no numerics, so that the command line, the tests and the benchmark can import it cheaply.
+"""
+
+import enum
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from sfm_shapefit.arrays import FloatArray
+
+Method = Literal["auto", "conic"]
+
+
+class Status(enum.Enum):
+    """Why the solver stopped; the value is the sentence shown to the user."""
+
+    CONVERGED = "the certified gap is below the tolerance"
+    INACCURATE = "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
+    MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SolverOptions:
+    """Settings of one solve. Unit-free: the program fixes its own scale."""
+
+    method: Method = "auto"
+    """Which solver: "conic" is the generic conic program through cvxpy and Clarabel; "auto" picks."""
+    tol: float = 1e-8
+    """The certified gap, objective - dual_bound, at which a solve counts as converged."""
+    max_iterations: int = 200
+    """Hard limit; reaching it is reported in `SolverResult.status`, never silent."""
+
+    def __post_init__(self) -> None:
+        if self.method not in get_args(Method):
+            raise ValueError(f"SolverOptions.method must be one of {get_args(Method)}, got {self.method!r}")
+        if not 0.0 < self.tol < 1.0:
+            raise ValueError(f"SolverOptions.tol must lie in (0, 1), got {self.tol}")
+        if self.max_iterations < 1:
+            raise ValueError(f"SolverOptions.max_iterations must be >= 1, got {self.max_iterations}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SolverResult:
+    """A solve's answer together with the evidence that it is one."""
+
+    locations: FloatArray
+    """(n, d) camera centres with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
+    status: Status
+    objective: float
+    """R(T) / L(T) of the paper at `locations`: a length-weighted mean tangent of the angular errors."""
+    dual_bound: float
+    """Value of the feasible dual point `dual`: no locations have an objective below it."""
+    dual: FloatArray
+    """(m, d) y_e, orthogonal to v_e, ||y_e|| <= w_e; at every camera the sum of signed y_e equals
+    dual_bound times the sum of signed w_e v_e."""
+    equality_residual: float
+    """Largest violation of that equality at a camera, relative to the largest weighted degree."""
+    iterations: int
+    seconds: float
+    method: str
+    """The solver that ran."""
+    method_reason: str
+    """Why it was chosen."""
+
+    @property
+    def gap(self) -> float:
+        """How far `objective` may be above the optimum, in the same dimensionless scale."""
+        return self.objective - self.dual_bound
