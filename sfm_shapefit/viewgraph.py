@@ -59,7 +59,9 @@ class ViewGraph:
         """
         edge_array, direction_array, weight_array = _checked_arrays(num_cameras, edges, directions, weights)
         if names is not None and len(names) != num_cameras:
-            raise InputError(f"the graph has {num_cameras} cameras but {len(names)} names; give one name each")
+            raise InputError(
+                f"the graph has {num_cameras} cameras but {len(names)} names; give one name each"
+            )
         edge_array, direction_array, weight_array = _merge_duplicates(
             edge_array, direction_array, weight_array
         )
@@ -165,9 +167,9 @@ def _merge_duplicates(
     weight = np.bincount(target, weights=weights, minlength=len(kept))
     length = np.linalg.norm(total, axis=1)
     _refuse(
-        length < 1e-9 * weight, edges[kept], "is given several times with directions that cancel; keep one"
+        np.asarray(length < 1e-9 * weight), edges[kept], "is given several times with directions that cancel; keep one"
     )
     # A pair given once keeps its direction to the last bit.
     single = np.bincount(target, minlength=len(kept)) == 1
     merged = np.where(single[:, None], directions[kept], total / length[:, None])
-    return edges[kept], merged, weight
+    return edges[kept], np.asarray(merged, dtype=np.float64), weight.astype(np.float64)

@@ -1,0 +1,1 @@
+"""Places the cameras of a COLMAP model from known rotations: certified, explained, deterministic."""
