@@ -1,7 +1,4 @@
-"""The core: solvers of the ShapeFit program, and the certificate of what they return.
-
-No input or output, no log, no random draw.
-"""
+"""The one entry to the solvers: check the graph, choose a method, solve, certify."""
 
 import time
 
@@ -12,11 +9,9 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import is_parallel_rigid
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.options import Method, SolverOptions, SolverResult, Status
+from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
 from sfm_shapefit.solver.program import normalized_locations, projected_length, scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
-
-__all__ = ["Certificate", "Method", "SolverOptions", "SolverResult", "Status", "certify", "solve"]
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
 
