@@ -227,7 +227,7 @@ def test_too_few_iterations_are_reported_not_hidden():
 
 
 def test_graphs_that_determine_nothing_are_refused_with_the_reason():
-    t, edges, v = tetrahedron()
+    _, edges, v = tetrahedron()
     with pytest.raises(UnsolvableError, match="no pair"):
         solve(ViewGraph(3, np.empty((0, 2), dtype=int), np.empty((0, 3))))
     with pytest.raises(UnsolvableError, match="2 connected components"):
