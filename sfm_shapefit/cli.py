@@ -248,15 +248,15 @@ def locate_command(
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:
-            _print_table(f"{found.graph.num_cameras} images of {source}", _locate_table(found, target))
+            _print_table(f"{len(found.model.names)} images of {source}", _locate_table(found, target))
 
 
 def _locate_table(found: "LocateResult", out: Path) -> Text:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results import camera_rows, summary
+    from sfm_shapefit.results import summary
 
     facts = summary(found)
-    left_out = [f"{row.name}: {row.reason}" for row in camera_rows(found) if not row.placed]
+    left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     pairs = ", ".join(
         f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count
     )

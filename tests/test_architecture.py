@@ -20,6 +20,7 @@ LAYERS = [
     "solver",
     "directions",
     "robust",
+    "placement",
     "gauge",
     "evaluation",
     "synthetic",
