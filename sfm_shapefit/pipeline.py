@@ -22,10 +22,12 @@ from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_g
 from sfm_shapefit.directions import PairDirections, concatenate, estimate_directions, from_relative_poses
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.evaluation import Evaluation, evaluate_poses
+from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
-from sfm_shapefit.results import Inputs, LocateResult, quality_warnings
+from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
+from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -244,6 +246,26 @@ def _warnings(matches: MatchDatabase | None, placement: Placement) -> Iterator[s
     if matches is not None and matches.unmatched_names:
         names = matches.unmatched_names
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
+
+
+def solve_graph_file(path: Path | str, options: SolverOptions | None = None) -> GraphResult:
+    """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
+
+    Args:
+        path: a text file, see `formats.read_graph`.
+        options: settings of the solver; defaults if None.
+
+    Raises:
+        InputError: if the file is malformed; the message names the line.
+        UnsolvableError: if the directions determine nothing.
+    """
+    options = options or SolverOptions()
+    clock = _Clock(lambda _stage, _done, _total: None)
+    with clock("read"):
+        graph = read_graph(path)
+    with clock("solve"):
+        placement = place(graph, options)
+    return GraphResult(path=Path(path), options=options, placement=placement, timings_s=clock.seconds)
 
 
 def evaluate(

@@ -113,7 +113,7 @@ def _location_sigmas(
     blocks = information[rows] / np.maximum(lengths, 1e-12 * lengths.max())[:, None, None] ** 2
     variances_of = _dense_variances if t.size <= _DENSE_UNKNOWNS else _sampled_variances
     variances = variances_of(len(held), edges, blocks, _gauge_directions(t))
-    found = np.sqrt(np.maximum(variances, 0.0)).reshape(-1, 3)
+    found = np.sqrt(np.maximum(variances, 0.0)).reshape(t.shape)
     is_loose = (found > np.ptp(t, axis=0).max()).any(axis=1)
     sigmas[held] = np.where(is_loose[:, None], np.inf, found)
     return sigmas

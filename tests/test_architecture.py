@@ -15,6 +15,7 @@ LAYERS = [
     "jit",
     "geometry",
     "viewgraph",
+    "formats",
     "rigidity",
     "laplacian",
     "solver",
