@@ -23,11 +23,12 @@ from typing import Any, Literal
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
 from sfm_shapefit.laplacian.dense import (
     FLAGS,
+    one_blas_thread,
     potrf,
     routine_addresses,
     syrk,
@@ -130,13 +131,8 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
     grounding = float(traces.mean()) if ground is None else ground
     traces[-1] += grounding
     pivot = np.empty(2)
-    failed = _factorise(
-        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.rows, plan.relative,
-        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets,
-        plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
-        w, diagonal, factor.panels, factor._stack, pivot,
-        routine_addresses(factor.dtype), FLAGS, work_integers(), work_scalars(factor.dtype),
-    )  # fmt: skip
+    with one_blas_thread():
+        failed = _run(factor, w, pivot)
     factor.smallest_pivot = float(pivot[0])
     factor.weakest_node = int(plan.permutation[int(pivot[1]) // b])
     if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(factor.dtype).eps:
@@ -144,6 +140,19 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
             f"the Laplacian is singular at node {factor.weakest_node} (relative pivot {pivot[0]:.1e}); "
             "the graph is disconnected or not rigid there, or its weights are not positive"
         )
+
+
+def _run(factor: CholeskyFactor, w: FloatArray, pivot: FloatArray) -> bool:
+    """Call the kernel with everything that it needs."""
+    plan, b, diagonal = factor.symbolic, factor.block, factor._diagonal
+    failed: bool = _factorise(
+        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.rows, plan.relative,
+        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets,
+        plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
+        w, diagonal, factor.panels, factor._stack, pivot,
+        routine_addresses(factor.dtype), FLAGS, work_integers(), work_scalars(factor.dtype),
+    )  # fmt: skip
+    return failed
 
 
 @kernel(exact=True)
@@ -173,7 +182,7 @@ def _sum_at_nodes(
                 diagonal[j, a] += w
 
 
-@kernel()
+@kernel(exact=True)
 def _factorise(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, relative: Any,
     panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any,
@@ -228,7 +237,7 @@ def _factorise(
     return False
 
 
-@kernel()
+@kernel(exact=True)
 def _assemble_edges(
     panel: Any, height: int, b: int, begin: int, end: int, index: Any, row: Any, column: Any, weights: Any
 ) -> None:
@@ -241,7 +250,7 @@ def _assemble_edges(
                 panel[at + a] -= weights[e, c * b + a]
 
 
-@kernel()
+@kernel(exact=True)
 def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, diagonal: Any) -> None:
     """Add the diagonal blocks of the nodes start..stop-1 to a panel."""
     for q in range(stop - start):
@@ -251,7 +260,7 @@ def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, d
                 panel[at + a] += diagonal[start + q, c * b + a]
 
 
-@kernel()
+@kernel(exact=True)
 def _check_pivots(
     panel: Any, height: int, width: int, b: int, start: int, diagonal: Any, pivot: Any
 ) -> None:
@@ -264,7 +273,7 @@ def _check_pivots(
             pivot[1] = start * b + k
 
 
-@kernel()
+@kernel(exact=True)
 def _add_update(
     update: Any, there: Any, b: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
@@ -285,14 +294,16 @@ def _add_update(
             source = (j * b + c) * size * b
             into = ((there[j] - lowest) * b + c) * leading
             i = j
+            skip = c  # the part of the diagonal block above the diagonal was never written
             while i < size:
                 count = (run_end[i] - i) * b
                 at = into + (there[i] - lowest) * b
-                _add(target[at : at + count], update[source + i * b : source + i * b + count])
+                _add(target[at + skip : at + count], update[source + i * b + skip : source + i * b + count])
                 i = run_end[i]
+                skip = 0
 
 
-@kernel()
+@kernel(exact=True)
 def _add(target: Any, values: Any) -> None:
     """Add one contiguous vector to another."""
     for i in range(len(target)):
@@ -306,182 +317,198 @@ def _solve(factor: CholeskyFactor, rhs: FloatArray) -> FloatArray:
     if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
         raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
     given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
-    x = np.empty((3, n * b), dtype=factor.dtype)
-    work = np.empty((3, int(np.max(np.diff(plan.row_pointers) + np.diff(plan.first), initial=1)) * b),
-                    dtype=factor.dtype)  # fmt: skip
+    heights = np.diff(plan.row_pointers) + np.diff(plan.first)
+    x = np.empty((n * b, 3), dtype=factor.dtype)
+    work = np.empty((3, int(np.max(heights, initial=1)) * b), dtype=factor.dtype)
     out = np.empty_like(given)
     for k in range(0, given.shape[1], 3):
-        columns = given[:, k : k + 3]
-        _gather(columns, plan.permutation, b, x)
-        _forward(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x, work)
-        _backward(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x, work)
+        _gather(given[:, k : k + 3], plan.permutation, b, x)
+        _substitute(
+            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x, work,
+            _leaves(factor.dtype), np.empty(3, np.int64), np.empty(12, factor.dtype),
+        )  # fmt: skip
         _scatter(x, plan.permutation, b, out[:, k : k + 3])
     return out.reshape(np.shape(rhs))
 
 
-@kernel()
+def _leaves(dtype: np.dtype[Any]) -> IntArray:
+    """Return the addresses of `_subtract_four` and `_multiply_four` for float32 or float64."""
+    addresses = [leaf_address(leaf, dtype, 3) for leaf in (_subtract_four, _multiply_four)]
+    return np.array(addresses, dtype=np.int64)
+
+
+@kernel(exact=True)
 def _gather(columns: Any, permutation: Any, b: int, x: Any) -> None:
-    """Write up to three right-hand sides into the rows of x in elimination order; the others are 0."""
-    for k in range(3):
-        for i in range(len(permutation)):
-            for a in range(b):
-                x[k, i * b + a] = columns[permutation[i] * b + a, k] if k < columns.shape[1] else 0.0
+    """Write up to three right-hand sides into the columns of x in elimination order; the others are 0."""
+    for i in range(len(permutation)):
+        for a in range(b):
+            for k in range(3):
+                x[i * b + a, k] = columns[permutation[i] * b + a, k] if k < columns.shape[1] else 0.0
 
 
-@kernel()
+@kernel(exact=True)
 def _scatter(x: Any, permutation: Any, b: int, columns: Any) -> None:
     """Undo `_gather`."""
-    for k in range(columns.shape[1]):
-        for i in range(len(permutation)):
-            for a in range(b):
-                columns[permutation[i] * b + a, k] = x[k, i * b + a]
+    for i in range(len(permutation)):
+        for a in range(b):
+            for k in range(columns.shape[1]):
+                columns[permutation[i] * b + a, k] = x[i * b + a, k]
 
 
-@kernel()
-def _forward(
-    b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any, x: Any, work: Any
+@kernel(exact=True)
+def _substitute(
+    b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any, x: Any, work: Any,
+    leaves: Any, sizes: Any, numbers: Any,
+) -> None:  # fmt: skip
+    """Solve L L^T y = x in place for three right-hand sides."""
+    num = len(first) - 1
+    for s in range(num):
+        height = _load_front(b, s, first, row_pointers, rows, x, work, False)
+        width = (first[s + 1] - first[s]) * b
+        _forward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
+        _store_front(b, s, first, row_pointers, rows, x, work, True)
+    for s in range(num - 1, -1, -1):
+        height = _load_front(b, s, first, row_pointers, rows, x, work, True)
+        width = (first[s + 1] - first[s]) * b
+        _backward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
+        _store_front(b, s, first, row_pointers, rows, x, work, False)
+
+
+@kernel(exact=True)
+def _load_front(
+    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
+) -> int:
+    """Copy the unknowns of a front to `work`, 0 for the rows below if not `with_below`; return its height."""
+    start, width = first[s] * b, (first[s + 1] - first[s]) * b
+    for i in range(width):
+        for k in range(3):
+            work[k, i] = x[start + i, k]
+    at = width
+    for p in range(row_pointers[s], row_pointers[s + 1]):
+        row = np.int64(rows[p]) * b
+        for a in range(b):
+            for k in range(3):
+                work[k, at + a] = x[row + a, k] if with_below else 0.0
+        at += b
+    return at
+
+
+@kernel(exact=True)
+def _store_front(
+    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
 ) -> None:
-    """Solve L y = x in place, three right-hand sides at a time."""
-    for s in range(len(first) - 1):
-        start, width = first[s] * b, (first[s + 1] - first[s]) * b
-        below = (row_pointers[s + 1] - row_pointers[s]) * b
-        height = width + below
-        panel = panels[panel_pointers[s] * b * b :][: width * height]
+    """Copy a front's own unknowns back to `x`, and add what it leaves to the rows below if `with_below`."""
+    start, width = first[s] * b, (first[s + 1] - first[s]) * b
+    for i in range(width):
         for k in range(3):
-            work[k, :width] = x[k, start : start + width]
-            work[k, width:height] = 0.0
-        w0, w1, w2 = work[0][:height], work[1][:height], work[2][:height]
-        _eliminate(panel, height, width, w0, w1, w2)
-        for k in range(3):
-            x[k, start : start + width] = work[k, :width]
-        for p in range(row_pointers[s], row_pointers[s + 1]):
-            at = width + (p - row_pointers[s]) * b
-            for a in range(b):
-                for k in range(3):
-                    x[k, rows[p] * b + a] += work[k, at + a]
+            x[start + i, k] = work[k, i]
+    if not with_below:
+        return
+    at = width
+    for p in range(row_pointers[s], row_pointers[s + 1]):
+        row = np.int64(rows[p]) * b
+        for a in range(b):
+            for k in range(3):
+                x[row + a, k] += work[k, at + a]
+        at += b
 
 
-@kernel()
-def _eliminate(panel: Any, height: int, width: int, w0: Any, w1: Any, w2: Any) -> None:
+@kernel(exact=True)
+def _forward(
+    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
+) -> None:
     """Divide by the square part of a panel and subtract its rows below, four columns at a time."""
     j = 0
     while j + 4 <= width:
         for q in range(j, j + 4):
-            _eliminate_rows(panel, height, q, j + 4, w0, w1, w2)
-        l0, l1 = panel[j * height :][j + 4 : height], panel[(j + 1) * height :][j + 4 : height]
-        l2, l3 = panel[(j + 2) * height :][j + 4 : height], panel[(j + 3) * height :][j + 4 : height]
-        _subtract_4(l0, l1, l2, l3, w0[j : j + 4], w0[j + 4 :], w1[j : j + 4], w1[j + 4 :], w2[j : j + 4],
-                    w2[j + 4 :])  # fmt: skip
+            _eliminate(panels[offset + q * height :][:height], q, j + 4, work)
+            for k in range(3):
+                numbers[4 * k + q - j] = work[k, q]
+        _call_leaf(leaves[0], panels, offset, height, j, work, sizes, numbers)
         j += 4
     for q in range(j, width):
-        _eliminate_rows(panel, height, q, height, w0, w1, w2)
+        _eliminate(panels[offset + q * height :][:height], q, height, work)
 
 
-@kernel()
-def _eliminate_rows(panel: Any, height: int, q: int, end: int, w0: Any, w1: Any, w2: Any) -> None:
-    """Finish unknown q and subtract its column from the rows q+1..end-1."""
-    column = panel[q * height : (q + 1) * height]
-    inverse = 1 / column[q]
-    w0[q] *= inverse
-    w1[q] *= inverse
-    w2[q] *= inverse
-    a0, a1, a2 = w0[q], w1[q], w2[q]
-    for i in range(q + 1, end):
-        w0[i] -= column[i] * a0
-        w1[i] -= column[i] * a1
-        w2[i] -= column[i] * a2
-
-
-@kernel()
-def _subtract_4(
-    l0: Any, l1: Any, l2: Any, l3: Any, a: Any, u: Any, b: Any, v: Any, c: Any, w: Any
+@kernel(exact=True)
+def _backward(
+    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
-    """Subtract four columns times the coefficients a, b, c from u, v, w."""
-    a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
-    b0, b1, b2, b3 = b[0], b[1], b[2], b[3]
-    c0, c1, c2, c3 = c[0], c[1], c[2], c[3]
-    for i in range(len(l0)):
+    """Solve with the transposed panel for its own unknowns, four columns at a time from the last."""
+    j = width
+    while j % 4 != 0:
+        j -= 1
+        _finish(panels[offset + j * height :][:height], j, height, work)
+    while j > 0:
+        j -= 4
+        _call_leaf(leaves[1], panels, offset, height, j, work, sizes, numbers)
+        for q in range(j + 3, j - 1, -1):
+            for k in range(3):
+                work[k, q] -= numbers[4 * k + q - j]
+            _finish(panels[offset + q * height :][:height], q, j + 4, work)
+
+
+@kernel(exact=True)
+def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
+    """Finish unknown q and subtract its column from the rows q+1..end-1."""
+    for k in range(3):
+        work[k, q] /= column[q]
+        for i in range(q + 1, end):
+            work[k, i] -= column[i] * work[k, q]
+
+
+@kernel(exact=True)
+def _finish(column: Any, q: int, end: int, work: Any) -> None:
+    """Subtract the rows q+1..end-1 of column q from unknown q and finish it."""
+    for k in range(3):
+        total = work[k, q]
+        for i in range(q + 1, end):
+            total -= column[i] * work[k, i]
+        work[k, q] = total / column[q]
+
+
+@kernel(exact=True)
+def _call_leaf(
+    leaf: int, panels: Any, offset: int, height: int, j: int, work: Any, sizes: Any, numbers: Any
+) -> None:
+    """Run a leaf on the columns j..j+3 of a panel and the rows from j+4 on."""
+    sizes[0], sizes[1], sizes[2] = height - j - 4, height, work.shape[1]
+    columns = array_address(panels) + (offset + j * height + j + 4) * panels.itemsize
+    vectors = array_address(work) + (j + 4) * work.itemsize
+    call_address(leaf, (array_address(sizes), columns, vectors, array_address(numbers)))
+
+
+def _subtract_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
+    """Leaf: subtract four columns times their coefficients from three vectors."""
+    size = carray(sizes, (3,))
+    count, height, stride = size[0], size[1], size[2]
+    panel = carray(columns, (3 * height + count,))
+    work = carray(vectors, (2 * stride + count,))
+    factor = carray(numbers, (12,))
+    l0, l1 = panel[:count], panel[height : height + count]
+    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
+    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
+    a0, a1, a2, a3 = factor[0], factor[1], factor[2], factor[3]
+    b0, b1, b2, b3 = factor[4], factor[5], factor[6], factor[7]
+    c0, c1, c2, c3 = factor[8], factor[9], factor[10], factor[11]
+    for i in range(count):
         u[i] -= l0[i] * a0 + l1[i] * a1 + l2[i] * a2 + l3[i] * a3
         v[i] -= l0[i] * b0 + l1[i] * b1 + l2[i] * b2 + l3[i] * b3
         w[i] -= l0[i] * c0 + l1[i] * c1 + l2[i] * c2 + l3[i] * c3
 
 
-@kernel()
-def _backward(
-    b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any, x: Any, work: Any
-) -> None:
-    """Solve L^T y = x in place, three right-hand sides at a time."""
-    for s in range(len(first) - 2, -1, -1):
-        start, width = first[s] * b, (first[s + 1] - first[s]) * b
-        below = (row_pointers[s + 1] - row_pointers[s]) * b
-        height = width + below
-        panel = panels[panel_pointers[s] * b * b :][: width * height]
-        for k in range(3):
-            work[k, :width] = x[k, start : start + width]
-        for p in range(row_pointers[s], row_pointers[s + 1]):
-            at = width + (p - row_pointers[s]) * b
-            for a in range(b):
-                for k in range(3):
-                    work[k, at + a] = x[k, rows[p] * b + a]
-        w0, w1, w2 = work[0][:height], work[1][:height], work[2][:height]
-        _substitute(panel, height, width, w0, w1, w2)
-        for k in range(3):
-            x[k, start : start + width] = work[k, :width]
-
-
-@kernel()
-def _substitute(panel: Any, height: int, width: int, w0: Any, w1: Any, w2: Any) -> None:
-    """Solve with the transposed panel for its own unknowns, four columns at a time from the last."""
-    sums = np.empty(12, panel.dtype)
-    j = width
-    while j % 4 != 0:
-        j -= 1
-        _substitute_row(panel, height, j, j + 1, height, w0, w1, w2)
-        _finish_row(panel, height, j, w0, w1, w2)
-    while j > 0:
-        j -= 4
-        l0, l1 = panel[j * height :][j + 4 : height], panel[(j + 1) * height :][j + 4 : height]
-        l2, l3 = panel[(j + 2) * height :][j + 4 : height], panel[(j + 3) * height :][j + 4 : height]
-        _dot_4(l0, l1, l2, l3, w0[j + 4 :], w1[j + 4 :], w2[j + 4 :], sums)
-        for q in range(3, -1, -1):
-            w0[j + q] -= sums[q]
-            w1[j + q] -= sums[4 + q]
-            w2[j + q] -= sums[8 + q]
-            _substitute_row(panel, height, j + q, j + q + 1, j + 4, w0, w1, w2)
-            _finish_row(panel, height, j + q, w0, w1, w2)
-
-
-@kernel()
-def _substitute_row(
-    panel: Any, height: int, q: int, begin: int, end: int, w0: Any, w1: Any, w2: Any
-) -> None:
-    """Subtract the products of the rows begin..end-1 of column q from unknown q."""
-    column = panel[q * height : (q + 1) * height]
-    s0 = s1 = s2 = column[q] * 0
-    for i in range(begin, end):
-        s0 += column[i] * w0[i]
-        s1 += column[i] * w1[i]
-        s2 += column[i] * w2[i]
-    w0[q] -= s0
-    w1[q] -= s1
-    w2[q] -= s2
-
-
-@kernel()
-def _finish_row(panel: Any, height: int, q: int, w0: Any, w1: Any, w2: Any) -> None:
-    """Divide unknown q by its pivot."""
-    inverse = 1 / panel[q * height + q]
-    w0[q] *= inverse
-    w1[q] *= inverse
-    w2[q] *= inverse
-
-
-@kernel()
-def _dot_4(l0: Any, l1: Any, l2: Any, l3: Any, u: Any, v: Any, w: Any, sums: Any) -> None:
-    """Write the twelve products of four columns with three vectors."""
-    zero = l0.dtype.type(0)
-    u0 = u1 = u2 = u3 = v0 = v1 = v2 = v3 = w0 = w1 = w2 = w3 = zero
-    for i in range(len(l0)):
+def _multiply_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
+    """Leaf: write the twelve products of four columns with three vectors."""
+    size = carray(sizes, (3,))
+    count, height, stride = size[0], size[1], size[2]
+    panel = carray(columns, (3 * height + count,))
+    work = carray(vectors, (2 * stride + count,))
+    sums = carray(numbers, (12,))
+    l0, l1 = panel[:count], panel[height : height + count]
+    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
+    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
+    u0 = u1 = u2 = u3 = v0 = v1 = v2 = v3 = w0 = w1 = w2 = w3 = sums.dtype.type(0)
+    for i in range(count):
         u0 += l0[i] * u[i]
         u1 += l1[i] * u[i]
         u2 += l2[i] * u[i]
