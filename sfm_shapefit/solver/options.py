@@ -16,7 +16,9 @@ class Status(enum.Enum):
     """Why the solver stopped; the value is the sentence shown to the user."""
 
     CONVERGED = "the certified gap is below the tolerance"
-    INACCURATE = "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
+    INACCURATE = (
+        "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
+    )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
 
 

@@ -1,0 +1,99 @@
+"""The reference solver: the ShapeFit program as a generic second-order cone program.
+
+The door to cvxpy and Clarabel. One cone of d rows per edge, in an orthonormal basis B_e of the
+complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
+
+    minimise    sum_e w_e s_e
+    subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
+
+The multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow beside a solver made
+for the program, and trusted: every other solver is tested against it.
+"""
+
+import warnings
+from typing import Any
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import tangent_bases
+from sfm_shapefit.solver.program import scale_functional
+from sfm_shapefit.viewgraph import ViewGraph
+
+_TIGHTER = 1e-3  # the cone solver's tolerance below ours: its gap is relative to an inexact dual
+
+
+def solve_conic(graph: ViewGraph, tol: float, max_iterations: int) -> tuple[FloatArray, FloatArray, int]:
+    """Solve the program with cvxpy and Clarabel.
+
+    Args:
+        graph: a connected, parallel-rigid view graph.
+        tol: the certified gap wanted.
+        max_iterations: limit of interior-point steps.
+
+    Returns:
+        locations (n, d), the approximate dual (m, d), and the number of interior-point steps.
+
+    Raises:
+        UnsolvableError: if the cone solver returns no point at all.
+    """
+    import cvxpy as cp
+
+    bases = tangent_bases(graph.directions)
+    matrix = _grounded_operator(graph, bases)
+    c = scale_functional(graph)[1:].ravel()
+    m, d = graph.num_edges, graph.dimension
+
+    t = cp.Variable(matrix.shape[1])
+    z = cp.Variable((d - 1, m))
+    s = cp.Variable(m)
+    fits = cp.vec(z, order="F") == matrix @ t
+    program = cp.Problem(
+        cp.Minimize(graph.weights @ s),
+        [fits, cp.SOC(s, z, axis=0), c @ t == graph.weights.sum()],
+    )
+    iterations = _run(program, max(_TIGHTER * tol, 1e-12), max_iterations)
+    if t.value is None or fits.dual_value is None:
+        raise UnsolvableError(
+            f"the conic solver stopped with status {program.status!r} and no answer; "
+            "check the graph's rigidity and its directions"
+        )
+    locations = np.vstack([np.zeros((1, d)), np.reshape(t.value, (-1, d))])
+    y = np.einsum("edk,ek->ed", bases, np.reshape(fits.dual_value, (m, d - 1)))
+    points_up = np.sum(y * (locations[graph.edges[:, 0]] - locations[graph.edges[:, 1]])) >= 0.0
+    return locations, y if points_up else -y, iterations
+
+
+def _grounded_operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
+    """Return the sparse map from (t_1, ..., t_{n-1}) to all B_e^T (t_i - t_j), stacked edge by edge."""
+    m, d, k = bases.shape
+    rows = np.broadcast_to((np.arange(m)[:, None] * k + np.arange(k))[:, None, :], (m, d, k))
+    parts: list[tuple[Any, Any, Any]] = []
+    for end, sign in ((0, 1.0), (1, -1.0)):
+        nodes = graph.edges[:, end] - 1
+        columns = np.broadcast_to((nodes[:, None] * d + np.arange(d))[:, :, None], (m, d, k))
+        kept = nodes >= 0
+        parts.append((sign * bases[kept].ravel(), rows[kept].ravel(), columns[kept].ravel()))
+    values, row, column = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return coo_array((values, (row, column)), shape=(m * k, (graph.num_cameras - 1) * d)).tocsr()
+
+
+def _run(program: Any, tolerance: float, max_iterations: int) -> int:
+    """Run Clarabel on a cvxpy problem; return its number of steps. An inaccurate point is still a point."""
+    import cvxpy as cp
+
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+        try:
+            program.solve(
+                solver=cp.CLARABEL,
+                max_iter=max_iterations,
+                tol_gap_abs=tolerance,
+                tol_gap_rel=tolerance,
+                tol_feas=tolerance,
+            )
+        except cp.error.SolverError:
+            return max_iterations
+    return int(program.solver_stats.num_iters or 0)

@@ -1,0 +1,85 @@
+"""The ShapeFit program and its dual, as arrays.
+
+    minimise    R(T) = sum_e w_e || P_e (t_i - t_j) ||        e = (i, j), P_e = I - v_e v_e^T
+    subject to  L(T) = sum_e w_e <t_i - t_j, v_e> = kappa,    sum_i t_i = 0
+
+With D the incidence operator, (D T)_e = t_i - t_j, and c = D^T (w v), L(T) = <c, T>. The dual is
+
+    maximise    lambda
+    subject to  D^T y = lambda c,    <y_e, v_e> = 0,    ||y_e|| <= w_e
+
+and for every feasible pair R(T) - lambda L(T) = sum_e (w_e ||r_e|| - <y_e, r_e>) >= 0 with
+r_e = P_e (t_i - t_j). The program is homogeneous: R(T) / L(T) is the paper's objective whatever kappa.
+Inside the solvers kappa = sum_e w_e, so that the mean edge has length about 1 and tolerances mean
+something; with the paper's kappa = 1 locations and objective would shrink like 1 / m.
+
+Source: Hand, Lee, Voroninski, "ShapeFit: Exact location recovery from corrupted pairwise
+directions", 2015 (arXiv 1506.01437), the program called ShapeFit. Weights w_e = 1 there.
+"""
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def differences(t: FloatArray, edges: IntArray) -> FloatArray:
+    """Return D T, the baselines t_i - t_j, shape (m, d)."""
+    baselines: FloatArray = t[edges[:, 0]] - t[edges[:, 1]]
+    return baselines
+
+
+def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
+    """Return D^T y, at every node the sum of its incident signed y_e, shape (n, d)."""
+    return np.stack(
+        [
+            np.bincount(edges[:, 0], weights=column, minlength=num_nodes)
+            - np.bincount(edges[:, 1], weights=column, minlength=num_nodes)
+            for column in y.T
+        ],
+        axis=1,
+    )
+
+
+def along(x: FloatArray, v: FloatArray) -> FloatArray:
+    """Return <x_e, v_e> for every edge, shape (m,)."""
+    lengths: FloatArray = np.einsum("ed,ed->e", x, v)
+    return lengths
+
+
+def across(x: FloatArray, v: FloatArray) -> FloatArray:
+    """Return P_e x_e = x_e - <x_e, v_e> v_e for every edge, shape (m, d).
+
+    Formed explicitly: sqrt(||x||^2 - <x, v>^2) would lose half of the digits.
+    """
+    transverse: FloatArray = x - along(x, v)[:, None] * v
+    return transverse
+
+
+def scale_functional(graph: ViewGraph) -> FloatArray:
+    """Return c = D^T (w v), so that L(T) = <c, T>, shape (n, d)."""
+    return adjoint(graph.weights[:, None] * graph.directions, graph.edges, graph.num_cameras)
+
+
+def residual_sum(graph: ViewGraph, t: FloatArray) -> float:
+    """Return R(T), the weighted sum of the transverse residuals, in the units of `t`."""
+    transverse = across(differences(t, graph.edges), graph.directions)
+    return float(graph.weights @ np.linalg.norm(transverse, axis=1))
+
+
+def projected_length(graph: ViewGraph, t: FloatArray) -> float:
+    """Return L(T), the weighted sum of the baselines' lengths along their directions."""
+    return float(graph.weights @ along(differences(t, graph.edges), graph.directions))
+
+
+def objective(graph: ViewGraph, t: FloatArray) -> float:
+    """Return R(T) / L(T), the paper's objective; infinite where L(T) <= 0."""
+    length = projected_length(graph, t)
+    return residual_sum(graph, t) / length if length > 0.0 else float("inf")
+
+
+def normalized_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return `t` centred and scaled so that L(T) = kappa = sum of the weights."""
+    centred: FloatArray = t - t.mean(axis=0)
+    scale = float(graph.weights.sum()) / projected_length(graph, centred)
+    return centred * scale
