@@ -463,8 +463,14 @@ def _forward(
                 numbers[4 * k + q - j] = work[k, q]
         _call_leaf(leaves[0], panels, offset, height, j, work, sizes, numbers)
         j += 4
+    end = width if width >= 4 else height
     for q in range(j, width):
-        _eliminate(panels[offset + q * height :][:height], q, height, work)
+        _eliminate(panels[offset + q * height :][:height], q, end, work)
+    if j < width and width >= 4:  # the rows below take the last four columns, those done before times 0
+        for k in range(3):
+            for q in range(width - 4, width):
+                numbers[4 * k + q - width + 4] = work[k, q] if q >= j else 0
+        _call_leaf(leaves[0], panels, offset, height, width - 4, work, sizes, numbers)
 
 
 @kernel(exact=True)
@@ -472,10 +478,15 @@ def _backward(
     panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
     """Solve with the transposed panel for its own unknowns, four columns at a time from the last."""
-    j = width
-    while j % 4 != 0:
-        j -= 1
-        _finish(panels[offset + j * height :][:height], j, height, work)
+    j = width - width % 4
+    end = width if width >= 4 else height
+    if j < width and width >= 4:
+        _call_leaf(leaves[1], panels, offset, height, width - 4, work, sizes, numbers)
+        for k in range(3):
+            for q in range(j, width):
+                work[k, q] -= numbers[4 * k + q - width + 4]
+    for q in range(width - 1, j - 1, -1):
+        _finish(panels[offset + q * height :][:height], q, end, work)
     while j > 0:
         j -= 4
         _call_leaf(leaves[1], panels, offset, height, j, work, sizes, numbers)
