@@ -3,14 +3,21 @@
 All matrices are column-major blocks inside a flat array: (array, offset, leading dimension), and only
 lower triangles are read or written. float32 and float64 share one code: a kernel is handed the
 `routine_addresses` of its type. Addresses are arguments, so the compiled kernels stay cached on disk
-(`sfm_shapefit.jit`). Small matrices do not pay for a call and a packing: they take plain loops.
+(`sfm_shapefit.jit`).
+
+BLAS with two threads splits, and hence rounds, differently from BLAS with one. `one_blas_thread` holds it to
+one, so that results do not depend on the number of cores.
 """
 
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from threadpoolctl import ThreadpoolController
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import array_address, call_address, function_address, kernel
@@ -19,6 +26,31 @@ _POTRF, _TRSM, _SYRK, _GEMM = range(4)
 
 FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
 """Character arguments of the Fortran routines, in one array: "L", "R", "T", "N"."""
+
+
+_lock = threading.Lock()
+_limits: list[Any] = []  # one entry per thread of Python inside `one_blas_thread`; the first holds the limit
+
+
+@lru_cache(maxsize=1)
+def _controller() -> ThreadpoolController:
+    """Find the BLAS libraries of this process, once, after scipy's has been loaded."""
+    _addresses("d")
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Hold BLAS to one thread; nested and concurrent uses share one limit, lifted by the last."""
+    with _lock:
+        _limits.append(None if _limits else _controller().limit(limits=1, user_api="blas"))
+    try:
+        yield
+    finally:
+        with _lock:
+            limit = _limits.pop(0) if len(_limits) == 1 else _limits.pop()
+            if limit is not None:
+                limit.restore_original_limits()
 
 
 @lru_cache(maxsize=2)
@@ -44,7 +76,7 @@ def work_scalars(dtype: npt.DTypeLike) -> npt.NDArray[Any]:
     return np.array([1.0, -1.0, 0.0], dtype=dtype)
 
 
-@kernel()
+@kernel(exact=True)
 def potrf(
     routines: Any, flags: Any, integers: Any, a: Any, offset: int, order: int, leading: int
 ) -> int:
@@ -58,7 +90,7 @@ def potrf(
     return int(integers[2])
 
 
-@kernel()
+@kernel(exact=True)
 def trsm(
     routines: Any,
     flags: Any,
@@ -86,7 +118,7 @@ def trsm(
     call_address(routines[_TRSM], pointers)
 
 
-@kernel()
+@kernel(exact=True)
 def syrk(
     routines: Any,
     flags: Any,
