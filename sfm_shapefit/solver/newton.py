@@ -1,4 +1,36 @@
-"""placeholder"""
+"""Primal-dual Newton steps on the smoothed sum of norms, dual feasible at every iterate.
+
+The norms of the program (`program`) are smoothed to rho_e = sqrt(||r_e||^2 + mu^2), and Newton's method
+is applied to the optimality conditions of the smoothed program, written without a quotient:
+
+    rho_e y_e = w_e r_e,    D^T y = lambda c,    <c, T> = kappa,        r_e = P_e (t_i - t_j)
+
+Linearised at (T, y), with the block S_e made symmetric, a step dT and the dual y+ it leads to are
+
+    y+_e = g_e + S_e P_e (dt_i - dt_j),    g_e = w_e r_e / rho_e
+    S_e  = (w_e P_e - (y_e r_e^T + r_e y_e^T) / (2 rho_e)) / rho_e
+    M dT = lambda+ c - D^T g,    <c, dT> = 0,                 M = D^T S D
+
+S_e is positive definite across v_e, for ||y_e|| <= w_e and ||r_e|| < rho_e. With a = M^-1 c and
+b = M^-1 D^T g the solution is lambda+ = <c, b> / <c, a>, dT = lambda+ a - b. Then D^T y+ = lambda+ c: the dual
+stays feasible, and lambda is a bound at every iterate.
+
+What makes it fast and safe:
+
+- *Lifting.* M is singular along translations, and nearly so along T where the data are nearly exact. Neither
+  direction occurs in dT, for it would change the centroid or <c, T>. So multiples of 1 1^T and c c^T
+  are added to M: dT and lambda+ stay what they are, and the matrix is well conditioned.
+- *The better of two dual steps.* y moves towards y+ as far as the ball allows, or y+ is divided by its
+  excess max ||y+_e|| / w_e. Both keep the equality; the larger lambda is taken. Near the optimum y+ leaves
+  the ball by a hair, and scaling costs a hair where stopping short costs half of the step.
+- *Steps with an old matrix.* After a step the conditions are evaluated anew and solved again with the
+  factor in hand: g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, rho' and S from the factorisation. That costs a
+  few passes over the edges. It goes on while the last step gained more per unit of work than the
+  cycle since the factorisation did on average, and nearly halves the number of factorisations.
+
+Source: Andersen, Christiansen, Conn, Overton, "An efficient primal-dual interior-point method for
+minimizing a sum of Euclidean norms", SIAM J. Sci. Comput. 22 (2000), for the symmetrised step.
+"""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -7,337 +39,469 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import array_address, call_address, function_address, kernel
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, potrs, routine_addresses, work_integers
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
+OnIteration = Callable[[int, float, float], object]
+"""Called with the number of factorisations so far, the objective and the gap."""
+
+_MU_PER_GAP = 0.15  # smoothing relative to the gap; .05 to .25 need the same number of factorisations
+_TO_BOUNDARY = 0.99  # how far towards the surface of the ball
+_MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
+_STEPS_PER_FACTOR = 10
+_EDGE_WORK = 4e3  # a step's passes over one edge cost as much as so many operations of a factorisation
+_EQUALITY = 1e-3, 1e-13  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
+_REFINEMENTS = 3
+_HALVINGS = 20
+_RIDGE = 1e-14, 1e-9  # first and last multiple of the identity added to M, per mean eigenvalue
+_STALL = 6  # factorisations without progress after which more will not help
+_OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
+
 
 class Problem(NamedTuple):
+    """The data, as the kernels take them."""
+
     edges: IntArray
     v: FloatArray
     w: FloatArray
     c: FloatArray
     kappa: float
     axes: tuple[int, ...]
-    routines: IntArray
+    """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls the loops over it."""
 
 
-class State(NamedTuple):
+class Iterate(NamedTuple):
+    """Where the solver stands; every step overwrites it."""
+
     t: FloatArray
+    """(n, d) locations, <c, T> = kappa."""
+    y: FloatArray
+    """(m, d) feasible dual."""
+    r: FloatArray
+    """(m, d) residuals P_e (t_i - t_j)."""
+
+
+class Model(NamedTuple):
+    """The linearisation: S_e by the y, r, rho it was taken at, and the Cholesky factor of M."""
+
     y: FloatArray
     r: FloatArray
-    dt: FloatArray
-    dy: FloatArray
-    dr: FloatArray
-    rhs: FloatArray  # (2, n, d)
-    total: FloatArray  # (n, d)
-    matrix: FloatArray  # (N * N,)
+    rho: FloatArray
+    """(m,)"""
+    matrix: FloatArray
+    """(nd * nd,) lower triangle in column-major order."""
     diagonal: FloatArray
+    """(n, d, d) scratch: the diagonal blocks of M."""
+    a: FloatArray
+    """(n, d), M^-1 c."""
+    routines: IntArray
     flags: Any
     integers: Any
 
 
-@kernel()
-def _transverse(problem, x, out):
-    edges, v = problem.edges, problem.v
-    d = len(problem.axes)
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        s = 0.0
-        for k in range(d):
-            s += (x[i, k] - x[j, k]) * v[e, k]
-        for k in range(d):
-            out[e, k] = (x[i, k] - x[j, k]) - s * v[e, k]
+class Step(NamedTuple):
+    """A proposed step, and scratch."""
+
+    t: FloatArray
+    """(n, d), dT."""
+    r: FloatArray
+    """(m, d), P D dT."""
+    g: FloatArray
+    """(m, d)"""
+    y: FloatArray
+    """(m, d), y+."""
+    nodes: FloatArray
+    """(n, d) right-hand side, then solution."""
+
+
+class Progress(NamedTuple):
+    """The scalars of the iteration."""
+
+    mu: float
+    multiplier: float
+    """lambda."""
+    objective: float
+    """R(T) / kappa."""
+    gap: float
+    """sum_e (w_e ||r_e|| - <y_e, r_e>) / kappa: every term is positive, so it does not cancel."""
+
+
+def solve_newton_dense(
+    graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
+) -> tuple[FloatArray, FloatArray, int]:
+    """Solve the program with a dense Cholesky factor of nd x nd; for n up to about a thousand.
+
+    Args:
+        graph: a connected, parallel-rigid view graph whose c is not 0.
+        tol: the gap wanted, in units of the objective.
+        max_iterations: limit of factorisations.
+        on_iteration: called after every factorisation and its steps; raise in it to cancel.
+
+    Returns:
+        locations (n, d), the dual (m, d), and the number of factorisations.
+
+    Raises:
+        UnsolvableError: if the directions do not determine any locations.
+    """
+    problem, iterate, model, step = _allocate(graph)
+    with one_blas_thread():
+        if _start(problem, iterate, model) != 0:
+            raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
+        progress = _first_progress(problem, iterate)
+        count, stalled = 0, 0
+        chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
+        while progress.gap > tol and count < max_iterations and stalled < _STALL:
+            steps = min(chunk, max_iterations - count)
+            done, stalled, progress = _newton(problem, iterate, model, step, progress, tol, steps, stalled)
+            count += done
+            if on_iteration:
+                on_iteration(count, progress.objective, progress.gap)
+    return iterate.t, iterate.y, count
+
+
+def _allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
+    """Return the problem as arrays, and room for the iteration."""
+    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
+
+    def nodes() -> FloatArray:
+        return np.empty((n, d))
+
+    def edges() -> FloatArray:
+        return np.empty((m, d))
+
+    problem = Problem(
+        np.ascontiguousarray(graph.edges),
+        np.ascontiguousarray(graph.directions),
+        graph.weights,
+        scale_functional(graph),
+        float(graph.weights.sum()),
+        tuple(range(d)),
+    )
+    matrix, blocks = np.empty((n * d) ** 2), np.empty((n, d, d))
+    lapack = routine_addresses(np.float64), FLAGS, work_integers()
+    model = Model(edges(), edges(), np.empty(m), matrix, blocks, nodes(), *lapack)
+    step = Step(nodes(), edges(), edges(), edges(), nodes())
+    return problem, Iterate(nodes(), edges(), edges()), model, step
 
 
 @kernel(exact=True)
-def _adjoint(problem, y, out):
-    edges = problem.edges
-    d = len(problem.axes)
-    out[:] = 0.0
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        for k in range(d):
-            out[i, k] += y[e, k]
-            out[j, k] -= y[e, k]
+def _newton(
+    problem: Any, iterate: Any, model: Any, step: Any, progress: Any, tol: float, limit: int, stalled: int
+) -> tuple[int, int, Progress]:
+    """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
+    count = 0
+    while count < limit and progress.gap > tol and stalled < _STALL:
+        before = progress.gap
+        count += 1
+        progress = _cycle(problem, iterate, model, step, progress, tol)
+        stalled = 0 if progress.gap < 0.9 * before else stalled + 1
+    return count, stalled, progress
 
 
-@kernel()
-def _assemble(problem, state, mu, start):
-    edges, v, w = problem.edges, problem.v, problem.w
-    r, y = state.r, state.y
-    a, diag = state.matrix, state.diagonal
-    d = len(problem.axes)
-    n = len(problem.c)
-    N = n * d
-    diag[:] = 0.0
-    # trace
-    lift = 0.0
-    c = problem.c.reshape(N)
-    cc = 0.0
-    for p in range(N):
-        cc += c[p] * c[p]
-    trace = 0.0
-    for e in range(len(edges)):
-        if start:
-            trace += 2 * (d - 1) * w[e]
-        else:
-            q = 0.0
-            for k in range(d):
-                q += r[e, k] * r[e, k]
-            trace += 2 * (d - 1) * w[e] / np.sqrt(q + mu * mu)
-    delta = trace / N / cc
-    shift = trace / N / n
-    for q in range(N):
-        col = a[q * N : (q + 1) * N]
-        f = delta * c[q]
-        for p in range(q, N):
-            col[p] = f * c[p]
-        for p in range(q, N, d):
-            col[p] += shift
+@kernel(exact=True)
+def _cycle(problem: Any, iterate: Any, model: Any, step: Any, progress: Any, tol: float) -> Progress:
+    """Factor once, then step with that factor while it pays."""
+    first, mu, multiplier = progress.gap, progress.mu, progress.multiplier
+    mu = min(mu, _MU_PER_GAP * first)
+    _set_residuals(problem, iterate.t, iterate.r)
+    _linearise(iterate, mu, model)
+    if _factorise(problem, model) != 0:
+        return Progress(mu, multiplier, progress.objective, first)
+    order = float(problem.c.size)
+    step_work = _EDGE_WORK * len(problem.w) + 4.0 * order**2
+    work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
+    for _ in range(_STEPS_PER_FACTOR):
+        previous = progress.gap
+        mu = min(mu, _MU_PER_GAP * previous)
+        target = _propose(problem, iterate, model, step, mu, previous)
+        multiplier = _take(problem, iterate, step, mu, multiplier, target)
+        objective, bound = _objective_and_bound(problem, iterate)
+        progress = Progress(mu, multiplier, objective, objective - bound)
+        work += step_work
+        if progress.gap <= tol:
+            break
+        if np.log(previous / progress.gap) * work < np.log(first / progress.gap) * step_work:
+            break
+    return progress
+
+
+@kernel(exact=True)
+def _start(problem: Any, iterate: Any, model: Any) -> int:
+    """Start from the least-squares locations, whose scaled residuals are a feasible dual; 0 if that worked."""
+    model.rho[:] = 1.0
+    model.y[:] = 0.0
+    model.r[:] = 0.0
+    info = _factorise(problem, model)
+    length = _dot(problem.c, model.a)
+    if info != 0 or not length > 0.0:
+        return 1
+    iterate.t[:] = (problem.kappa / length) * model.a
+    _set_residuals(problem, iterate.t, iterate.r)
+    worst = 0.0
+    for e in range(len(problem.w)):
+        rr = 0.0
+        for k in range(len(problem.axes)):
+            rr += iterate.r[e, k] ** 2
+        worst = max(worst, np.sqrt(rr))
+    for e in range(len(problem.w)):
+        scale = problem.w[e] / worst if worst > 0.0 else 0.0
+        for k in range(len(problem.axes)):
+            iterate.y[e, k] = scale * iterate.r[e, k]
+    return 0
+
+
+@kernel(exact=True)
+def _first_progress(problem: Any, iterate: Any) -> Progress:
+    """Return the scalars at the start; the smoothing is at most the mean length of a pair."""
+    objective, bound = _objective_and_bound(problem, iterate)
+    return Progress(1.0, bound, objective, objective - bound)
+
+
+@kernel(exact=True)
+def _factorise(problem: Any, model: Any) -> int:
+    """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if that worked."""
+    order = problem.c.size
+    size = 0.0  # mean eigenvalue
+    for e in range(len(problem.w)):
+        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] / model.rho[e] / order
+    ridge, last = _RIDGE
+    info = 1
+    while info != 0 and ridge <= last:
+        _lift(problem, model, size, ridge * size)
+        _add_edge_blocks(problem, model)
+        info = potrf(model.routines, model.flags, model.integers, model.matrix, 0, order, order)
+        ridge *= 100.0
+    model.a[:] = problem.c
+    if info == 0:
+        potrs(model.routines, model.flags, model.integers, model.matrix, order, model.a)
+    return info
+
+
+@kernel(exact=True)
+def _lift(problem: Any, model: Any, size: float, ridge: float) -> None:
+    """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
+    n, d = problem.c.shape
+    order = n * d
+    c = problem.c.reshape(order)
+    along_c = size / _dot(problem.c, problem.c)
+    for q in range(order):
+        column = model.matrix[q * order : (q + 1) * order]
+        factor = along_c * c[q]
+        for p in range(q, order):
+            column[p] = factor * c[p]
+        for p in range(q, order, d):
+            column[p] += size / n
+        column[q] += ridge
+
+
+@kernel(exact=True)
+def _add_edge_blocks(problem: Any, model: Any) -> None:
+    """Add D^T S D to the lower triangle of the matrix."""
+    edges, v, w, y, r = problem.edges, problem.v, problem.w, model.y, model.r
+    matrix, diagonal = model.matrix, model.diagonal
+    n, d = len(problem.c), len(problem.axes)
+    order = n * d
+    diagonal[:] = 0.0
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        q = 0.0
-        for k in range(d):
-            q += r[e, k] * r[e, k]
-        rho = np.sqrt(q + mu * mu)
-        if start:
-            rho = 1.0
-        wr = w[e] / rho
-        h = 0.0 if start else 0.5 / (rho * rho)
-        low, high = max(i, j), min(i, j)
-        base = high * d * N + low * d
+        corner = min(i, j) * d * order + max(i, j) * d
+        inverse = 1.0 / model.rho[e]
+        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
         for k in range(d):
             for l in range(d):
-                s = -wr * v[e, k] * v[e, l] - h * (y[e, k] * r[e, l] + r[e, k] * y[e, l])
+                s = -stiffness * v[e, k] * v[e, l] - bend * (y[e, k] * r[e, l] + r[e, k] * y[e, l])
                 if k == l:
-                    s += wr
-                a[base + k * N + l] -= s
-                diag[i, k, l] += s
-                diag[j, k, l] += s
+                    s += stiffness
+                matrix[corner + k * order + l] -= s
+                if k <= l:
+                    diagonal[i, k, l] += s
+                    diagonal[j, k, l] += s
     for i in range(n):
         for k in range(d):
             for l in range(k, d):
-                a[(i * d + k) * N + i * d + l] += diag[i, k, l]
+                matrix[(i * d + k) * order + i * d + l] += diagonal[i, k, l]
 
 
-@kernel()
-def _factor(problem, state, order):
-    ints = state.integers
-    ints[0] = order
-    ints[1] = 0
-    text, pi = array_address(state.flags), array_address(ints)
-    call_address(problem.routines[0], (text, pi, array_address(state.matrix), pi, pi + 4))
-    return ints[1]
+@kernel(exact=True)
+def _linearise(iterate: Any, mu: float, model: Any) -> None:
+    """Keep the iterate as the point at which S is taken."""
+    for e in range(len(iterate.r)):
+        rr = mu * mu
+        for k in range(iterate.r.shape[1]):
+            rr += iterate.r[e, k] ** 2
+            model.y[e, k] = iterate.y[e, k]
+            model.r[e, k] = iterate.r[e, k]
+        model.rho[e] = np.sqrt(rr)
 
 
-@kernel()
-def _solve(problem, state, b, order, count):
-    ints = state.integers
-    ints[0] = order
-    ints[1] = 0
-    ints[2] = count
-    text, pi = array_address(state.flags), array_address(ints)
-    call_address(
-        problem.routines[1],
-        (text, pi, pi + 8, array_address(state.matrix), pi, array_address(b), pi, pi + 4),
-    )
-    return ints[1]
+@kernel(exact=True)
+def _propose(problem: Any, iterate: Any, model: Any, step: Any, mu: float, gap: float) -> float:
+    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c; return lambda+."""
+    c, a, nodes, order = problem.c, model.a, step.nodes, problem.c.size
+    per_gap, least = _EQUALITY
+    allowed = max(per_gap * gap, least) * problem.kappa / len(c)
+    scale = _dot(c, a)
+    _set_gradient(problem, iterate, model, mu, step)
+    potrs(model.routines, model.flags, model.integers, model.matrix, order, nodes)
+    multiplier = _dot(c, nodes) / scale
+    step.t[:] = multiplier * a - nodes
+    for _ in range(_REFINEMENTS):
+        _set_dual(problem, model, step)
+        nodes[:] = multiplier * c - nodes
+        if np.max(np.abs(nodes)) <= allowed:
+            return multiplier
+        potrs(model.routines, model.flags, model.integers, model.matrix, order, nodes)
+        shift = _dot(c, nodes) / scale
+        multiplier -= shift
+        step.t[:] += nodes - shift * a
+    _set_dual(problem, model, step)
+    return multiplier
 
 
-@kernel()
-def _dot(x, y):
-    s = 0.0
-    a, b = x.reshape(x.size), y.reshape(y.size)
-    for k in range(a.size):
-        s += a[k] * b[k]
-    return s
-
-
-@kernel()
-def _start(problem, state):
-    n, d = problem.c.shape
-    _assemble(problem, state, 1.0, True)
-    if _factor(problem, state, n * d) != 0:
-        return -1.0
-    state.t[:] = problem.c
-    _solve(problem, state, state.t, n * d, 1)
-    scale = problem.kappa / _dot(problem.c, state.t)
-    state.t[:] *= scale
-    _transverse(problem, state.t, state.r)
-    worst = 0.0
-    for e in range(len(problem.w)):
-        q = 0.0
-        for k in range(d):
-            q += state.r[e, k] ** 2
-        worst = max(worst, q)
-    worst = np.sqrt(worst)
-    for e in range(len(problem.w)):
-        for k in range(d):
-            state.y[e, k] = problem.w[e] * state.r[e, k] / worst
-    return 1.0
-
-
-@kernel()
-def _sums(problem, state, mu):
-    """objective, <y, r>, smoothed"""
-    f = g = phi = 0.0
-    for e in range(len(problem.w)):
-        q = p = 0.0
+@kernel(exact=True)
+def _set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -> None:
+    """g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, and nodes = D^T g."""
+    edges, w, y, r, g, nodes = problem.edges, problem.w, iterate.y, iterate.r, step.g, step.nodes
+    nodes[:] = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        rr = mu * mu
         for k in range(len(problem.axes)):
-            q += state.r[e, k] ** 2
-            p += state.r[e, k] * state.y[e, k]
-        f += problem.w[e] * np.sqrt(q)
-        g += p
-        phi += problem.w[e] * np.sqrt(q + mu * mu)
-    return f, g, phi
+            rr += r[e, k] ** 2
+        inverse = 1.0 / model.rho[e]
+        keep, pull = 1.0 - np.sqrt(rr) * inverse, w[e] * inverse
+        for k in range(len(problem.axes)):
+            x = keep * y[e, k] + pull * r[e, k]
+            g[e, k] = x
+            nodes[i, k] += x
+            nodes[j, k] -= x
 
 
-@kernel()
-def _smooth(problem, state, mu, alpha):
-    phi = 0.0
+@kernel(exact=True)
+def _set_dual(problem: Any, model: Any, step: Any) -> None:
+    """P D dT, y+_e = g_e + S_e P_e (dt_i - dt_j), and nodes = D^T y+."""
+    edges, v, w, dt, nodes = problem.edges, problem.v, problem.w, step.t, step.nodes
+    nodes[:] = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        s = 0.0
+        for k in range(len(problem.axes)):
+            s += (dt[i, k] - dt[j, k]) * v[e, k]
+        yd = rd = 0.0
+        for k in range(len(problem.axes)):
+            x = (dt[i, k] - dt[j, k]) - s * v[e, k]
+            step.r[e, k] = x
+            yd += model.y[e, k] * x
+            rd += model.r[e, k] * x
+        inverse = 1.0 / model.rho[e]
+        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
+        for k in range(len(problem.axes)):
+            x = step.g[e, k] + stiffness * step.r[e, k] - bend * (rd * model.y[e, k] + yd * model.r[e, k])
+            step.y[e, k] = x
+            nodes[i, k] += x
+            nodes[j, k] -= x
+
+
+@kernel(exact=True)
+def _take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, target: float) -> float:
+    """Move along the step as far as it helps; return the new multiplier."""
+    alpha = 1.0
+    while alpha > 0.0 and _increase(problem, iterate, step, mu, alpha) > 0.0:
+        alpha = 0.5 * alpha if alpha > 0.5**_HALVINGS else 0.0
+    length, excess = _dual_limits(problem, iterate, step)
+    beta = min(1.0, _TO_BOUNDARY * length)
+    partly = multiplier + beta * (target - multiplier)
+    scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0))) if excess > 1.0 else 1.0
+    if excess > 1.0 and scale * target > partly:
+        _move(iterate, step, alpha, 0.0, scale)
+        return scale * target
+    _move(iterate, step, alpha, 1.0 - beta, beta)
+    return partly
+
+
+@kernel(exact=True)
+def _increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
+    """Return the change of sum_e w_e rho_e from r to r + alpha dr, without cancellation."""
+    r, dr = iterate.r, step.r
+    total = 0.0
     for e in range(len(problem.w)):
-        q = 0.0
+        rr = rd = dd = 0.0
         for k in range(len(problem.axes)):
-            q += (state.r[e, k] + alpha * state.dr[e, k]) ** 2
-        phi += problem.w[e] * np.sqrt(q + mu * mu)
-    return phi
+            rr += r[e, k] * r[e, k]
+            rd += r[e, k] * dr[e, k]
+            dd += dr[e, k] * dr[e, k]
+        change = alpha * (2.0 * rd + alpha * dd)
+        now = rr + mu * mu
+        then = max(now + change, mu * mu)
+        total += problem.w[e] * change / (np.sqrt(now) + np.sqrt(then))
+    return total
 
 
-@kernel()
-def _gradients(problem, state, mu):
-    """dy <- w r / rho"""
+@kernel(exact=True)
+def _dual_limits(problem: Any, iterate: Any, step: Any) -> tuple[float, float]:
+    """Return the longest step from y towards y+ inside the ball, and max_e ||y+_e|| / w_e."""
+    length, excess = np.inf, 0.0
     for e in range(len(problem.w)):
-        q = 0.0
+        dd = yd = yy = pp = 0.0
         for k in range(len(problem.axes)):
-            q += state.r[e, k] ** 2
-        s = problem.w[e] / np.sqrt(q + mu * mu)
-        for k in range(len(problem.axes)):
-            state.dy[e, k] = s * state.r[e, k]
+            y, target = iterate.y[e, k], step.y[e, k]
+            dd += (target - y) ** 2
+            yd += (target - y) * y
+            yy += y * y
+            pp += target * target
+        ww = problem.w[e] ** 2
+        if pp > ww:
+            excess = max(excess, pp / ww)
+            room = max(ww - yy, 0.0)
+            root = np.sqrt(yd * yd + dd * room)
+            length = min(length, room / (yd + root) if yd > 0.0 else (root - yd) / dd)
+    return length, np.sqrt(excess)
 
 
-@kernel()
-def _next_dual(problem, state, mu):
-    """dy <- y+ = g + S dr"""
-    y, r, dr = state.y, state.r, state.dr
+@kernel(exact=True)
+def _move(iterate: Any, step: Any, alpha: float, keep: float, gain: float) -> None:
+    """T += alpha dT, r += alpha dr, y = keep y + gain y+."""
+    iterate.t[:] += alpha * step.t
+    for e in range(len(iterate.r)):
+        for k in range(iterate.r.shape[1]):
+            iterate.r[e, k] += alpha * step.r[e, k]
+            iterate.y[e, k] = keep * iterate.y[e, k] + gain * step.y[e, k]
+
+
+@kernel(exact=True)
+def _set_residuals(problem: Any, t: Any, r: Any) -> None:
+    """r_e = P_e (t_i - t_j)."""
+    edges, v = problem.edges, problem.v
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        s = 0.0
+        for k in range(len(problem.axes)):
+            s += (t[i, k] - t[j, k]) * v[e, k]
+        for k in range(len(problem.axes)):
+            r[e, k] = (t[i, k] - t[j, k]) - s * v[e, k]
+
+
+@kernel(exact=True)
+def _objective_and_bound(problem: Any, iterate: Any) -> tuple[float, float]:
+    """Return R(T) / kappa and the dual value lambda = <y, r> / kappa."""
+    objective = bound = 0.0
     for e in range(len(problem.w)):
-        q = a = b = 0.0
+        rr = yr = 0.0
         for k in range(len(problem.axes)):
-            q += r[e, k] ** 2
-            a += r[e, k] * dr[e, k]
-            b += y[e, k] * dr[e, k]
-        rho = np.sqrt(q + mu * mu)
-        s = problem.w[e] / rho
-        h = 0.5 / (rho * rho)
-        for k in range(len(problem.axes)):
-            state.dy[e, k] = s * (r[e, k] + dr[e, k]) - h * (a * y[e, k] + b * r[e, k])
+            rr += iterate.r[e, k] * iterate.r[e, k]
+            yr += iterate.r[e, k] * iterate.y[e, k]
+        objective += problem.w[e] * np.sqrt(rr)
+        bound += yr
+    return objective / problem.kappa, bound / problem.kappa
 
 
-@kernel()
-def _ratio(problem, state):
-    """Largest alpha with ||y + alpha (y+ - y)|| <= w."""
-    best = 1e300
-    for e in range(len(problem.w)):
-        a = b = 0.0
-        yy = 0.0
-        for k in range(len(problem.axes)):
-            dy = state.dy[e, k] - state.y[e, k]
-            a += dy * dy
-            b += dy * state.y[e, k]
-            yy += state.y[e, k] ** 2
-        room = problem.w[e] ** 2 - yy
-        # a s^2 + 2 b s - room = 0
-        root = np.sqrt(b * b + a * max(room, 0.0))
-        s = room / (b + root) if b > 0 else (root - b) / max(a, 1e-300)
-        best = min(best, s)
-    return best
-
-
-@kernel()
-def _newton(problem, state, lam, mu, tol, rule, steps, trace):
-    n, d = problem.c.shape
-    N = n * d
-    its = 0
-    pstep, dstep = 1.0, 1.0
-    f, g, phi = _sums(problem, state, mu)
-    gap = (f - g) / problem.kappa
-    old = gap
-    while its < steps and gap > tol:
-        if rule[0] == 0:
-            mu = min(mu, rule[1] * gap)
-        else:
-            q = rule[1] if min(pstep, dstep) < 0.9 else rule[2]
-            mu = min(mu, q * gap)
-        phi = _smooth(problem, state, mu, 0.0)
-        _assemble(problem, state, mu, False)
-        if _factor(problem, state, N) != 0:
-            return its, lam, mu, -gap
-        _gradients(problem, state, mu)
-        _adjoint(problem, state.dy, state.rhs[1])
-        state.rhs[0][:] = problem.c
-        _solve(problem, state, state.rhs, N, 2)
-        ca = _dot(problem.c, state.rhs[0])
-        up = _dot(problem.c, state.rhs[1]) / ca
-        state.dt[:] = up * state.rhs[0] - state.rhs[1]
-        for rep in range(4):
-            _transverse(problem, state.dt, state.dr)
-            _next_dual(problem, state, mu)
-            _adjoint(problem, state.dy, state.total)
-            worst = 0.0
-            for i in range(n):
-                for k in range(d):
-                    state.total[i, k] = up * problem.c[i, k] - state.total[i, k]
-                    worst = max(worst, abs(state.total[i, k]))
-            trace[its, 5] = worst
-            trace[its, 6] = rep
-            if worst < max(1e-13, 1e-3 * gap) * problem.kappa / n or rep == 3:
-                break
-            _solve(problem, state, state.total, N, 1)
-            s = _dot(problem.c, state.total) / ca
-            up -= s
-            state.dt[:] += state.total - s * state.rhs[0]
-        slope = -_dot(state.dt, problem.c)  # ~0
-        pstep = 1.0
-        new = _smooth(problem, state, mu, pstep)
-        cuts = 0
-        while new > phi and cuts < 30:
-            pstep *= 0.5
-            cuts += 1
-            new = _smooth(problem, state, mu, pstep)
-        dstep = min(1.0, 0.99 * _ratio(problem, state))
-        state.t[:] += pstep * state.dt
-        state.y[:] += dstep * (state.dy - state.y)
-        _transverse(problem, state.t, state.r)
-        f, g, phi = _sums(problem, state, mu)
-        gap = (f - g) / problem.kappa
-        trace[its, 0] = f / problem.kappa
-        trace[its, 1] = gap
-        trace[its, 2] = mu
-        trace[its, 3] = pstep
-        trace[its, 4] = dstep
-        its += 1
-    return its, g / problem.kappa, mu, gap
-
-
-def prepare(graph):
-    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
-    lapack = "scipy.linalg.cython_lapack"
-    routines = np.array([function_address(lapack, "dpotrf"), function_address(lapack, "dpotrs")])
-    problem = Problem(
-        graph.edges, graph.directions, graph.weights, scale_functional(graph), float(graph.weights.sum()),
-        tuple(range(d)), routines,
-    )
-    state = State(
-        t=np.zeros((n, d)), y=np.zeros((m, d)), r=np.zeros((m, d)), dt=np.zeros((n, d)), dy=np.zeros((m, d)),
-        dr=np.zeros((m, d)), rhs=np.zeros((2, n, d)), total=np.zeros((n, d)), matrix=np.zeros((n * d) ** 2),
-        diagonal=np.zeros((n, d, d)), flags=np.frombuffer(b"LRTN", dtype=np.uint8), integers=np.zeros(8, np.int32),
-    )
-    return problem, state
-
-
-def run(graph, tol=1e-8, rule=(0, 0.15, 0.15), mu0=1.0, steps=60):
-    problem, state = prepare(graph)
-    trace = np.zeros((steps, 8))
-    _start(problem, state)
-    its, lam, mu, gap = _newton(problem, state, 0.0, mu0, tol, np.array(rule, float), steps, trace)
-    return state.t, state.y, its, gap, trace[:its]
+@kernel(exact=True)
+def _dot(x: Any, y: Any) -> float:
+    """Return the inner product of two (n, d) arrays."""
+    total = 0.0
+    for i in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            total += x[i, k] * y[i, k]
+    return total
