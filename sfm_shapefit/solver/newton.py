@@ -51,12 +51,13 @@ _MU_PER_GAP = 0.15  # smoothing relative to the gap; .05 to .25 need the same nu
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _STEPS_PER_FACTOR = 10
-_EDGE_WORK = 4e3  # a step's passes over one edge cost as much as so many operations of a factorisation
+_EDGE_WORK = 1500.0  # a step passes over one edge in the time of so many operations of a factorisation
 _EQUALITY = 1e-3, 1e-13  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
 _REFINEMENTS = 3
 _HALVINGS = 20
 _RIDGE = 1e-14, 1e-9  # first and last multiple of the identity added to M, per mean eigenvalue
 _STALL = 6  # factorisations without progress after which more will not help
+_SOLVE_WORK = 20.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
 
@@ -210,7 +211,7 @@ def _cycle(problem: Any, iterate: Any, model: Any, step: Any, progress: Any, tol
     if _factorise(problem, model) != 0:
         return Progress(mu, multiplier, progress.objective, first)
     order = float(problem.c.size)
-    step_work = _EDGE_WORK * len(problem.w) + 4.0 * order**2
+    step_work = _EDGE_WORK * len(problem.w) + _SOLVE_WORK * order**2
     work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
     for _ in range(_STEPS_PER_FACTOR):
         previous = progress.gap
