@@ -18,6 +18,7 @@ Geman-McClure weights: Zhang, "Parameter estimation techniques", IVC 1997, table
 """
 
 import enum
+from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
@@ -111,6 +112,10 @@ class PairDirections:
     def usable(self) -> IntArray:
         """Return the rows that have a direction."""
         return np.flatnonzero([status is DirectionStatus.USABLE for status in self.status])
+
+    def counts(self) -> dict[DirectionStatus, int]:
+        """Return how many pairs have each status, most frequent first."""
+        return dict(Counter(self.status).most_common())
 
     def sigma_deg(self) -> FloatArray:
         """Return the standard deviation along each direction's least certain axis, shape (k,)."""

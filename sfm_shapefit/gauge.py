@@ -10,9 +10,10 @@ from typing import Literal
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.geometry import Similarity, fit_similarity_l1
+from sfm_shapefit.geometry import Similarity, fit_similarity_l1, median_spread
 
 Scale = Literal["input", "unit"]
+
 
 _COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
 
@@ -45,7 +46,8 @@ def choose_gauge(locations: FloatArray, input_centers: FloatArray, scale: Scale)
         return _unit(
             locations, "unit: the input's centres coincide, so the scale is free; median distance is 1"
         )
-    similarity = fit_similarity_l1(locations, input_centers, rotate=False)
+    cap = 0.5 * median_spread(input_centers)  # a camera that has flown away must not set the scale
+    similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=cap or np.inf)
     if similarity.scale <= 0.0:
         return _unit(locations, "unit: the input's centres contradict the answer; median distance is 1")
     return Gauge(

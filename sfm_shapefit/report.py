@@ -7,11 +7,13 @@ columns and keys may be added, never renamed.
 import csv
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.robust import Verdict
 from sfm_shapefit.solver.options import SolverResult
 
 SCHEMA_VERSION = 1
@@ -19,47 +21,51 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRow:
-    """One image of the input, placed or not."""
+    """One image of the input, placed or not; NaN and None are empty fields."""
 
     name: str
-    placed: bool
-    reason: str
-    """Why it is not placed; empty for a placed camera."""
-    piece: int | None
-    """The parallel-rigid piece it belongs to, 0 the largest; None outside every piece of 3 cameras."""
-    x: float
-    y: float
-    z: float
-    """Centre in the output's units; NaN when not placed."""
-    degree: int
+    placed: bool = False
+    reason: str = ""
+    """Why it is not placed."""
+    piece: int | None = None
+    """The parallel-rigid piece it belongs to, 0 the solved one; None outside every piece of 3 cameras."""
+    x: float = math.nan
+    y: float = math.nan
+    z: float = math.nan
+    """Centre in the output's units."""
+    degree: int = 0
     """Number of its pairs with a usable direction."""
-    trust: float
-    """Share of its pairs that agree with the solution, in [0, 1]; NaN when not placed."""
-    sigma_x: float
-    sigma_y: float
-    sigma_z: float
-    """Standard deviation of the centre in the output's units, centroid and scale held fixed."""
+    trust: float = math.nan
+    """Share of its pairs that agree with the solution, in [0, 1]."""
+    sigma_x: float = math.nan
+    sigma_y: float = math.nan
+    sigma_z: float = math.nan
+    """Standard deviation of the solved centre in the output's units, with centroid and scale held fixed;
+    empty also where the agreeing pairs do not hold the camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairRow:
-    """One image pair with a usable direction."""
+    """One image pair that was looked at; NaN is an empty field."""
 
     name1: str
     name2: str
-    vx: float
-    vy: float
-    vz: float
+    vx: float = math.nan
+    vy: float = math.nan
+    vz: float = math.nan
     """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2)."""
-    support: int
+    support: int = 0
     """Number of inlier matches."""
-    weight: float
-    residual_deg: float
-    """Angle between the direction and the solved baseline; NaN if a camera is not placed."""
-    dual_norm: float
-    """||y_e|| / w_e of the certificate, below 1 for directions that the solution fits exactly."""
-    verdict: str
-    """inlier, outlier or undetermined."""
+    weight: float = math.nan
+    """Weight in the program."""
+    residual_deg: float = math.nan
+    """Angle between the direction and the solved baseline."""
+    dual_norm: float = math.nan
+    """||y_e|| / w_e of the certificate; below 1 for directions that the solution fits exactly."""
+    verdict: str = Verdict.UNDETERMINED.value
+    """inlier, outlier, or undetermined."""
+    reason: str = ""
+    """Why it is undetermined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,12 +80,32 @@ class PieceRow:
 
 
 def write_csv(rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, path: Path) -> None:
-    """Write rows as CSV with a header; numbers round-trip, NaN and None are empty fields."""
+    """Write rows of one type as CSV; the header stands even where there is no row."""
     names = [field.name for field in fields(row_type)]
-    with path.open("w", newline="", encoding="utf-8") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([_cell(getattr(row, name)) for name in names] for row in rows)
+    write_records([asdict(row) for row in rows], path, names)
+
+
+def write_records(
+    records: Sequence[Mapping[str, object]], path: Path, names: Sequence[str] | None = None
+) -> None:
+    """Write records as CSV; numbers round-trip, NaN and None are empty fields.
+
+    Args:
+        records: one mapping per row.
+        path: the file.
+        names: the columns; by default those of the first record.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    columns = names or list(records[0])
+    try:
+        with path.open("w", newline="", encoding="utf-8") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows([_cell(record[name]) for name in columns] for record in records)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
 
 
 def write_json(summary: dict[str, Any], path: Path) -> None:
@@ -105,11 +131,6 @@ def solve_summary(result: SolverResult) -> dict[str, Any]:
         "method": result.method,
         "method_reason": result.method_reason,
     }
-
-
-def pieces_summary(pieces: Sequence[PieceRow]) -> list[dict[str, Any]]:
-    """Return the `pieces` list of locate.json."""
-    return [asdict(piece) for piece in pieces]
 
 
 def _cell(value: object) -> object:

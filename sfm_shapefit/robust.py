@@ -19,12 +19,14 @@ from scipy.sparse.linalg import splu
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
+from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import adjoint, along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _MEDIAN_OF_RAYLEIGH = 1.1774  # median length of a 2-vector of unit normal components
 _OUTLIER_CHI2 = 25.0  # 5 sigma: one in 270,000 of normal residuals
 _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
+_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _DENSE_UNKNOWNS = 1500
 _RIDGE = (
     1e-12  # of the largest diagonal entry: keeps a camera that nothing holds finite, and far above any limit
@@ -55,7 +57,7 @@ class Assessment:
     """(n,) share of the camera's pairs that agree with the solution."""
     sigmas: FloatArray
     """(n, 3) standard deviation of each location in the units of `locations`, with centroid and scale
-    held fixed; infinite where the inlier pairs do not hold a camera."""
+    held fixed; infinite for cameras outside the largest rigid piece of the inlier pairs."""
 
 
 def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray) -> Assessment:
@@ -93,21 +95,25 @@ def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray) -> A
 def _location_sigmas(
     graph: ViewGraph, locations: FloatArray, inliers: BoolArray, information: FloatArray
 ) -> FloatArray:
-    """Return the standard deviations of the locations from the (m, 3, 3) information of the directions."""
-    n = graph.num_cameras
-    edges = graph.edges[inliers]
-    if len(edges) == 0:
-        return np.full((n, 3), np.inf)
-    lengths = np.linalg.norm(differences(locations, edges), axis=1)
-    blocks = information[inliers] / np.maximum(lengths, 1e-12 * lengths.max())[:, None, None] ** 2
-    gauge = _gauge_directions(locations)
-    variances = (_dense_variances if 3 * n <= _DENSE_UNKNOWNS else _sampled_variances)(
-        n, edges, blocks, gauge
-    )
-    sigmas = np.sqrt(np.maximum(variances, 0.0)).reshape(n, 3)
-    extent = float(np.ptp(locations, axis=0).max())
-    loose = (sigmas > extent).any(axis=1) | (np.bincount(edges.ravel(), minlength=n) < 2)
-    return np.where(loose[:, None], np.inf, sigmas)
+    """Return the standard deviations of the locations from the (m, 3, 3) information of the directions.
+
+    Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
+    """
+    sigmas = np.full(locations.shape, np.inf)
+    pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], 3)
+    rows = np.flatnonzero(inliers)[pieces == 0]
+    held, edges = np.unique(graph.edges[rows], return_inverse=True)
+    if len(held) < _SMALLEST_RIGID:
+        return sigmas
+    edges, t = edges.reshape(-1, 2), locations[held]
+    lengths = np.linalg.norm(differences(t, edges), axis=1)
+    blocks = information[rows] / np.maximum(lengths, 1e-12 * lengths.max())[:, None, None] ** 2
+    variances_of = _dense_variances if t.size <= _DENSE_UNKNOWNS else _sampled_variances
+    variances = variances_of(len(held), edges, blocks, _gauge_directions(t))
+    found = np.sqrt(np.maximum(variances, 0.0)).reshape(-1, 3)
+    is_loose = (found > np.ptp(t, axis=0).max()).any(axis=1)
+    sigmas[held] = np.where(is_loose[:, None], np.inf, found)
+    return sigmas
 
 
 def _gauge_directions(locations: FloatArray) -> FloatArray:
