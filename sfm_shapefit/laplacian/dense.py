@@ -151,7 +151,7 @@ def syrk(
 
 @kernel(exact=True)
 def potrs(routines: Any, flags: Any, integers: Any, a: Any, order: int, b: Any) -> None:
-    """Solve L L^T x = b in place; `a` holds L as one block, and b its right-hand sides one after the other."""
+    """Solve L L^T x = b in place; `a` holds L as one block, b its right-hand sides one after the other."""
     integers[0] = order
     integers[1] = b.size // order
     integers[2] = 0
