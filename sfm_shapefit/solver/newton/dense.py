@@ -133,7 +133,9 @@ def _cycle(
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = min(mu, MU_PER_GAP * previous)
-        target = _propose(problem, iterate, model, factor, step, mu, previous)
+        target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
+        if not exact:
+            break
         multiplier = take(problem, iterate, step, mu, multiplier, target)
         progress = measure(problem, iterate, mu, multiplier)
         work += step_work
@@ -228,12 +230,12 @@ def _propose(problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu:
     for _ in range(REFINEMENTS):
         nodes[:] = multiplier * c - nodes
         if np.max(np.abs(nodes)) <= allowed:
-            break
+            return float(multiplier), True
         _solve(factor, nodes)
         shift = dot(c, nodes) / scale
         multiplier -= shift
         extend_step(problem, model, nodes - shift * a, step)
-    return float(multiplier)
+    return float(multiplier), np.max(np.abs(multiplier * c - nodes)) <= allowed
 
 
 @kernel(exact=True)

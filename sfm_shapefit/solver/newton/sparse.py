@@ -104,7 +104,9 @@ def _cycle(
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = min(mu, MU_PER_GAP * previous)
-        target = _propose(problem, iterate, model, factor, step, mu, previous)
+        target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
+        if not exact:
+            break
         multiplier = take(problem, iterate, step, mu, multiplier, target)
         progress = measure(problem, iterate, mu, multiplier)
         work += step_work
@@ -121,8 +123,12 @@ def _propose(
     step: Step,
     mu: float,
     gap: float,
-) -> float:
-    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c; return lambda+."""
+) -> tuple[float, bool]:
+    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
+
+    Returns:
+        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    """
     c, a, nodes = problem.c, model.a, step.nodes
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
     set_gradient(problem, iterate, model, mu, step)
@@ -132,12 +138,12 @@ def _propose(
     for _ in range(REFINEMENTS):
         violation = multiplier * c - nodes
         if np.abs(violation).max() <= allowed:
-            break
+            return multiplier, True
         solution = factor.solve(violation)
         shift = dot(c, solution) / scale
         multiplier -= shift
         extend_step(problem, model, solution - shift * a, step)
-    return multiplier
+    return multiplier, bool(np.abs(multiplier * c - nodes).max() <= allowed)
 
 
 def _factorise(problem: Problem, model: Model, factor: CholeskyFactor) -> bool:

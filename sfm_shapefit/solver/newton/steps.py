@@ -16,6 +16,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 MU_PER_GAP = 0.1  # smoothing relative to the gap; .07 to .3 need the same number of factorisations
 STEPS_PER_FACTOR = 10
+_LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
 REFINEMENTS = 3
 STALL = 6  # factorisations without progress after which more will not help
 EDGE_WORK = 1500.0  # a step passes over one edge in the time of so many operations of a factorisation
@@ -168,8 +169,9 @@ def allowed_violation(problem: Any, gap: float) -> float:
 @kernel(exact=True)
 def linearise(iterate: Any, mu: float, model: Any) -> None:
     """Keep the iterate as the point at which S is taken."""
+    floor = max(mu, _LEAST_MU)
     for e in range(len(iterate.r)):
-        rr = mu * mu
+        rr = floor * floor
         for k in range(iterate.r.shape[1]):
             rr += iterate.r[e, k] ** 2
             model.y[e, k] = iterate.y[e, k]
