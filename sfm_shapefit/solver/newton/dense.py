@@ -141,7 +141,7 @@ def _cycle(
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return progress
+    return Progress(progress.mu, progress.multiplier, progress.objective, progress.gap)
 
 
 @kernel(exact=True)
@@ -219,8 +219,14 @@ def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
 
 
 @kernel(exact=True)
-def _propose(problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu: float, gap: float) -> float:
-    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c; return lambda+."""
+def _propose(
+    problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu: float, gap: float
+) -> tuple[float, bool]:
+    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
+
+    Returns:
+        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    """
     c, a, nodes = problem.c, model.a, step.nodes
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
     set_gradient(problem, iterate, model, mu, step)
@@ -235,7 +241,7 @@ def _propose(problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu:
         shift = dot(c, nodes) / scale
         multiplier -= shift
         extend_step(problem, model, nodes - shift * a, step)
-    return float(multiplier), np.max(np.abs(multiplier * c - nodes)) <= allowed
+    return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
 
 
 @kernel(exact=True)

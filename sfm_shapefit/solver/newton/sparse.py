@@ -1,10 +1,16 @@
 """Newton cycles with a sparse block Cholesky factor of M, whose analysis is done once on the n cameras.
 
-There is no lifting here: it would fill the matrix. One camera is grounded instead, and where M is singular
-along T (exact data) a multiple of the weights is added to every block until it is not.
+Lifting by c c^T would fill the matrix. But M must be kept away from T: the objective is homogeneous, so
+M T tends to 0 with mu, whatever the data. Instead one pair is pinned: with q = D^T of v_e at that pair,
+
+    M' = M + tau q q^T,    M dT = M' dT - tau q <q, dT>,
+
+so that with a = M'^-1 c and p = M'^-1 q the step is lambda a + sigma p + M'^-1 (right-hand side), where
+lambda and sigma = tau <q, dT> solve the two equations <c, dT> = what is wanted, <q, dT> = sigma / tau.
+Translations are taken away by grounding one camera.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -42,6 +48,7 @@ from sfm_shapefit.solver.newton.steps import (
     take,
 )
 from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _RIDGES = 0.0, 1e-12, 1e-10  # tried in turn, per stiffness of the edge
@@ -68,7 +75,8 @@ def solve_newton_sparse(
     neighbours = adjacency(graph.num_cameras, problem.edges)
     plan = plan_factorisation(neighbours, problem.edges, best_order(neighbours))
     factor = allocate_factor(plan, graph.dimension)
-    if not _factorise(problem, model, factor) or not start_from(problem, model.a, iterate):
+    system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
+    if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
         raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     progress = measure(problem, iterate, 1.0, 0.0)
     count, stalled = 0, 0
@@ -80,6 +88,27 @@ def solve_newton_sparse(
         if is_cancelled(on_iteration, count, progress):
             break
     return *answer(iterate, progress, tol), count
+
+
+class System(NamedTuple):
+    """The bordered system after a factorisation."""
+
+    factor: CholeskyFactor
+    """Of M'."""
+    a: FloatArray
+    """(n, d), M'^-1 c."""
+    p: FloatArray
+    """(n, d), M'^-1 q."""
+    rows: FloatArray
+    """(2, n * d), c and q."""
+    matrix: FloatArray
+    """(2, 2), of the equations for lambda and sigma."""
+
+    def solve(self, rhs: FloatArray, length: float) -> tuple[float, FloatArray]:
+        """Return lambda and x with M x = lambda c + rhs, <c, x> = length."""
+        z = self.factor.solve(rhs)
+        unknown = np.linalg.solve(self.matrix, np.array([length, 0.0]) - self.rows @ z.ravel())
+        return float(unknown[0]), unknown[0] * self.a + unknown[1] * self.p + z
 
 
 def _cycle(
@@ -96,7 +125,9 @@ def _cycle(
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(iterate, mu, model)
-    if not _factorise(problem, model, factor):
+    longest = int(np.argmax(along(differences(iterate.t, problem.edges), problem.v)))
+    system = _factorise(problem, model, factor, longest)
+    if system is None:
         return progress
     edge_work = EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.panels.size
@@ -104,7 +135,7 @@ def _cycle(
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = min(mu, MU_PER_GAP * previous)
-        target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
+        target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
         multiplier = take(problem, iterate, step, mu, multiplier, target)
@@ -116,49 +147,49 @@ def _cycle(
 
 
 def _propose(
-    problem: Problem,
-    iterate: Iterate,
-    model: Model,
-    factor: CholeskyFactor,
-    step: Step,
-    mu: float,
-    gap: float,
+    problem: Problem, iterate: Iterate, model: Model, system: System, step: Step, mu: float, gap: float
 ) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
 
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
-    c, a, nodes = problem.c, model.a, step.nodes
-    allowed, scale = allowed_violation(problem, gap), dot(c, a)
+    c = problem.c
+    allowed = allowed_violation(problem, gap)
     set_gradient(problem, iterate, model, mu, step)
-    solution = factor.solve(nodes)
-    multiplier = dot(c, solution) / scale
-    extend_step(problem, model, multiplier * a - solution, step)
+    drift = problem.kappa - dot(c, iterate.t)
+    multiplier, dt = system.solve(-step.nodes, drift)
+    extend_step(problem, model, dt, step)
     for _ in range(REFINEMENTS):
-        violation = multiplier * c - nodes
+        violation = multiplier * c - step.nodes
         if np.abs(violation).max() <= allowed:
             return multiplier, True
-        solution = factor.solve(violation)
-        shift = dot(c, solution) / scale
-        multiplier -= shift
-        extend_step(problem, model, solution - shift * a, step)
-    return multiplier, bool(np.abs(multiplier * c - nodes).max() <= allowed)
+        shift, dt = system.solve(violation, drift - dot(c, step.t))
+        multiplier += shift
+        extend_step(problem, model, dt, step)
+    return multiplier, bool(np.abs(multiplier * c - step.nodes).max() <= allowed)
 
 
-def _factorise(problem: Problem, model: Model, factor: CholeskyFactor) -> bool:
-    """Factor M and solve for a; return whether it is positive definite."""
+def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: int) -> System | None:
+    """Factor M'; None if it is not positive definite."""
     m, d = model.y.shape
+    v = problem.v[pinned]
     blocks = np.empty((m, d, d))
+    q = np.zeros_like(problem.c)
+    q[problem.edges[pinned, 0]], q[problem.edges[pinned, 1]] = v, -v
+    stiffness = float(np.mean(problem.w / model.rho))
     for ridge in _RIDGES:
         _set_blocks(problem, model, ridge, blocks)
+        blocks[pinned] += stiffness * np.outer(v, v)
         try:
             factor.refactor(blocks)
         except UnsolvableError:
             continue
-        model.a[:] = factor.solve(problem.c)
-        return True
-    return False
+        a, p = factor.solve(problem.c), factor.solve(q)
+        rows = np.stack([problem.c.ravel(), q.ravel()])
+        matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / stiffness])
+        return System(factor, a, p, rows, matrix) if abs(np.linalg.det(matrix)) > 0.0 else None
+    return None
 
 
 @kernel(exact=True)

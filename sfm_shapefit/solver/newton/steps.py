@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import scale_functional
@@ -26,6 +27,7 @@ _EQUALITY = 1e-5, 1e-13  # allowed violation of D^T y = lambda c, per gap and at
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _HALVINGS = 20
+_CANCEL = 1e-12  # size of c, relative to the sum of weights, that is rounding
 
 
 class Problem(NamedTuple):
@@ -88,7 +90,11 @@ class Progress(NamedTuple):
 
 
 def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
-    """Return the problem as arrays, and room for the iteration."""
+    """Return the problem as arrays, and room for the iteration.
+
+    Raises:
+        UnsolvableError: if c is 0 up to rounding.
+    """
     n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
 
     def nodes() -> FloatArray:
@@ -105,6 +111,8 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
         float(graph.weights.sum()),
         tuple(range(d)),
     )
+    if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
+        raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
     model = Model(np.zeros((m, d)), np.zeros((m, d)), np.ones(m), nodes())
     step = Step(nodes(), edges(), edges(), nodes())
     return problem, Iterate(nodes(), edges(), edges()), model, step
