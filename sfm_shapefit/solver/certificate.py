@@ -11,7 +11,17 @@ the right-hand side orthogonal to T, the one direction in which D^T P D is nearl
 data are nearly exact.
 
 The system is solved by conjugate gradients, preconditioned by the scalar graph Laplacian of the same
-graph, in a number of steps that does not grow with n.
+graph, in a number of steps that does not grow with n. A dual that satisfies the equality already, as
+that of a Newton method does, is taken as it is.
+
+Uniqueness. An optimal T' has w_e ||r'_e|| = <y_e, r'_e> for every pair and every optimal dual: r'_e = 0
+where ||y_e|| < w_e, and r'_e points along y_e where ||y_e|| = w_e. If translations and T are all that
+satisfies these linear conditions, there is no other optimum. (It suffices, but is not needed, that the
+pairs with ||y_e|| < w_e are parallel rigid.) The conditions are the null space of a Laplacian with blocks
+
+    w_e P_e  where ||y_e|| < (1 - margin) w_e,      w_e (P_e - y_e y_e^T / ||y_e||^2)  elsewhere,
+
+and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells whether it is regular.
 """
 
 from collections.abc import Callable
@@ -22,10 +32,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.linalg import splu
 
 from sfm_shapefit.arrays import FloatArray, frozen
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.laplacian.cholesky import factorise
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import plan_factorisation
 from sfm_shapefit.solver.program import (
     across,
     adjoint,
+    along,
     differences,
     objective,
     scale_functional,
@@ -37,6 +52,10 @@ LinearMap = Callable[[FloatArray], FloatArray]
 _REPAIRS = 3  # each repair shrinks the equality residual to the rounding of the previous one
 _CG_STEPS = 500
 _CG_REDUCTION = 1e-13
+_EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
+_STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
+_REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
+_UNIQUENESS_FLOPS = 1e11  # a few seconds; beyond it uniqueness is not examined
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,6 +70,9 @@ class Certificate:
     """(m, d) the feasible dual point that proves it."""
     equality_residual: float
     """Largest violation of D^T y = dual_bound * c at a camera, relative to the largest weighted degree."""
+    unique: bool | None = None
+    """True: the dual proves that no other locations are optimal (up to translation and scale, and up to
+    the gap). False: it does not prove that. None: not examined."""
 
     @property
     def gap(self) -> float:
@@ -58,40 +80,77 @@ class Certificate:
         return self.objective - self.dual_bound
 
 
-def certify(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> Certificate:
+def certify(
+    graph: ViewGraph, locations: FloatArray, dual: FloatArray, *, uniqueness: bool = False
+) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
     Args:
         graph: a connected view graph.
         locations: (n, d) camera centres, in any scale, with L(T) > 0.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
+        uniqueness: also examine whether the optimum is unique; costs one sparse factorisation.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
     """
     _check(graph, locations, dual)
-    edges, v, w = graph.edges, graph.directions, graph.weights
+    edges, w = graph.edges, graph.weights
     c = scale_functional(graph)
-    precondition = _laplacian_inverse(graph)
+    degree = np.bincount(edges.ravel(), weights=np.repeat(w, 2), minlength=graph.num_cameras).max()
     t = locations - locations.mean(axis=0)
 
-    y = across(dual, v)
-    for _ in range(_REPAIRS):
-        multiplier = float(np.sum(y * differences(t, edges)) / np.sum(c * t))
-        violation = adjoint(y, edges, graph.num_cameras) - multiplier * c
-        h = _conjugate_gradients(lambda x: _projected_laplacian(graph, x), violation, precondition)
-        y = across(y - across(differences(h, edges), v), v)
-
+    y = _with_equality(graph, t, dual, c, _EXACT * float(degree))
     y /= max(1.0, float(np.max(np.linalg.norm(y, axis=1) / w)))
     total = adjoint(y, edges, graph.num_cameras)
     bound = float(np.sum(total * c) / np.sum(c * c))
     if bound <= 0.0:  # y = 0 is feasible and proves at least this
         y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
-    degree = np.bincount(edges.ravel(), weights=np.repeat(w, 2), minlength=graph.num_cameras).max()
-    residual = float(np.linalg.norm(total - bound * c, axis=1).max() / degree)
     return Certificate(
-        objective=objective(graph, t), dual_bound=bound, dual=frozen(y), equality_residual=residual
+        objective=objective(graph, t),
+        dual_bound=bound,
+        dual=frozen(y),
+        equality_residual=float(np.linalg.norm(total - bound * c, axis=1).max() / degree),
+        unique=_is_unique(graph, t, y) if uniqueness else None,
     )
+
+
+def _with_equality(
+    graph: ViewGraph, t: FloatArray, dual: FloatArray, c: FloatArray, allowed: float
+) -> FloatArray:
+    """Return the dual moved across the directions until D^T y = lambda c at every camera up to `allowed`."""
+    edges, v = graph.edges, graph.directions
+    y = across(dual, v)
+    precondition: LinearMap | None = None
+    for _ in range(_REPAIRS):
+        multiplier = float(np.sum(y * differences(t, edges)) / np.sum(c * t))
+        violation = adjoint(y, edges, graph.num_cameras) - multiplier * c
+        if np.linalg.norm(violation, axis=1).max() <= allowed:
+            break
+        precondition = precondition or _laplacian_inverse(graph)
+        h = _conjugate_gradients(lambda x: _projected_laplacian(graph, x), violation, precondition)
+        y = across(y - across(differences(h, edges), v), v)
+    return y
+
+
+def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
+    """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
+    neighbours = adjacency(graph.num_cameras, graph.edges)
+    symbolic = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
+    d = graph.dimension
+    if symbolic.flops * d**3 > _UNIQUENESS_FLOPS:
+        return None
+    v = graph.directions
+    norms = np.linalg.norm(y, axis=1)
+    held = norms < (1.0 - _STRICT) * graph.weights
+    u = np.where(held, 0.0, 1.0 / np.maximum(norms, np.finfo(float).tiny))[:, None] * y
+    blocks = np.eye(d) - v[:, :, None] * v[:, None, :] - u[:, :, None] * u[:, None, :]
+    longest = int(np.argmax(along(differences(t, graph.edges), v)))
+    blocks[longest] += np.outer(v[longest], v[longest])
+    try:
+        return factorise(symbolic, graph.weights[:, None, None] * blocks).smallest_pivot > _REGULAR
+    except UnsolvableError:
+        return False
 
 
 def _check(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:

@@ -1,0 +1,250 @@
+"""Newton cycles with a dense Cholesky factor of M, nd x nd, compiled as one function over LAPACK."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.dense import (
+    FLAGS,
+    one_blas_thread,
+    potrf,
+    potrs,
+    routine_addresses,
+    work_integers,
+)
+from sfm_shapefit.solver.newton.steps import (
+    EDGE_WORK,
+    MU_PER_GAP,
+    REFINEMENTS,
+    SOLVE_WORK,
+    STALL,
+    STEPS_PER_FACTOR,
+    Progress,
+    allocate,
+    allowed_violation,
+    answer,
+    dot,
+    extend_step,
+    is_cancelled,
+    linearise,
+    measure,
+    pays,
+    set_gradient,
+    set_residuals,
+    start_from,
+    take,
+)
+from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.viewgraph import ViewGraph
+
+_RIDGE = 1e-14, 1e-9  # first and last multiple of the identity added to M, per mean eigenvalue
+_OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
+
+
+class DenseFactor(NamedTuple):
+    """Room for M and its Cholesky factor, and what LAPACK is called with."""
+
+    matrix: FloatArray
+    """(nd * nd,) lower triangle in column-major order."""
+    diagonal: FloatArray
+    """(n, d, d) scratch: the diagonal blocks of M."""
+    routines: IntArray
+    flags: Any
+    integers: Any
+
+
+def solve_newton_dense(
+    graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
+) -> tuple[FloatArray, FloatArray, int]:
+    """Solve the program with a dense Cholesky factor of nd x nd; for n up to about a thousand.
+
+    Args:
+        graph: a connected, parallel-rigid view graph whose c is not 0.
+        tol: the gap wanted, in units of the objective.
+        max_iterations: limit of factorisations.
+        on_iteration: called after every factorisation and its steps.
+
+    Returns:
+        locations (n, d), the dual (m, d), and the number of factorisations.
+
+    Raises:
+        UnsolvableError: if the directions do not determine any locations.
+    """
+    problem, iterate, model, step = allocate(graph)
+    n, d = problem.c.shape
+    lapack = routine_addresses(np.float64), FLAGS, work_integers()
+    factor = DenseFactor(np.empty((n * d) ** 2), np.empty((n, d, d)), *lapack)
+    with one_blas_thread():
+        if not _start(problem, iterate, model, factor):
+            raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
+        progress = measure(problem, iterate, 1.0, 0.0)
+        count, stalled = 0, 0
+        chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
+        while progress.gap > tol and count < max_iterations and stalled < STALL:
+            limit = min(chunk, max_iterations - count)
+            done, stalled, progress = _newton(
+                problem, iterate, model, factor, step, progress, tol, limit, stalled
+            )
+            count += done
+            if is_cancelled(on_iteration, count, progress):
+                break
+    return *answer(iterate, progress, tol), count
+
+
+@kernel(exact=True)
+def _newton(
+    problem: Any,
+    iterate: Any,
+    model: Any,
+    factor: Any,
+    step: Any,
+    progress: Any,
+    tol: float,
+    limit: int,
+    stalled: int,
+) -> tuple[int, int, Progress]:
+    """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
+    count = 0
+    while count < limit and progress.gap > tol and stalled < STALL:
+        before = progress.gap
+        count += 1
+        progress = _cycle(problem, iterate, model, factor, step, progress, tol)
+        stalled = 0 if progress.gap < 0.9 * before else stalled + 1
+    return count, stalled, progress
+
+
+@kernel(exact=True)
+def _cycle(
+    problem: Any, iterate: Any, model: Any, factor: Any, step: Any, progress: Any, tol: float
+) -> Progress:
+    """Factor once, then step with that factor while it pays."""
+    first, multiplier = progress.gap, progress.multiplier
+    mu = min(progress.mu, MU_PER_GAP * first)
+    set_residuals(problem, iterate.t, iterate.r)
+    linearise(iterate, mu, model)
+    if _factorise(problem, model, factor) != 0:
+        return Progress(mu, multiplier, progress.objective, first)
+    order = float(problem.c.size)
+    step_work = EDGE_WORK * len(problem.w) + SOLVE_WORK * order**2
+    work = order**3 / 3.0 + 0.5 * EDGE_WORK * len(problem.w)
+    for _ in range(STEPS_PER_FACTOR):
+        previous = progress.gap
+        mu = min(mu, MU_PER_GAP * previous)
+        target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
+        if not exact:
+            break
+        multiplier = take(problem, iterate, step, mu, multiplier, target)
+        progress = measure(problem, iterate, mu, multiplier)
+        work += step_work
+        if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
+            break
+    return Progress(progress.mu, progress.multiplier, progress.objective, progress.gap)
+
+
+@kernel(exact=True)
+def _start(problem: Any, iterate: Any, model: Any, factor: Any) -> bool:
+    """Factor the projected Laplacian D^T W P D, which is M at rho = 1, y = r = 0, and start from it."""
+    if _factorise(problem, model, factor) != 0:
+        return False
+    started: bool = start_from(problem, model.a, iterate)
+    return started
+
+
+@kernel(exact=True)
+def _factorise(problem: Any, model: Any, factor: Any) -> int:
+    """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if it worked."""
+    order = problem.c.size
+    size = 0.0  # mean eigenvalue
+    for e in range(len(problem.w)):
+        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] / model.rho[e] / order
+    ridge, last = _RIDGE
+    info = 1
+    while info != 0 and ridge <= last:
+        _lift(problem, factor, size, ridge * size)
+        _add_edge_blocks(problem, model, factor)
+        info = potrf(factor.routines, factor.flags, factor.integers, factor.matrix, 0, order, order)
+        ridge *= 100.0
+    model.a[:] = problem.c
+    if info == 0:
+        _solve(factor, model.a)
+    return info
+
+
+@kernel(exact=True)
+def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
+    """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
+    n, d = problem.c.shape
+    order = n * d
+    c = problem.c.reshape(order)
+    along_c = size / dot(problem.c, problem.c)
+    for q in range(order):
+        column = factor.matrix[q * order : (q + 1) * order]
+        slope = along_c * c[q]
+        for p in range(q, order):
+            column[p] = slope * c[p]
+        for p in range(q, order, d):
+            column[p] += size / n
+        column[q] += ridge
+
+
+@kernel(exact=True)
+def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
+    """Add D^T S D to the lower triangle of the matrix."""
+    edges, v, w, y, r = problem.edges, problem.v, problem.w, model.y, model.r
+    matrix, diagonal = factor.matrix, factor.diagonal
+    n, d = len(problem.c), len(problem.axes)
+    order = n * d
+    diagonal[:] = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        corner = min(i, j) * d * order + max(i, j) * d
+        inverse = 1.0 / model.rho[e]
+        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
+        for k in range(d):
+            for q in range(d):
+                s = -stiffness * v[e, k] * v[e, q] - bend * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
+                if k == q:
+                    s += stiffness
+                matrix[corner + k * order + q] -= s
+                if k <= q:
+                    diagonal[i, k, q] += s
+                    diagonal[j, k, q] += s
+    for i in range(n):
+        for k in range(d):
+            for q in range(k, d):
+                matrix[(i * d + k) * order + i * d + q] += diagonal[i, k, q]
+
+
+@kernel(exact=True)
+def _propose(
+    problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu: float, gap: float
+) -> tuple[float, bool]:
+    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
+
+    Returns:
+        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    """
+    c, a, nodes = problem.c, model.a, step.nodes
+    allowed, scale = allowed_violation(problem, gap), dot(c, a)
+    set_gradient(problem, iterate, model, mu, step)
+    _solve(factor, nodes)
+    multiplier = dot(c, nodes) / scale
+    extend_step(problem, model, multiplier * a - nodes, step)
+    for _ in range(REFINEMENTS):
+        nodes[:] = multiplier * c - nodes
+        if np.max(np.abs(nodes)) <= allowed:
+            return float(multiplier), True
+        _solve(factor, nodes)
+        shift = dot(c, nodes) / scale
+        multiplier -= shift
+        extend_step(problem, model, nodes - shift * a, step)
+    return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
+
+
+@kernel(exact=True)
+def _solve(factor: Any, nodes: Any) -> None:
+    """Replace `nodes` by M^-1 nodes."""
+    potrs(factor.routines, factor.flags, factor.integers, factor.matrix, nodes.size, nodes)

@@ -1,0 +1,206 @@
+"""Newton cycles with a sparse block Cholesky factor of M, whose analysis is done once on the n cameras.
+
+Lifting by c c^T would fill the matrix. But M must be kept away from T: the objective is homogeneous, so
+M T tends to 0 with mu, whatever the data. Instead one pair is pinned: with q = D^T of v_e at that pair,
+
+    M' = M + tau q q^T,    M dT = M' dT - tau q <q, dT>,
+
+so that with a = M'^-1 c and p = M'^-1 q the step is lambda a + sigma p + M'^-1 (right-hand side), where
+lambda and sigma = tau <q, dT> solve the two equations <c, dT> = what is wanted, <q, dT> = sigma / tau.
+Translations are taken away by grounding one camera.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.solver.newton.steps import (
+    EDGE_WORK,
+    MU_PER_GAP,
+    REFINEMENTS,
+    SOLVE_WORK,
+    STALL,
+    STEPS_PER_FACTOR,
+    Iterate,
+    Model,
+    Problem,
+    Progress,
+    Step,
+    allocate,
+    allowed_violation,
+    answer,
+    dot,
+    extend_step,
+    is_cancelled,
+    linearise,
+    measure,
+    pays,
+    set_gradient,
+    set_residuals,
+    start_from,
+    take,
+)
+from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.program import along, differences
+from sfm_shapefit.viewgraph import ViewGraph
+
+_RIDGES = 0.0, 1e-12, 1e-10  # tried in turn, per stiffness of the edge
+
+
+def solve_newton_sparse(
+    graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
+) -> tuple[FloatArray, FloatArray, int]:
+    """Solve the program with a sparse Cholesky factor in d x d blocks; as `solve_newton_dense` otherwise.
+
+    Args:
+        graph: a connected, parallel-rigid view graph whose c is not 0.
+        tol: the gap wanted, in units of the objective.
+        max_iterations: limit of factorisations.
+        on_iteration: called after every factorisation and its steps.
+
+    Returns:
+        locations (n, d), the dual (m, d), and the number of factorisations.
+
+    Raises:
+        UnsolvableError: if the directions do not determine any locations.
+    """
+    problem, iterate, model, step = allocate(graph)
+    neighbours = adjacency(graph.num_cameras, problem.edges)
+    plan = plan_factorisation(neighbours, problem.edges, best_order(neighbours))
+    factor = allocate_factor(plan, graph.dimension)
+    system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
+    if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
+        raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
+    progress = measure(problem, iterate, 1.0, 0.0)
+    count, stalled = 0, 0
+    while progress.gap > tol and count < max_iterations and stalled < STALL:
+        before = progress.gap
+        progress = _cycle(problem, iterate, model, factor, step, progress, tol)
+        stalled = 0 if progress.gap < 0.9 * before else stalled + 1
+        count += 1
+        if is_cancelled(on_iteration, count, progress):
+            break
+    return *answer(iterate, progress, tol), count
+
+
+class System(NamedTuple):
+    """The bordered system after a factorisation."""
+
+    factor: CholeskyFactor
+    """Of M'."""
+    a: FloatArray
+    """(n, d), M'^-1 c."""
+    p: FloatArray
+    """(n, d), M'^-1 q."""
+    rows: FloatArray
+    """(2, n * d), c and q."""
+    matrix: FloatArray
+    """(2, 2), of the equations for lambda and sigma."""
+
+    def solve(self, rhs: FloatArray, length: float) -> tuple[float, FloatArray]:
+        """Return lambda and x with M x = lambda c + rhs, <c, x> = length."""
+        z = self.factor.solve(rhs)
+        unknown = np.linalg.solve(self.matrix, np.array([length, 0.0]) - self.rows @ z.ravel())
+        return float(unknown[0]), unknown[0] * self.a + unknown[1] * self.p + z
+
+
+def _cycle(
+    problem: Problem,
+    iterate: Iterate,
+    model: Model,
+    factor: CholeskyFactor,
+    step: Step,
+    progress: Progress,
+    tol: float,
+) -> Progress:
+    """Factor once, then step with that factor while it pays."""
+    first, multiplier = progress.gap, progress.multiplier
+    mu = min(progress.mu, MU_PER_GAP * first)
+    set_residuals(problem, iterate.t, iterate.r)
+    linearise(iterate, mu, model)
+    longest = int(np.argmax(along(differences(iterate.t, problem.edges), problem.v)))
+    system = _factorise(problem, model, factor, longest)
+    if system is None:
+        return progress
+    edge_work = EDGE_WORK * len(problem.w)
+    step_work = edge_work + SOLVE_WORK * factor.panels.size
+    work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
+    for _ in range(STEPS_PER_FACTOR):
+        previous = progress.gap
+        mu = min(mu, MU_PER_GAP * previous)
+        target, exact = _propose(problem, iterate, model, system, step, mu, previous)
+        if not exact:
+            break
+        multiplier = take(problem, iterate, step, mu, multiplier, target)
+        progress = measure(problem, iterate, mu, multiplier)
+        work += step_work
+        if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
+            break
+    return progress
+
+
+def _propose(
+    problem: Problem, iterate: Iterate, model: Model, system: System, step: Step, mu: float, gap: float
+) -> tuple[float, bool]:
+    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
+
+    Returns:
+        lambda+, and whether the refinement converged; the step must not be taken otherwise.
+    """
+    c = problem.c
+    allowed = allowed_violation(problem, gap)
+    set_gradient(problem, iterate, model, mu, step)
+    drift = problem.kappa - dot(c, iterate.t)
+    multiplier, dt = system.solve(-step.nodes, drift)
+    extend_step(problem, model, dt, step)
+    for _ in range(REFINEMENTS):
+        violation = multiplier * c - step.nodes
+        if np.abs(violation).max() <= allowed:
+            return multiplier, True
+        shift, dt = system.solve(violation, drift - dot(c, step.t))
+        multiplier += shift
+        extend_step(problem, model, dt, step)
+    return multiplier, bool(np.abs(multiplier * c - step.nodes).max() <= allowed)
+
+
+def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: int) -> System | None:
+    """Factor M'; None if it is not positive definite."""
+    m, d = model.y.shape
+    v = problem.v[pinned]
+    blocks = np.empty((m, d, d))
+    q = np.zeros_like(problem.c)
+    q[problem.edges[pinned, 0]], q[problem.edges[pinned, 1]] = v, -v
+    stiffness = float(np.mean(problem.w / model.rho))
+    for ridge in _RIDGES:
+        _set_blocks(problem, model, ridge, blocks)
+        blocks[pinned] += stiffness * np.outer(v, v)
+        try:
+            factor.refactor(blocks)
+        except UnsolvableError:
+            continue
+        a, p = factor.solve(problem.c), factor.solve(q)
+        rows = np.stack([problem.c.ravel(), q.ravel()])
+        matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / stiffness])
+        return System(factor, a, p, rows, matrix) if abs(np.linalg.det(matrix)) > 0.0 else None
+    return None
+
+
+@kernel(exact=True)
+def _set_blocks(problem: Any, model: Any, ridge: float, blocks: Any) -> None:
+    """Write S_e, plus `ridge` times its stiffness times the identity."""
+    v, w, y, r = problem.v, problem.w, model.y, model.r
+    d = len(problem.axes)
+    for e in range(len(w)):
+        inverse = 1.0 / model.rho[e]
+        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
+        for k in range(d):
+            for q in range(d):
+                s = -stiffness * v[e, k] * v[e, q] - bend * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
+                blocks[e, k, q] = s + stiffness * (1.0 + ridge) if k == q else s
