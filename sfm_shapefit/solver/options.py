@@ -4,6 +4,7 @@ Pure data, no numerics, so that the command line, the tests and the benchmark ca
 """
 
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -20,6 +21,22 @@ class Status(enum.Enum):
         "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
     )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+
+
+@dataclass(frozen=True, slots=True)
+class IterationInfo:
+    """What a solver tells its `on_iteration` callback after each iteration."""
+
+    iteration: int
+    """Number of iterations done, from 1."""
+    objective: float
+    """Objective at the iterate, in the scale of `SolverResult.objective`."""
+    dual_bound: float | None
+    """A rigorous lower bound if the method has one at every iterate, else None."""
+
+
+OnIteration = Callable[[IterationInfo], bool | None]
+"""Called after each iteration; returning False, or raising, cancels the solve."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

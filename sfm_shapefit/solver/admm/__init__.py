@@ -1,0 +1,1 @@
+"""Splitting for large view graphs."""
