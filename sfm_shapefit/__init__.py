@@ -1,1 +1,64 @@
-"""Places the cameras of a COLMAP model from known rotations: certified, explained, deterministic."""
+"""Places the cameras of a COLMAP model from known rotations: certified, explained, deterministic.
+
+    graph  = ViewGraph(num_cameras, edges, directions)      # directions of t_i - t_j
+    result = solve(graph)                                   # ShapeFit with a certificate of optimality
+    found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
+    write_result(found, "out")
+    errors = evaluate(found.reconstruction, "truth")
+
+Names are imported when they are first used, so that importing the package is cheap.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
+    from sfm_shapefit.options import LocateOptions
+    from sfm_shapefit.pipeline import evaluate, locate
+    from sfm_shapefit.results import LocateResult, write_result
+    from sfm_shapefit.solver.certificate import Certificate, certify
+    from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
+    from sfm_shapefit.solver.solve import solve
+    from sfm_shapefit.viewgraph import ViewGraph
+
+_HOMES = {
+    "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
+    "options": ("LocateOptions",),
+    "pipeline": ("evaluate", "locate"),
+    "results": ("LocateResult", "write_result"),
+    "solver.certificate": ("Certificate", "certify"),
+    "solver.options": ("SolverOptions", "SolverResult", "Status"),
+    "solver.solve": ("solve",),
+    "viewgraph": ("ViewGraph",),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__version__ = "0.1.0"
+__all__ = [
+    "Certificate",
+    "InputError",
+    "LocateOptions",
+    "LocateResult",
+    "ShapeFitError",
+    "SolverOptions",
+    "SolverResult",
+    "Status",
+    "UnsolvableError",
+    "ViewGraph",
+    "certify",
+    "evaluate",
+    "locate",
+    "solve",
+    "write_result",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})

@@ -1,4 +1,4 @@
-"""Unit vectors, angles, tangent bases and similarity alignment: the geometry that other modules share.
+"""Unit vectors, angles, tangent bases, similarity alignment, mean rotations: geometry that others share.
 
 Everything here works on plain float64 arrays and imports nothing but numpy.
 """
@@ -9,11 +9,15 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 
+_NUM_SAMPLES = 256  # where half of the points are good, 1 draw of 3 in 8 is: none in 256 has odds 1e-15
+_NUM_REFINED_SAMPLES = 4
+
 
 def normalized(vectors: FloatArray) -> FloatArray:
     """Return the unit vectors along the last axis of `vectors`, shape (..., d); zero vectors give NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+        units: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return units
 
 
 def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -22,7 +26,7 @@ def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
     Uses tan(angle / 2) = |a - b| / |a + b| (Kahan), exact to rounding at 0 and at 180 degrees, where
     arccos of the inner product loses half of the digits.
     """
-    half = np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
+    half: FloatArray = np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
     return np.degrees(2.0 * half)
 
 
@@ -66,9 +70,12 @@ def fit_similarity(
 ) -> Similarity:
     """Return the similarity that maps `source` onto `target` with least weighted squares.
 
+    The scale is never negative: a mirrored source, which would fit best turned inside out, gets scale 0.
+    A source whose points coincide leaves the scale open and gets 1.
+
     Args:
         source, target: (n, d) corresponding points.
-        weights: (n,) non-negative weights; equal if None.
+        weights: (n,) non-negative weights, not all 0; equal if None.
         rotate: False keeps the axes and fits scale and translation only.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point
@@ -80,48 +87,120 @@ def fit_similarity(
     spread = float(w @ np.sum(x * x, axis=1))
     cross = (w[:, None] * y).T @ x
     rotation = _nearest_rotation(cross) if rotate else np.eye(source.shape[1])
-    scale = float(np.sum(rotation * cross)) / spread if spread > 0.0 else 1.0
+    scale = max(0.0, float(np.sum(rotation * cross)) / spread) if spread > 0.0 else 1.0
     return Similarity(
         scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean
     )
 
 
-def fit_similarity_l1(
-    source: FloatArray, target: FloatArray, *, rotate: bool = True, iterations: int = 200
-) -> Similarity:
-    """Return the similarity that minimises the sum of unsquared distances: a few bad points hardly matter.
+def median_spread(points: FloatArray) -> float:
+    """Return the median distance of points (n, d) from their coordinate-wise median.
 
-    Iteratively reweighted least squares, from the equal-weight solution and from the one that fits the
-    best half of the points; the lower sum is kept. The floor of the weights is 1e-9 of the target's
-    spread, so that points which fit exactly do not stop the iteration.
+    Where more than half of the points coincide it is the largest distance instead; 0 only if all coincide.
+    """
+    distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
+    median, largest = float(np.median(distances)), float(distances.max())
+    return median if median > 1e-12 * largest else largest
+
+
+def fit_similarity_l1(
+    source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf, iterations: int = 200
+) -> Similarity:
+    """Return the similarity that minimises the sum of unsquared distances min(distance, cap).
+
+    Without a cap, a few bad targets hardly matter, but one source point that is far enough away shrinks
+    the scale towards 0: it costs its distance at the true scale, and nearly nothing at scale 0. A finite
+    cap closes that hole; half of the points may then be anywhere.
+
+    Iteratively reweighted least squares (weight 1 / distance, 0 beyond the cap) from the equal-weight
+    solution and from the best fits of a few points drawn with a fixed seed; the lowest sum is kept. The
+    floor of the distances in the weights is 1e-9 of the target's spread, so that points which fit exactly
+    do not stop the iteration.
 
     Args:
         source, target: (n, d) corresponding points, n >= 1.
         rotate: False keeps the axes and fits scale and translation only.
+        cap: positive distance, in the target's units, beyond which a point counts as lost.
         iterations: limit of reweighting steps from each start; it stops earlier once nothing changes.
     """
-    spread = float(np.median(np.linalg.norm(target - np.median(target, axis=0), axis=1)))
-    floor = max(1e-9 * spread, np.finfo(float).tiny)
+    floor = 1e-9 * (median_spread(target) or 1.0)
 
     def distances(similarity: Similarity) -> FloatArray:
         return np.asarray(np.linalg.norm(similarity.apply(source) - target, axis=1))
 
-    def reweighted(start: Similarity) -> tuple[float, Similarity]:
-        best, cost = start, float(distances(start).sum())
-        current = start
+    def cost(similarity: Similarity) -> float:
+        return float(np.minimum(distances(similarity), cap).sum())
+
+    def reweighted(best: Similarity) -> Similarity:
+        best_cost = cost(best)
         for _ in range(iterations):
-            weights = 1.0 / np.maximum(distances(current), floor)
-            current = fit_similarity(source, target, weights, rotate=rotate)
-            new_cost = float(distances(current).sum())
-            if new_cost >= cost * (1.0 - 1e-12):
+            apart = distances(best)
+            weights = np.where(apart < cap, floor / np.maximum(apart, floor), 0.0)
+            if not weights.any():
                 break
-            best, cost = current, new_cost
-        return cost, best
+            candidate = fit_similarity(source, target, weights, rotate=rotate)
+            new_cost = cost(candidate)
+            if new_cost >= best_cost * (1.0 - 1e-12):
+                break
+            best, best_cost = candidate, new_cost
+        return best
 
     plain = fit_similarity(source, target, rotate=rotate)
-    closest_half = distances(plain) <= np.median(distances(plain))
-    trimmed = fit_similarity(source[closest_half], target[closest_half], rotate=rotate)
-    return min(reweighted(plain), reweighted(trimmed), key=lambda pair: pair[0])[1]
+    sampled = sorted(_fits_of_few_points(source, target, rotate=rotate), key=cost)
+    return min((reweighted(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
+
+
+def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
+    """Return similarities that each fit as few points as determine one, drawn with a fixed seed."""
+    size = min(len(source), source.shape[1] if rotate else 2)
+    rng = np.random.default_rng(0)
+    samples = (rng.choice(len(source), size, replace=False) for _ in range(_NUM_SAMPLES))
+    return [fit_similarity(source[few], target[few], rotate=rotate) for few in samples]
+
+
+def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
+    """Return the angles of rotations (..., 3, 3) in degrees, in [0, 180].
+
+    By atan2 of the sine (skew part) and the cosine (trace): exact to rounding at 0 and at 180 degrees.
+    """
+    skew = rotations - np.swapaxes(rotations, -1, -2)
+    sine = np.linalg.norm(skew, axis=(-2, -1)) / np.sqrt(8.0)
+    cosine = (np.trace(rotations, axis1=-2, axis2=-1) - 1.0) / 2.0
+    angles: FloatArray = np.arctan2(sine, cosine)
+    return np.degrees(angles)
+
+
+def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray:
+    """Return the rotation with the least sum of chordal distances |R_i - R|_F: a robust mean.
+
+    Weiszfeld's iteration, started from the chordal mean of the half of the rotations that is closest to
+    the best single one (out of at most 100, drawn with a fixed seed). Chordal distances are bounded, so
+    that any majority that agrees wins.
+
+    Args:
+        rotations: (n, d, d), n >= 1.
+        iterations: limit of reweighting steps; it stops earlier once nothing changes.
+
+    Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011;
+    the chordal instead of the geodesic distance.
+    """
+    floor = 1e-9  # of the distances in the weights; chordal distances are at most 2 sqrt(2) for d = 3
+
+    def distances(rotation: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(rotations - rotation, axis=(1, 2)))
+
+    count = len(rotations)
+    candidates = np.random.default_rng(0).permutation(count)[:100]
+    centre = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
+    nearest = np.argsort(distances(centre), kind="stable")[: count // 2 + 1]
+    best = _nearest_rotation(rotations[nearest].sum(axis=0))
+    for _ in range(iterations):
+        weights = floor / np.maximum(distances(best), floor)
+        candidate = _nearest_rotation(np.einsum("k,kij->ij", weights, rotations))
+        if distances(candidate).sum() >= distances(best).sum() * (1.0 - 1e-12):
+            break
+        best = candidate
+    return best
 
 
 def _nearest_rotation(matrix: FloatArray) -> FloatArray:

@@ -4,6 +4,7 @@ An edge (i, j) carries the unit direction of t_i - t_j: it points from camera j 
 (Hand, Lee, Voroninski 2015, eq. 1).
 """
 
+import numbers
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
 
 _UNIT_NORM_TOLERANCE = 1e-6  # a direction printed with 7 digits still passes; a wrong one does not
+_ROUNDING = 8.0 * np.finfo(np.float64).eps  # of a norm; dividing by it again would only change last bits
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -23,7 +25,8 @@ class ViewGraph:
     """Cameras 0..n-1 and the measured directions between pairs of them. Arrays are read-only.
 
     A pair that is given more than once is merged into its first occurrence: weights add, and the
-    direction is that of the weighted sum. Directions are renormalised to unit length exactly.
+    direction is that of the weighted sum. Directions are renormalised to unit length; those which have it
+    to rounding are kept to the last bit, so that a graph of a graph's edges has the same directions.
     """
 
     num_cameras: int
@@ -47,7 +50,7 @@ class ViewGraph:
         """Check and store a view graph.
 
         Args:
-            num_cameras: n >= 1.
+            num_cameras: n >= 0; a graph without cameras is what no edges at all are restricted to.
             edges: (m, 2) integers in [0, n).
             directions: (m, d) unit vectors, d >= 2.
             weights: (m,) finite and positive; 1 if None.
@@ -117,9 +120,13 @@ def _checked_arrays(
     num_cameras: int, edges: npt.ArrayLike, directions: npt.ArrayLike, weights: npt.ArrayLike | None
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the inputs as arrays of the right type and shape, or raise InputError."""
+    if not isinstance(num_cameras, numbers.Integral) or num_cameras < 0:
+        raise InputError(f"num_cameras must be a whole number >= 0, got {num_cameras}")
     given = np.asarray(edges)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"edges must be integers, got {given.dtype}; give camera indices in [0, n)")
+    if given.size and given.shape[1:] != (2,):
+        raise InputError(f"edges have shape {given.shape}; give one row (i, j) per pair, shape (m, 2)")
     i = given.astype(np.int64).reshape(-1, 2)
     v = np.array(directions, dtype=np.float64)
     if v.ndim != 2 or len(v) != len(i) or v.shape[1] < 2:
@@ -132,11 +139,13 @@ def _checked_arrays(
 
     _refuse(~((i >= 0) & (i < num_cameras)).all(axis=1), i, f"is outside the cameras 0..{num_cameras - 1}")
     _refuse(i[:, 0] == i[:, 1], i, "joins a camera with itself; remove it")
-    norms = np.linalg.norm(v, axis=1)
+    with np.errstate(over="ignore"):
+        norms = np.linalg.norm(v, axis=1)
     _refuse(
         ~(np.abs(norms - 1.0) <= _UNIT_NORM_TOLERANCE), i, "has a direction that is not a finite unit vector"
     )
     _refuse(~(np.isfinite(w) & (w > 0.0)), i, "has a weight that is not finite and positive; remove it")
+    norms[np.abs(norms - 1.0) <= _ROUNDING] = 1.0
     return i, v / norms[:, None], w
 
 
@@ -166,9 +175,9 @@ def _merge_duplicates(
     np.add.at(total, target, signed)
     weight = np.bincount(target, weights=weights, minlength=len(kept))
     length = np.linalg.norm(total, axis=1)
-    _refuse(
-        np.asarray(length < 1e-9 * weight), edges[kept], "is given several times with directions that cancel; keep one"
-    )
+    cancelled = np.zeros(len(edges), dtype=np.bool_)
+    cancelled[kept] = length < 1e-9 * weight
+    _refuse(cancelled, edges, "is given several times with directions that cancel; keep one")
     # A pair given once keeps its direction to the last bit.
     single = np.bincount(target, minlength=len(kept)) == 1
     merged = np.where(single[:, None], directions[kept], total / length[:, None])

@@ -43,7 +43,8 @@ def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
 
 def along(x: FloatArray, v: FloatArray) -> FloatArray:
     """Return <x_e, v_e> for every edge, shape (m,)."""
-    return np.einsum("ed,ed->e", x, v)
+    lengths: FloatArray = np.einsum("ed,ed->e", x, v)
+    return lengths
 
 
 def across(x: FloatArray, v: FloatArray) -> FloatArray:
@@ -51,7 +52,8 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
     Formed explicitly: sqrt(||x||^2 - <x, v>^2) would lose half of the digits.
     """
-    return x - along(x, v)[:, None] * v
+    transverse: FloatArray = x - along(x, v)[:, None] * v
+    return transverse
 
 
 def scale_functional(graph: ViewGraph) -> FloatArray:

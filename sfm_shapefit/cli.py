@@ -1,0 +1,388 @@
+"""The commands: parse, call, write. The door to typer and rich.
+
+Flags are the fields of the options dataclasses, and their help is the sentence under each field. Results
+go to stdout, progress and messages to stderr.
+
+Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved; 130 interrupted.
+"""
+
+import ast
+import inspect
+import os
+import sys
+import textwrap
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar, get_origin, get_type_hints
+
+import typer
+
+from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.synthetic import SceneOptions
+
+if TYPE_CHECKING:
+    from sfm_shapefit.evaluation import Evaluation
+    from sfm_shapefit.pipeline import Progress
+    from sfm_shapefit.results import LocateResult
+
+Options = TypeVar("Options")
+Command = TypeVar("Command", bound=Callable[..., None])
+Text = list[tuple[str, str]]
+"""A two-column table: label and what stands beside it."""
+
+_EXIT_USAGE, _EXIT_INPUT, _EXIT_UNSOLVABLE, _EXIT_INTERRUPTED = 2, 3, 4, 130
+_NAMES_SHOWN = 8
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Place the cameras of a COLMAP model whose rotations are known.",
+)
+
+# COLMAP's own names for paths are accepted beside the positional ones.
+ModelArgument = Annotated[
+    Optional[Path], typer.Argument(metavar="MODEL", help="COLMAP model folder (binary or text).")
+]
+OutArgument = Annotated[Optional[Path], typer.Argument(metavar="OUT", help="Folder to be made.")]
+InputPath = Annotated[Optional[Path], typer.Option("--input_path", hidden=True)]
+OutputPath = Annotated[Optional[Path], typer.Option("--output_path", hidden=True)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Config = Annotated[
+    Optional[Path],
+    typer.Option("--config", metavar="FILE.toml", help="Options from a TOML file; flags win over it."),
+]
+
+
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+# --- flags from options ----------------------------------------------------------------------------
+
+
+def _takes(options_type: type) -> Callable[[Command], Command]:
+    """Give a command one flag per field of an options dataclass, None where the user says nothing."""
+
+    def decorate(command: Command) -> Command:
+        signature = inspect.signature(command, eval_str=True)
+        own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        parameters = own + _flags(options_type)
+        command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
+        return command
+
+    return decorate
+
+
+def _flags(options_type: type) -> list[inspect.Parameter]:
+    """Return a keyword parameter with a typer option for each field."""
+    hints, documentation = get_type_hints(options_type), _field_documentation(options_type)
+    parameters = []
+    for item in fields(options_type):
+        flag = f"--{item.name.replace('_', '-')}"
+        names = f"{flag}/--no{flag[1:]}" if hints[item.name] is bool else flag
+        shown = {True: "yes", False: "no"}.get(item.default, str(item.default))  # type: ignore[call-overload]
+        option = typer.Option(names, help=documentation[item.name], show_default=shown)
+        annotation = Annotated[Optional[hints[item.name]], option]  # type: ignore[name-defined]
+        parameters.append(
+            inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+        )
+    return parameters
+
+
+def _field_documentation(options_type: type) -> dict[str, str]:
+    """Return the sentence under each field of a dataclass."""
+    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(options_type))).body
+    assert isinstance(definition, ast.ClassDef)
+    found: dict[str, str] = {}
+    for statement, following in zip(definition.body, definition.body[1:], strict=False):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
+            found[statement.target.id] = " ".join(str(following.value.value).split()) if is_text else ""  # type: ignore[attr-defined]
+    return found
+
+
+def _options(options_type: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
+    """Return options from a TOML file and the flags that were given, which win."""
+    known = {item.name for item in fields(options_type)}  # type: ignore[arg-type]
+    values = _read_toml(config, known, options_type) if config else {}
+    values |= {name: value for name, value in given.items() if value is not None}
+    try:
+        return options_type(**values)
+    except (TypeError, ValueError) as error:
+        raise typer.BadParameter(str(error)) from error
+
+
+def _read_toml(path: Path, known: set[str], options_type: type) -> dict[str, Any]:
+    """Return the values of a TOML file whose keys and types fit the options."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
+    hints = get_type_hints(options_type)
+    for name, value in values.items():
+        if name not in known:
+            raise typer.BadParameter(f"{path}: {name!r} is no option; known are {', '.join(sorted(known))}")
+        wanted = str if get_origin(hints[name]) is Literal else hints[name]
+        if type(value) is not wanted and not (wanted is float and type(value) is int):
+            raise typer.BadParameter(f"{path}: {name} must be of type {wanted.__name__}, got {value!r}")
+    return values
+
+
+# --- messages --------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _reported() -> Iterator[None]:
+    """Turn every known error into one sentence on stderr and its exit code."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        _fail("interrupted; nothing was written", _EXIT_INTERRUPTED)
+    except UnsolvableError as error:
+        _fail(str(error), _EXIT_UNSOLVABLE)
+    except ShapeFitError as error:
+        _fail(str(error), _EXIT_INPUT)
+
+
+def _fail(message: str, code: int) -> None:
+    print(f"sfm-shapefit: {_printable(message)}", file=sys.stderr)  # noqa: T201
+    raise typer.Exit(code)
+
+
+def _printable(text: str) -> str:
+    """Return text without control characters: names come from strangers, and may move the cursor."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+@contextmanager
+def _progress(enabled: bool) -> "Iterator[Progress | None]":
+    """Show stages on stderr if it is a terminal. Written to a copy of it, which nobody silences."""
+    if not (enabled and sys.stderr.isatty()):
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Display
+
+    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        os.fdopen(os.dup(2), "w") as stream,
+        Display(*columns, console=Console(file=stream, force_terminal=True)) as display,
+    ):
+        tasks: dict[str, Any] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = display.add_task(stage, total=total)
+            if total > 1 or display.tasks[tasks[stage]].total == 1:
+                display.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def _print_table(title: str, rows: Text) -> None:
+    """Print a two-column table on stdout."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title, show_header=False, title_justify="left")
+    for label, value in rows:
+        table.add_row(label, escape("\n".join(_printable(line) for line in value.split("\n"))))
+    Console().print(table)
+
+
+# --- locate ----------------------------------------------------------------------------------------
+
+
+@app.command("locate")
+@_takes(LocateOptions)
+def locate_command(
+    model: ModelArgument = None,
+    out: OutArgument = None,
+    *,
+    input_path: InputPath = None,
+    output_path: OutputPath = None,
+    database: Annotated[
+        Optional[Path],
+        typer.Option(
+            "--database",
+            "--database_path",
+            help="COLMAP database with the matches; by default database.db in MODEL, its parent or grandparent.",
+        ),
+    ] = None,
+    overwrite: Overwrite = False,
+    config: Config = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    **given: Any,
+) -> None:
+    """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
+    source = _one_path(model, input_path, "MODEL")
+    target = _one_path(out, output_path, "OUT")
+    with _reported():
+        from sfm_shapefit.output import check_output
+
+        options = _options(LocateOptions, given, config)
+        protect = [path for path in (source, database, config) if path is not None]
+        check_output(target, overwrite=overwrite, protect=protect)
+
+        from sfm_shapefit.pipeline import locate
+        from sfm_shapefit.report import dumps
+        from sfm_shapefit.results import summary, write_result
+
+        with _progress(not quiet) as progress:
+            found = locate(source, database, options, progress)
+            write_result(found, target, overwrite=overwrite, protect=protect)
+        if as_json:
+            print(dumps(summary(found)))  # noqa: T201
+        elif not quiet:
+            _print_table(f"{found.graph.num_cameras} images of {source}", _locate_table(found, target))
+
+
+def _locate_table(found: "LocateResult", out: Path) -> Text:
+    """Return what was placed, what was not and why, how certain it is, and where it is."""
+    from sfm_shapefit.results import camera_rows, summary
+
+    facts = summary(found)
+    left_out = [f"{row.name}: {row.reason}" for row in camera_rows(found) if not row.placed]
+    pairs = ", ".join(f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count)
+    solve = found.solve
+    rows = [
+        ("directions", found.inputs.statement),
+        ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
+        *([("not placed", _shortened(left_out))] if left_out else []),
+        ("pairs", f"{facts['num_pairs']}: {pairs}"),
+        ("objective", f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({solve.method})"),
+        ("scale", found.gauge.statement),
+        ("points", f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"),
+        *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
+        *[("warning", warning) for warning in found.warnings],
+        ("time", f"{sum(found.timings_s.values()):.1f} s"),
+        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
+    ]
+    return rows
+
+
+def _adjustment_line(found: "LocateResult") -> str:
+    assert found.adjusted is not None
+    state = "converged" if found.adjusted.converged else "stopped at its limit"
+    before, after = found.adjusted.initial_error_px, found.adjusted.final_error_px
+    return f"{state} after {found.adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
+
+
+# --- evaluate --------------------------------------------------------------------------------------
+
+
+@app.command("evaluate")
+def evaluate_command(
+    model: ModelArgument = None,
+    reference: Annotated[
+        Optional[Path], typer.Argument(metavar="REF", help="COLMAP model with the true poses.")
+    ] = None,
+    *,
+    input_path: InputPath = None,
+    threshold: Annotated[
+        Optional[list[float]],
+        typer.Option("--threshold", help="Recall at this position error in REF's units; may be repeated."),
+    ] = None,
+    csv: Annotated[
+        Optional[Path], typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment."""
+    source = _one_path(model, input_path, "MODEL")
+    truth = _one_path(reference, None, "REF")
+    with _reported():
+        from sfm_shapefit.pipeline import evaluate
+        from sfm_shapefit.report import dumps, write_records
+
+        errors = evaluate(source, truth, threshold or ())
+        if csv is not None:
+            write_records(errors.rows(), csv)
+        if as_json:
+            print(dumps(errors.as_dict()))  # noqa: T201
+        else:
+            _print_table(f"{source} against {truth}", _evaluation_table(errors))
+
+
+def _evaluation_table(errors: "Evaluation") -> Text:
+    """Return the errors in the reference's units."""
+    position, rotation = errors.position, errors.rotation_deg
+    recall = "\n".join(f"{r.recall:7.1%} within {r.threshold:.4g}" for r in errors.recalls)
+    return [
+        ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
+        *([("missing", _shortened(errors.missing))] if errors.missing else []),
+        (
+            "position error",
+            f"median {position.median:.4g}, mean {position.mean:.4g}, max {position.max:.4g} "
+            f"(extent {errors.extent:.4g})",
+        ),
+        (
+            "rotation error",
+            f"median {rotation.median:.4g}, mean {rotation.mean:.4g}, max {rotation.max:.4g} deg",
+        ),
+        ("recall", recall),
+        *[("warning", warning) for warning in errors.warnings],
+    ]
+
+
+# --- synth -----------------------------------------------------------------------------------------
+
+
+@app.command("synth")
+@_takes(SceneOptions)
+@_takes(WorkspaceOptions)
+def synth_command(out: OutArgument = None, *, output_path: OutputPath = None, **given: Any) -> None:
+    """Make a synthetic COLMAP workspace in OUT: a database, a model, and the exact truth."""
+    target = _one_path(out, output_path, "OUT")
+    with _reported():
+        scene_options = _options(SceneOptions, _fields_of(SceneOptions, given))
+        workspace_options = _options(WorkspaceOptions, _fields_of(WorkspaceOptions, given))
+        from sfm_shapefit.colmap.workspace import write_workspace
+        from sfm_shapefit.synthetic import make_scene
+
+        scene = make_scene(scene_options)
+        write_workspace(scene, target, workspace_options)
+        rows = [
+            ("images", str(len(scene.keypoints))),
+            ("points", str(len(scene.points))),
+            ("pairs", f"{len(scene.pairs)}, of which {int(scene.corrupted.sum())} wrong"),
+            ("written to", str(target)),
+        ]
+        _print_table(f"{scene_options.shape}, seed {scene_options.seed}", rows)
+
+
+def _fields_of(options_type: type, given: dict[str, Any]) -> dict[str, Any]:
+    names = {item.name for item in fields(options_type)}
+    return {name: value for name, value in given.items() if name in names}
+
+
+def _one_path(positional: Path | None, flag: Path | None, name: str) -> Path:
+    """Return the one path that was given, by position or by COLMAP's name."""
+    if positional is not None and flag is not None:
+        raise typer.BadParameter(f"{name} is given twice; give it by position or by name")
+    path = positional if positional is not None else flag
+    if path is None:
+        raise typer.BadParameter(f"{name} is missing")
+    return path
+
+
+def _shortened(lines: Sequence[str]) -> str:
+    """Return the first lines, and how many there are more."""
+    more = [f"and {len(lines) - _NAMES_SHOWN} more, see cameras.csv"] if len(lines) > _NAMES_SHOWN else []
+    return "\n".join([*lines[:_NAMES_SHOWN], *more])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,62 @@
+"""Scale and origin of the answer: what directions cannot tell, chosen by the user and stated.
+
+Rotations are given, so the axes are the input's; a gauge is one scale and one shift. The program
+leaves both free (sum_i t_i = 0, L(T) = kappa).
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.geometry import Similarity, fit_similarity_l1, median_spread
+
+Scale = Literal["input", "unit"]
+
+
+_COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gauge:
+    """The map from the solver's locations to the output's units, and the sentence that states it."""
+
+    similarity: Similarity
+    """Its rotation is the identity."""
+    scale: Scale
+    """The choice that was carried out."""
+    statement: str
+    """What scale and origin the output has, for the report."""
+
+
+def choose_gauge(locations: FloatArray, input_centers: FloatArray, scale: Scale) -> Gauge:
+    """Return the gauge asked for; without usable input centres "input" becomes "unit", and says so.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        scale: "input" maps robustly (L1, no rotation) onto the input's centres; "unit" puts the centroid
+            at the origin and the median distance from it to 1.
+    """
+    if scale == "unit":
+        return _unit(locations, "unit: median distance of the cameras from their centroid is 1")
+    spread = np.ptp(input_centers, axis=0).max()
+    if spread <= _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
+        return _unit(
+            locations, "unit: the input's centres coincide, so the scale is free; median distance is 1"
+        )
+    cap = 0.5 * median_spread(input_centers)  # a camera that has flown away must not set the scale
+    similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=cap or np.inf)
+    if similarity.scale <= 0.0:
+        return _unit(locations, "unit: the input's centres contradict the answer; median distance is 1")
+    return Gauge(
+        similarity=similarity, scale="input", statement="input: scale and origin of the input's centres"
+    )
+
+
+def _unit(locations: FloatArray, statement: str) -> Gauge:
+    centroid = locations.mean(axis=0)
+    scale = 1.0 / float(np.median(np.linalg.norm(locations - centroid, axis=1)))
+    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=-scale * centroid)
+    return Gauge(similarity=similarity, scale="unit", statement=statement)

@@ -1,0 +1,88 @@
+"""What `locate` is told: `LocateOptions`, whose fields are the command line's flags and the TOML's keys.
+
+Pure data, and cheap to import. Each stage's own options check the values that belong to it.
+"""
+
+import os
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+from sfm_shapefit.gauge import Scale
+from sfm_shapefit.solver.options import Method
+
+if TYPE_CHECKING:
+    from sfm_shapefit.colmap.structure import StructureOptions
+    from sfm_shapefit.directions import DirectionOptions
+    from sfm_shapefit.solver.options import SolverOptions
+
+Source = Literal["auto", "matches", "relative-poses", "tracks"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LocateOptions:
+    """Settings of `locate`."""
+
+    directions: Source = "auto"
+    """Where directions come from: the database's inlier matches, its stored relative poses, or the
+    model's own tracks; "auto" takes matches if there is a database, else tracks."""
+    solver: Method = "auto"
+    """The ShapeFit solver; "auto" picks one and says which."""
+    tol: float = 1e-8
+    """Certified gap at which the solve counts as converged."""
+    scale: Scale = "input"
+    """Gauge of the output: scale and origin of the input's centres ("unit" where it has none), or
+    "unit": centroid 0 and median distance from it 1."""
+    min_inliers: int = 15
+    """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
+    min_inlier_ratio: float = 0.5
+    """Least share of a pair's matches that must agree with the given rotations."""
+    inlier_threshold_px: float = 2.0
+    """Largest Sampson error of an inlier match in pixels."""
+    max_reprojection_error_px: float = 4.0
+    """Observations of 3D points with a larger reprojection error are dropped."""
+    min_triangulation_angle_deg: float = 1.5
+    """3D points seen under a smaller angle are dropped."""
+    bundle_adjust: bool = False
+    """Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."""
+    threads: int = 0
+    """Threads for estimating directions; 0 means one per core. The answer does not depend on it."""
+
+    def __post_init__(self) -> None:
+        for name, kind in (("directions", Source), ("scale", Scale), ("solver", Method)):
+            choices = get_args(kind)
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        if self.threads < 0:
+            raise ValueError(f"threads must be 0 or more, got {self.threads}")
+        self.for_solver()
+        self.for_directions()
+        self.for_structure()
+
+    def for_solver(self) -> "SolverOptions":
+        """Return the solver's share."""
+        from sfm_shapefit.solver.options import SolverOptions
+
+        return SolverOptions(method=self.solver, tol=self.tol)
+
+    def for_directions(self) -> "DirectionOptions":
+        """Return the direction estimator's share."""
+        from sfm_shapefit.directions import DirectionOptions
+
+        return DirectionOptions(
+            min_inliers=self.min_inliers,
+            min_inlier_ratio=self.min_inlier_ratio,
+            inlier_threshold_px=self.inlier_threshold_px,
+        )
+
+    def for_structure(self) -> "StructureOptions":
+        """Return the triangulation's share."""
+        from sfm_shapefit.colmap.structure import StructureOptions
+
+        return StructureOptions(
+            max_reprojection_error_px=self.max_reprojection_error_px,
+            min_triangulation_angle_deg=self.min_triangulation_angle_deg,
+        )
+
+    def num_threads(self) -> int:
+        """Return the number of threads to use."""
+        return self.threads or os.cpu_count() or 1

@@ -1,0 +1,288 @@
+"""`locate`: from known rotations and matches to a seeded COLMAP model, the path of the data in one page.
+
+Each stage is one function from values to a new value; the input is never changed.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.adjustment import bundle_adjust
+from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
+from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches
+from sfm_shapefit.colmap.seed import build_seed
+from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
+from sfm_shapefit.directions import PairDirections, concatenate, estimate_directions, from_relative_poses
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.evaluation import Evaluation, evaluate_poses
+from sfm_shapefit.gauge import choose_gauge
+from sfm_shapefit.options import LocateOptions, Source
+from sfm_shapefit.results import Inputs, LocateResult
+from sfm_shapefit.rigidity import rigid_pieces
+from sfm_shapefit.robust import Assessment, assess
+from sfm_shapefit.solver.options import SolverResult, Status
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.viewgraph import ViewGraph
+
+if TYPE_CHECKING:
+    import pycolmap
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of a stage, the work done so far and the work in all."""
+
+
+def locate(
+    reconstruction: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None = None,
+    options: LocateOptions | None = None,
+    progress: Progress | None = None,
+) -> LocateResult:
+    """Place the cameras of a model whose rotations and intrinsics are known.
+
+    Args:
+        reconstruction: a pycolmap.Reconstruction or a model folder; neither is changed, and its camera
+            centres never place a camera.
+        database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
+            the model's folder, its parent and its grandparent; failing that the model's tracks serve.
+        options: settings; defaults if None.
+        progress: called as stages advance.
+
+    Raises:
+        InputError: if the model or the database cannot be used; the message says what to do.
+        UnsolvableError: if no pair has a usable direction, or the directions determine nothing.
+
+    Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
+    """
+    options = options or LocateOptions()
+    clock = _Clock(progress or (lambda _stage, _done, _total: None))
+    with ExitStack() as resources:
+        with clock("read"):
+            model = read_model(reconstruction)
+            inputs = _choose_inputs(reconstruction, database, options.directions)
+            matches = None
+            if inputs.database is not None:
+                matches = resources.enter_context(open_database(inputs.database, model))
+        with clock("directions"):
+            directions = _measure_directions(model, matches, inputs.source, options, clock)
+        with clock("rigidity"):
+            graph = _view_graph(model, directions)
+            pieces = rigid_pieces(graph)
+            piece, cameras = graph.restricted_to(pieces[0].edges)
+        with clock("solve"):
+            solved = solve(piece, options.for_solver())
+            covariance = directions.covariance[directions.usable()[pieces[0].edges]]
+            assessment = assess(piece, solved.locations, covariance)
+            gauge = choose_gauge(solved.locations, model.centers[cameras], options.scale)
+        with clock("structure"):
+            centers = gauge.similarity.apply(solved.locations)
+            rejected = cameras[piece.edges[~assessment.inliers]]
+            seed, tracks = _seed_and_tracks(model, matches, cameras, centers, rejected, clock)
+            seeded = triangulate(seed, tracks, options.for_structure())
+        adjusted = None
+        if options.bundle_adjust:
+            with clock("bundle adjustment"):
+                adjusted = bundle_adjust(seed, tracks, options.for_structure())
+                seeded = adjusted.reconstruction
+    return LocateResult(
+        reconstruction=colored(seeded, model.reconstruction),
+        inputs=inputs,
+        options=options,
+        model=model,
+        directions=directions,
+        graph=graph,
+        pieces=pieces,
+        solve=solved,
+        assessment=assessment,
+        gauge=gauge,
+        adjusted=adjusted,
+        timings_s=clock.seconds,
+        warnings=_warnings(matches, solved, assessment),
+    )
+
+
+@dataclass(slots=True)
+class _Clock:
+    """Measures stages and passes their progress on."""
+
+    progress: Progress
+    seconds: dict[str, float] = field(default_factory=dict)
+    stage: str = ""
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        self.stage = stage
+        self.progress(stage, 0, 1)
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - start
+        self.progress(stage, 1, 1)
+
+    def advance(self, done: int, total: int) -> None:
+        """Report progress inside the current stage."""
+        self.progress(self.stage, done, total)
+
+
+def _choose_inputs(
+    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source
+) -> Inputs:
+    """Decide where directions come from, and say how."""
+    folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None
+    if source == "tracks":
+        return Inputs(
+            folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
+        )
+    path = Path(database) if database is not None else folder and find_database(folder)
+    if path is None:
+        if source != "auto":
+            raise InputError(f"directions from {source} need a database; give one with --database")
+        statement = "the model's own tracks; no database.db was given or found beside the model"
+        return Inputs(folder=folder, database=None, source="tracks", statement=statement)
+    what = "stored relative poses" if source == "relative-poses" else "inlier matches"
+    statement = f"{what} of {path}" + (" (found beside the model)" if database is None else "")
+    chosen: Source = "relative-poses" if source == "relative-poses" else "matches"
+    return Inputs(folder=folder, database=path, source=chosen, statement=statement)
+
+
+def _measure_directions(
+    model: PosedModel, matches: MatchDatabase | None, source: Source, options: LocateOptions, clock: _Clock
+) -> PairDirections:
+    """Return the direction of every pair that the source has."""
+    if matches is not None and source == "relative-poses":
+        poses = matches.relative_poses()
+        return from_relative_poses(
+            poses.pairs,
+            (poses.rotations, poses.translations),
+            model.rotations,
+            poses.num_inliers,
+            options.for_directions(),
+        )
+    batches = track_matches(model, 1) if matches is None else matches.iter_matches(1)
+    total = model.num_images if matches is None else matches.num_pairs
+    parts: list[PairDirections] = []
+    for batch in batches:
+        focal_lengths = model.focal_lengths_px[batch.pairs].min(axis=1)
+        parts.append(
+            estimate_directions(
+                batch.pairs,
+                batch.offsets,
+                batch.rays_i,
+                batch.rays_j,
+                1.0 / focal_lengths,
+                options.for_directions(),
+                threads=options.num_threads(),
+            )
+        )
+        clock.advance(sum(len(part.pairs) for part in parts), total)
+    if not parts:
+        raise UnsolvableError(
+            "no two posed images share matches; match the images, or give the database that has their matches"
+        )
+    return concatenate(parts)
+
+
+def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
+    """Return the graph of the usable directions; it has at least one edge."""
+    usable = directions.usable()
+    if len(usable) == 0:
+        reasons = ", ".join(f"{count} {status.value}" for status, count in directions.counts().items())
+        raise UnsolvableError(
+            f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
+            "check that the rotations and intrinsics belong to these matches"
+        )
+    return ViewGraph(
+        model.num_images, directions.pairs[usable], directions.directions[usable], names=model.names
+    )
+
+
+def _seed_and_tracks(
+    model: PosedModel,
+    matches: MatchDatabase | None,
+    cameras: IntArray,
+    centers: FloatArray,
+    rejected: IntArray,
+    clock: _Clock,
+) -> "tuple[pycolmap.Reconstruction, TrackSource]":
+    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
+    placed = np.zeros(model.num_images, dtype=np.bool_)
+    placed[cameras] = True
+    all_centers = np.full((model.num_images, 3), np.nan)
+    all_centers[cameras] = centers
+    if matches is None:
+        return build_seed(model, placed, all_centers), model.reconstruction
+    seed = build_seed(model, placed, all_centers, matches.keypoints)
+    batches = _counted(_without_pairs(matches.iter_matches(1), rejected), matches.num_pairs, clock)
+    return seed, correspondence_graph(seed, model.image_ids, batches)
+
+
+def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
+    """Empty the match lists of the rejected pairs (k, 2): their directions contradict the solution."""
+    unwanted = {(min(i, j), max(i, j)) for i, j in rejected.tolist()}
+    for batch in batches:
+        dropped: BoolArray = np.array(
+            [tuple(pair) in unwanted for pair in batch.pairs.tolist()], dtype=np.bool_
+        )
+        counts = np.diff(batch.offsets)
+        kept = np.repeat(~dropped, counts)
+        yield MatchBatch(
+            pairs=batch.pairs[~dropped],
+            offsets=np.concatenate([[0], np.cumsum(counts[~dropped])]),
+            keypoints=batch.keypoints[kept],
+            rays_i=batch.rays_i[kept],
+            rays_j=batch.rays_j[kept],
+        )
+
+
+def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterator[MatchBatch]:
+    """Report progress while batches are consumed."""
+    done = 0
+    for batch in batches:
+        yield batch
+        done += len(batch.pairs)
+        clock.advance(done, total)
+
+
+def _warnings(matches: MatchDatabase | None, solved: SolverResult, assessment: Assessment) -> tuple[str, ...]:
+    """Return what the user should know beyond the tables."""
+    found: list[str] = []
+    if solved.status is not Status.CONVERGED:
+        found.append(f"the solve is not certified to the tolerance: {solved.status.value}")
+    if matches is not None and matches.unmatched_names:
+        names = matches.unmatched_names
+        found.append(f"{len(names)} images of the model are not in the database, {names[0]} for one")
+    share = 1.0 - float(assessment.inliers.mean())
+    if share > 0.5:
+        found.append(f"{share:.0%} of the pairs contradict the solution; do not trust it without a look")
+    return tuple(found)
+
+
+def evaluate(
+    reconstruction: "pycolmap.Reconstruction | Path | str",
+    reference: "pycolmap.Reconstruction | Path | str",
+    thresholds: Sequence[float] = (),
+) -> Evaluation:
+    """Return position and rotation errors of a model against a reference, after robust alignment.
+
+    Args:
+        reconstruction, reference: reconstructions or model folders; cameras are matched by name.
+        thresholds: position errors, in the reference's units, at which recall is wanted too.
+
+    Raises:
+        InputError: if a model cannot be read, or they have fewer than three cameras in common.
+    """
+    model, truth = read_model(reconstruction), read_model(reference)
+    return evaluate_poses(
+        model.names,
+        model.rotations,
+        model.centers,
+        truth.names,
+        truth.rotations,
+        truth.centers,
+        thresholds=thresholds,
+    )

@@ -1,0 +1,218 @@
+"""Directions from matches and known rotations, on pairs whose true direction is known."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.directions import (
+    DirectionOptions,
+    DirectionStatus,
+    PairDirections,
+    concatenate,
+    estimate_directions,
+    from_relative_poses,
+)
+from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
+
+FOCAL_PX = 1000.0
+EXACT_DEG = 1e-9  # rays are exact to 1e-16 rad, and 5 degrees of parallax amplify that by a hundred or so
+
+
+def make_pair(seed, *, count=100, noise_px=0.0, wrong=0.0, baseline=(1.0, 0.2, -0.1), depth=(4.0, 8.0)):
+    """Unit rays (k, 3) of one pair in world axes, and the unit direction of C_i - C_j."""
+    rng = np.random.default_rng(seed)
+    center_i, center_j = np.zeros(3), -np.asarray(baseline, dtype=float)
+    points = np.column_stack([rng.uniform(-2, 2, (count, 2)), rng.uniform(*depth, count)])
+    rays = []
+    for center in (center_i, center_j):
+        pixels = FOCAL_PX * (points - center)[:, :2] / (points - center)[:, 2:]
+        pixels += noise_px * rng.standard_normal(pixels.shape)
+        rays.append(normalized(np.column_stack([pixels / FOCAL_PX, np.ones(count)])))
+    shuffled = rng.random(count) < wrong
+    rays[1][shuffled] = rays[1][rng.permutation(np.flatnonzero(shuffled))][::-1]
+    direction = normalized(center_i - center_j) if np.any(baseline) else np.full(3, np.nan)
+    return rays[0], rays[1], direction
+
+
+def estimate(pairs, options=None, threads=1) -> PairDirections:
+    """Estimate a list of (rays_i, rays_j, ...) as one batch."""
+    counts = [len(pair[0]) for pair in pairs]
+    return estimate_directions(
+        np.array([(k, k + 1) for k in range(len(pairs))]),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.concatenate([pair[0] for pair in pairs]),
+        np.concatenate([pair[1] for pair in pairs]),
+        np.full(len(pairs), 1.0 / FOCAL_PX),
+        options,
+        threads,
+    )
+
+
+@pytest.mark.parametrize("baseline", [(1.0, 0.2, -0.1), (-0.4, 0.0, 0.0), (0.05, 0.02, 1.0), (0.0, 0.0, -1.0)])
+def test_exact_matches_give_the_exact_direction_with_its_sign(baseline):
+    pair = make_pair(1, baseline=baseline)
+    found = estimate([pair])
+    assert found.status == [DirectionStatus.USABLE]
+    assert angle_between_deg(found.directions[0], pair[2]) < EXACT_DEG
+    assert found.cheirality_fraction[0] == 1.0
+
+
+def test_swapping_the_images_flips_the_direction():
+    rays_i, rays_j, direction = make_pair(2, noise_px=0.5)
+    forward, backward = estimate([(rays_i, rays_j)]), estimate([(rays_j, rays_i)])
+    # The same draws fall on the same matches, so only roundings differ.
+    assert angle_between_deg(forward.directions[0], -backward.directions[0]) < 1e-6
+    assert angle_between_deg(forward.directions[0], direction) < 1.0
+
+
+def test_turning_the_world_turns_the_direction():
+    rays_i, rays_j, _ = make_pair(3, noise_px=0.5)
+    rotation = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
+    rotation *= np.sign(np.linalg.det(rotation))
+    plain, turned = estimate([(rays_i, rays_j)]), estimate([(rays_i @ rotation.T, rays_j @ rotation.T)])
+    assert angle_between_deg(turned.directions[0], rotation @ plain.directions[0]) < 1e-6
+
+
+@pytest.mark.parametrize("wrong", [0.1, 0.3, 0.45])
+def test_wrong_matches_inside_the_list_do_not_move_the_direction(wrong):
+    errors = []
+    for seed in range(20):
+        pair = make_pair(seed, count=200, noise_px=0.5, wrong=wrong)
+        found = estimate([pair])
+        assert found.status == [DirectionStatus.USABLE]
+        errors.append(angle_between_deg(found.directions[0], pair[2]))
+    # 0.5 px in 200 matches at a baseline of a sixth of the depth: about 0.1 degrees; 45 % wrong doubles it.
+    assert np.median(errors) < 0.2
+    assert max(errors) < 1.0
+
+
+def test_two_motions_in_one_list_give_the_direction_of_the_larger_one():
+    larger, smaller = make_pair(4, count=140), make_pair(5, count=60, baseline=(0.0, 1.0, 0.3))
+    mixed = tuple(np.concatenate([larger[k], smaller[k]]) for k in (0, 1))
+    found = estimate([mixed])
+    assert found.status == [DirectionStatus.USABLE]
+    assert angle_between_deg(found.directions[0], larger[2]) < 0.01  # soft weights keep a trace of the rest
+
+
+def test_pure_rotation_gives_no_direction():
+    pairs = [make_pair(seed, count=300, noise_px=0.5, baseline=(0.0, 0.0, 0.0)) for seed in range(20)]
+    assert DirectionStatus.USABLE not in estimate(pairs).status
+
+
+def test_points_at_infinity_give_no_direction():
+    pairs = [make_pair(seed, noise_px=0.5, depth=(4e5, 8e5)) for seed in range(20)]
+    assert DirectionStatus.USABLE not in estimate(pairs).status
+
+
+def test_identical_rays_and_empty_lists_give_no_direction():
+    rays = make_pair(6)[0]
+    found = estimate([(rays, rays), (rays[:0], rays[:0]), (rays[:4], rays[:4])])
+    few = DirectionStatus.TOO_FEW_MATCHES
+    assert found.status == [DirectionStatus.NO_PARALLAX, few, few]
+    assert np.isnan(found.directions).all()
+
+
+def test_random_matches_are_recognised_by_their_inlier_ratio():
+    pairs = []
+    for seed in range(20):
+        rays_i, rays_j, _ = make_pair(seed, count=60)
+        pairs.append((rays_i, np.random.default_rng(seed).permutation(rays_j)))
+    assert set(estimate(pairs).status) == {DirectionStatus.LOW_INLIER_RATIO}
+
+
+def test_a_planar_scene_is_no_obstacle():
+    pair = make_pair(7, noise_px=0.5, depth=(6.0, 6.0), count=200)
+    found = estimate([pair])
+    assert found.status == [DirectionStatus.USABLE]
+    assert angle_between_deg(found.directions[0], pair[2]) < 1.0
+
+
+def test_the_covariance_predicts_the_errors():
+    pairs = [make_pair(seed, noise_px=0.7, count=80) for seed in range(300)]
+    found = estimate(pairs)
+    truth = np.array([pair[2] for pair in pairs])
+    tangential = np.einsum("kdi,kd->ki", tangent_bases(found.directions), truth)
+    squares = np.einsum("ki,kij,kj->k", tangential, np.linalg.inv(found.covariance), tangential)
+    # chi-square of 2 degrees of freedom has median 1.386; 300 draws give it to 8 %, and robust weights
+    # on 80 matches cost some efficiency.
+    assert 0.75 * 1.386 < np.median(squares) < 1.6 * 1.386
+
+
+def test_support_says_what_the_pair_has():
+    found = estimate([make_pair(8, count=100, noise_px=0.5, wrong=0.3)])
+    assert found.num_matches[0] == 100
+    assert 60 <= found.num_inliers[0] <= 80  # 70 are right; a few wrong ones fall on their epipolar line
+    # A Sampson error of 0.5 px noise has median 0.6745 * 0.5 px, and 70 of them give it to 15 %.
+    assert found.median_residual_px[0] == pytest.approx(0.6745 * 0.5, rel=0.45)
+    assert 5.0 < found.parallax_deg[0] < 15.0  # baseline 1.02 seen from 4 to 8
+
+
+def test_neither_batches_nor_threads_change_a_bit():
+    pairs = [make_pair(seed, noise_px=0.5, wrong=0.2) for seed in range(7)]
+    whole, threaded = estimate(pairs), estimate(pairs, threads=2)
+    one_by_one = concatenate([estimate([pair]) for pair in pairs])
+    for other in (threaded, one_by_one):
+        for name in ("directions", "covariance", "num_inliers", "median_residual_px", "parallax_deg"):
+            np.testing.assert_array_equal(getattr(whole, name), getattr(other, name))
+        assert whole.status == other.status
+
+
+def test_each_rule_can_be_the_reason():
+    pair = make_pair(9, count=40, noise_px=0.5, wrong=0.3)
+    strict = {
+        "min_inliers": (39, DirectionStatus.FEW_INLIERS),
+        "min_inlier_ratio": (0.99, DirectionStatus.LOW_INLIER_RATIO),
+        "max_sigma_deg": (1e-3, DirectionStatus.NO_PARALLAX),
+        "inlier_threshold_px": (1e-3, DirectionStatus.LOW_INLIER_RATIO),
+    }
+    assert estimate([pair]).status == [DirectionStatus.USABLE]
+    for name, (value, reason) in strict.items():
+        assert estimate([pair], DirectionOptions(**{name: value})).status == [reason], name
+    # A scene as far behind the cameras as before them fits either sign.
+    rays_i, rays_j, _ = make_pair(10, count=60)
+    flipped = np.where(np.arange(60) % 2, 1.0, -1.0)[:, None]
+    assert estimate([(rays_i * flipped, rays_j * flipped)]).status == [DirectionStatus.AMBIGUOUS_SIGN]
+
+
+def test_more_hypotheses_survive_more_wrong_matches():
+    options = DirectionOptions(min_inlier_ratio=0.1, min_sign_majority=1.0)
+    pairs = [make_pair(seed, count=150, noise_px=0.3, wrong=0.75) for seed in range(20)]
+    truth = np.array([pair[2] for pair in pairs])
+
+    def failures(num_hypotheses):
+        found = estimate(pairs, dataclasses.replace(options, num_hypotheses=num_hypotheses))
+        return np.sum(~(angle_between_deg(found.directions, truth) < 5.0))
+
+    assert failures(400) < failures(5)
+
+
+@pytest.mark.parametrize("field", [f.name for f in dataclasses.fields(DirectionOptions)])
+def test_options_out_of_range_are_refused_by_name(field):
+    with pytest.raises(ValueError, match=field):
+        DirectionOptions(**{field: -1})
+
+
+def test_relative_poses_become_directions_with_the_papers_sign():
+    rng = np.random.default_rng(11)
+    rotations = np.linalg.qr(rng.standard_normal((2, 3, 3)))[0]
+    rotations *= np.linalg.det(rotations)[:, None, None]
+    centers = rng.standard_normal((2, 3))
+    translations = -np.einsum("nab,nb->na", rotations, centers)
+    relative_rotation = rotations[1] @ rotations[0].T
+    relative_translation = translations[1] - relative_rotation @ translations[0]
+    pairs, support = np.array([[0, 1]]), np.array([50])
+
+    poses = (relative_rotation[None], 0.17 * relative_translation[None])  # COLMAP's planar poses are not unit
+    found = from_relative_poses(pairs, poses, rotations, support)
+    assert found.status == [DirectionStatus.USABLE]
+    np.testing.assert_allclose(found.directions[0], normalized(centers[0] - centers[1]), atol=1e-14)
+
+    turned = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), -np.sin(0.3)], [0.0, np.sin(0.3), np.cos(0.3)]])
+    contradicting = (turned @ poses[0], poses[1])
+    assert from_relative_poses(pairs, contradicting, rotations, support).status == [
+        DirectionStatus.ROTATION_MISMATCH
+    ]
+    assert from_relative_poses(pairs, poses, rotations, np.array([5])).status == [
+        DirectionStatus.TOO_FEW_MATCHES
+    ]

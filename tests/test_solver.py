@@ -1,0 +1,253 @@
+"""ShapeFit solved and certified: exactness, invariances, optimality, and refusals."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.options import SolverOptions, Status
+from sfm_shapefit.solver.program import (
+    across,
+    adjoint,
+    differences,
+    normalized_locations,
+    objective,
+    projected_length,
+    scale_functional,
+)
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+TOL = SolverOptions().tol
+
+
+def problem(seed, *, n=20, p=0.6, d=3, sigma=0.0, q=0.2):
+    """A random problem of the paper's kind: the view graph and the true locations, centroid 0, norm 1."""
+    drawn = random_graph_problem(n, p, d=d, sigma=sigma, q=q, seed=seed)
+    truth = drawn.locations - drawn.locations.mean(axis=0)
+    return ViewGraph(n, drawn.edges, drawn.directions), truth / np.linalg.norm(truth)
+
+
+def shape(locations):
+    """Locations with centroid 0 and norm 1."""
+    centred = locations - locations.mean(axis=0)
+    return centred / np.linalg.norm(centred)
+
+
+def tetrahedron():
+    """Four cameras, all pairs, exact directions."""
+    t = np.array([[0.0, 0, 0], [1, 0, 0], [0.2, 1, 0], [0.3, 0.4, 1]])
+    edges = np.array([(i, j) for i in range(4) for j in range(i + 1, 4)])
+    baselines = differences(t, edges)
+    return t, edges, baselines / np.linalg.norm(baselines, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5, 10])
+def test_recovery_is_exact_in_spite_of_corruption(d):
+    graph, truth = problem(d, n=24, p=0.7, d=d, q=0.15)
+    result = solve(graph)
+    assert result.status is Status.CONVERGED
+    assert result.objective > 0.05  # the corrupted pairs are really there
+    # Near a sharp minimum the error is at most a constant of the gap; the worst seen here is 1e-9.
+    assert np.linalg.norm(shape(result.locations) - truth) < 1e-7
+
+
+def test_exact_directions_have_objective_zero():
+    graph, truth = problem(1, q=0.0)
+    result = solve(graph)
+    assert result.objective < 1e-10
+    assert result.dual_bound == pytest.approx(0.0, abs=1e-10)
+    assert np.linalg.norm(shape(result.locations) - truth) < 1e-8
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    d=st.sampled_from([2, 3, 5]),
+    sigma=st.sampled_from([0.0, 1e-6, 0.01, 0.3]),
+    q=st.sampled_from([0.0, 0.3, 1.0]),
+)
+def test_every_result_proves_what_it_claims(seed, d, sigma, q):
+    drawn = random_graph_problem(12, 0.9, d=d, sigma=sigma, q=q, seed=seed)
+    weights = np.random.default_rng(seed).uniform(0.2, 3.0, len(drawn.edges))
+    graph = ViewGraph(12, drawn.edges, drawn.directions, weights)
+    result = solve(graph)
+
+    assert result.status is Status.CONVERGED
+    assert result.gap <= TOL
+    assert result.dual_bound <= result.objective + 1e-12
+    assert result.objective == pytest.approx(objective(graph, result.locations), rel=1e-12)
+    # Feasibility of the dual, recomputed here from the formulas.
+    y, v = result.dual, graph.directions
+    assert np.all(np.linalg.norm(y, axis=1) <= graph.weights * (1 + 1e-12))
+    assert np.abs(np.sum(y * v, axis=1)).max() <= 1e-13
+    imbalance = adjoint(y, graph.edges, 12) - result.dual_bound * scale_functional(graph)
+    assert np.linalg.norm(imbalance, axis=1).max() <= 1e-9
+    assert projected_length(graph, result.locations) == pytest.approx(graph.weights.sum(), rel=1e-12)
+    assert np.abs(result.locations.mean(axis=0)).max() <= 1e-12 * np.abs(result.locations).max()
+
+
+def test_no_locations_beat_the_dual_bound():
+    graph, truth = problem(2, sigma=0.05)
+    result = solve(graph)
+    rng = np.random.default_rng(2)
+    start = normalized_locations(graph, result.locations)
+    for size in (1e-6, 1e-4, 1e-2, 1.0):
+        for _ in range(50):
+            assert objective(graph, start + size * rng.standard_normal(start.shape)) >= result.dual_bound
+    assert objective(graph, truth) >= result.dual_bound
+
+
+def test_stationarity_holds_edge_by_edge():
+    graph, _ = problem(3, sigma=0.05)
+    result = solve(graph, SolverOptions(tol=1e-9))
+    residuals = across(differences(result.locations, graph.edges), graph.directions)
+    lengths = np.linalg.norm(residuals, axis=1)
+    # sum_e (||r_e|| - <y_e, r_e>) = gap * kappa with every term >= 0, so each term is below it.
+    slack = lengths - np.sum(residuals * result.dual, axis=1)
+    assert slack.min() >= -1e-12
+    assert slack.max() <= 1e-9 * graph.num_edges
+
+
+def test_turning_the_world_turns_the_answer():
+    graph, _ = problem(4, sigma=0.05)
+    rotation = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
+    turned = solve(ViewGraph(graph.num_cameras, graph.edges, graph.directions @ rotation.T))
+    # The optimum is unique; a gap of 1e-8 leaves about the square root of it.
+    np.testing.assert_allclose(shape(turned.locations), shape(solve(graph).locations) @ rotation.T, atol=1e-5)
+
+
+def test_relabelling_cameras_relabels_the_answer():
+    graph, _ = problem(5, sigma=0.05)
+    order = np.random.default_rng(5).permutation(graph.num_cameras)
+    relabelled = solve(ViewGraph(graph.num_cameras, order[graph.edges], graph.directions))
+    np.testing.assert_allclose(shape(relabelled.locations)[order], shape(solve(graph).locations), atol=1e-5)
+
+
+def test_reversing_an_edge_and_its_direction_changes_nothing():
+    graph, _ = problem(6, sigma=0.05)
+    flip = np.random.default_rng(6).random(graph.num_edges) < 0.5
+    edges = np.where(flip[:, None], graph.edges[:, ::-1], graph.edges)
+    directions = np.where(flip[:, None], -graph.directions, graph.directions)
+    reversed_result = solve(ViewGraph(graph.num_cameras, edges, directions))
+    assert reversed_result.objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
+    np.testing.assert_allclose(shape(reversed_result.locations), shape(solve(graph).locations), atol=1e-5)
+
+
+def test_weight_two_is_a_pair_given_twice():
+    graph, _ = problem(7, sigma=0.05)
+    weights = np.where(np.arange(graph.num_edges) % 3 == 0, 2.0, 1.0)
+    weighted = solve(ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights))
+    again = np.flatnonzero(weights == 2.0)
+    doubled = solve(
+        ViewGraph(
+            graph.num_cameras,
+            np.concatenate([graph.edges, graph.edges[again]]),
+            np.concatenate([graph.directions, graph.directions[again]]),
+        )
+    )
+    assert weighted.objective == pytest.approx(doubled.objective, abs=2 * TOL)
+    assert abs(weighted.objective - solve(graph).objective) > 1e-4  # weights matter at all
+
+
+def test_scaling_all_weights_changes_nothing():
+    graph, _ = problem(8, sigma=0.05)
+    scaled = ViewGraph(graph.num_cameras, graph.edges, graph.directions, np.full(graph.num_edges, 1e4))
+    assert solve(scaled).objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
+
+
+def test_some_flipped_directions_do_no_harm_and_all_flipped_turn_the_answer_around():
+    t, edges, v = tetrahedron()
+    one_flipped = v * np.where(np.arange(6) == 2, -1.0, 1.0)[:, None]
+    np.testing.assert_allclose(shape(solve(ViewGraph(4, edges, one_flipped)).locations), shape(t), atol=1e-8)
+    np.testing.assert_allclose(shape(solve(ViewGraph(4, edges, -v)).locations), -shape(t), atol=1e-8)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_the_smallest_graphs_work(n):
+    t, edges, v = tetrahedron()
+    kept = (edges < n).all(axis=1)
+    result = solve(ViewGraph(n, edges[kept], v[kept]))
+    np.testing.assert_allclose(shape(result.locations), shape(t[:n]), atol=1e-8)
+    assert result.status is Status.CONVERGED
+
+
+def test_coincident_cameras_are_found_coincident():
+    rng = np.random.default_rng(9)
+    t = rng.standard_normal((10, 3))
+    t[1] = t[0]
+    edges = np.array([(i, j) for i in range(10) for j in range(i + 1, 10)])
+    baselines = differences(t, edges)
+    baselines[0] = rng.standard_normal(3)  # the pair (0, 1) has no direction; it gets a random one
+    result = solve(ViewGraph(10, edges, baselines / np.linalg.norm(baselines, axis=1, keepdims=True)))
+    assert np.linalg.norm(shape(result.locations)[0] - shape(result.locations)[1]) < 1e-7
+
+
+def test_a_tampered_dual_proves_less_but_never_too_much():
+    graph, _ = problem(10, sigma=0.05)
+    result = solve(graph)
+    rng = np.random.default_rng(10)
+    for size in (1e-3, 0.1, 10.0):
+        tampered = result.dual + size * rng.standard_normal(result.dual.shape)
+        certificate = certify(graph, result.locations, tampered)
+        assert certificate.dual_bound < result.dual_bound
+        assert certificate.equality_residual < 1e-10
+    assert certify(graph, result.locations, 5.0 * result.dual).gap < 2 * TOL  # scaling is repaired
+    assert certify(graph, result.locations, -result.dual).dual_bound == 0.0  # the zero dual is the floor
+
+
+def test_a_certificate_of_other_locations_shows_their_gap():
+    graph, truth = problem(11, sigma=0.05)
+    result = solve(graph)
+    certificate = certify(graph, truth, result.dual)
+    assert certificate.objective > result.objective
+    assert certificate.dual_bound == pytest.approx(result.dual_bound, abs=1e-6)
+
+
+def test_certify_refuses_what_it_cannot_judge():
+    graph, _ = problem(12)
+    result = solve(graph)
+    with pytest.raises(InputError, match="shapes"):
+        certify(graph, result.locations[1:], result.dual)
+    with pytest.raises(InputError, match="finite"):
+        certify(graph, result.locations * np.nan, result.dual)
+    with pytest.raises(InputError, match="point against"):
+        certify(graph, -result.locations, result.dual)
+
+
+def test_too_few_iterations_are_reported_not_hidden():
+    graph, _ = problem(13, sigma=0.05)
+    result = solve(graph, SolverOptions(max_iterations=4))
+    assert result.status is not Status.CONVERGED
+    assert result.gap > TOL
+    assert np.isfinite(result.locations).all()
+
+
+def test_graphs_that_determine_nothing_are_refused_with_the_reason():
+    _, edges, v = tetrahedron()
+    with pytest.raises(UnsolvableError, match="no pair"):
+        solve(ViewGraph(3, np.empty((0, 2), dtype=int), np.empty((0, 3))))
+    with pytest.raises(UnsolvableError, match="2 connected components"):
+        solve(ViewGraph(8, np.concatenate([edges, edges + 4]), np.concatenate([v, v])))
+    with pytest.raises(UnsolvableError, match="not parallel rigid"):
+        solve(ViewGraph(5, [*edges.tolist(), [0, 4]], [*v.tolist(), [1.0, 0.0, 0.0]]))
+    around = np.array([[0, 1], [1, 2], [2, 0]])
+    same = np.tile([1.0, 0.0, 0.0], (3, 1))  # t_0 - t_1, t_1 - t_2 and t_2 - t_0 all the same way
+    with pytest.raises(UnsolvableError, match="cancel"):
+        solve(ViewGraph(3, around, same))
+
+
+def test_pure_noise_still_ends_certified():
+    graph, _ = problem(14, q=1.0)
+    result = solve(graph)
+    assert result.status is Status.CONVERGED
+    assert result.objective > 0.3
+
+
+@pytest.mark.parametrize(("field", "value"), [("method", "magic"), ("tol", 0.0), ("max_iterations", 0)])
+def test_solver_options_out_of_range_are_refused_by_name(field, value):
+    with pytest.raises(ValueError, match=field):
+        SolverOptions(**{field: value})
