@@ -2,24 +2,101 @@
 
 Kernels take and return plain arrays and numbers. `fastmath` allows fused and reassociated sums
 but keeps NaN and infinity checks; pass `exact=True` where the order of a sum must be the written one.
+
+C functions of other libraries are called by address. The address of a function changes from process
+to process, so it must not be a constant of the compiled code, or the code cached on disk would be
+useless (numba then refuses to cache it). `call_address` takes the address as an ordinary argument.
+
+Determinism: a kernel that calls another one contains its own copy of it, compiled in its own context. Which
+copy runs depends on what was compiled, and what loaded from the cache, in this process. Under fastmath the
+copies may round differently. So a kernel that calls, or is called by, another one and whose sums matter is
+either `exact=True` (then all copies agree to the last bit), or compiled apart and called by its address
+(`leaf_address`: there is only one copy).
 """
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 import numba
+import numpy as np
+import numpy.typing as npt
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import get_cython_function_address, intrinsic
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
 prange = numba.prange
+carray = numba.carray
+"""In a leaf (see `leaf_address`): `carray(pointer, shape)` is the array behind a pointer."""
+
+_FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 
 
 def kernel(*, parallel: bool = False, exact: bool = False) -> Callable[[Kernel], Kernel]:
     """Compile a function with numba on its first call; the machine code is cached beside the source."""
-    fastmath: bool | set[str] = False if exact else {"contract", "reassoc", "nsz", "arcp"}
+    fastmath: bool | set[str] = False if exact else _FASTMATH
 
     def decorate(function: Kernel) -> Kernel:
         options = {"cache": True, "nogil": True, "error_model": "numpy"}
         return cast(Kernel, numba.njit(parallel=parallel, fastmath=fastmath, **options)(function))
 
     return decorate
+
+
+def function_address(module: str, name: str) -> int:
+    """Return the address of a C function that a Cython module exports, valid in this process only.
+
+    Args:
+        module: such as "scipy.linalg.cython_blas".
+        name: such as "dsyrk".
+    """
+    return int(get_cython_function_address(module, name))
+
+
+def _call_address(_context: Any, address: Any, pointers: Any) -> Any:
+    """Type `call_address(address, pointers)` and generate its code."""
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        function, packed = arguments
+        void_pointer = cgutils.voidptr_t
+        items = [builder.inttoptr(p, void_pointer) for p in cgutils.unpack_tuple(builder, packed)]
+        function_type = ir.FunctionType(ir.VoidType(), [void_pointer] * len(items))
+        builder.call(builder.inttoptr(function, function_type.as_pointer()), items)
+        return context.get_dummy_value()
+
+    return types.void(address, pointers), generate
+
+
+call_address = intrinsic(_call_address)
+"""In a kernel: call the C function `void f(void*, ...)` at an integer address.
+
+`call_address(address, (p0, p1, ...))` takes all pointers as int64, see `array_address`. The arrays
+behind them must be arguments of the calling kernel or be used after the call: numba frees a local
+array after its last use by name.
+"""
+
+
+@kernel()
+def array_address(array: Any) -> int:
+    """Return the address of the first entry of a contiguous array, as int64."""
+    address: int = numba.int64(array.ctypes.data)
+    return address
+
+
+@lru_cache(maxsize=32)
+def _compiled_leaf(function: Callable[..., None], dtype: str, num_arrays: int) -> Any:
+    """Compile a leaf for one type, or load it from the disk cache."""
+    number = numba.from_dtype(np.dtype(dtype))
+    signature = types.void(types.CPointer(types.int64), *([types.CPointer(number)] * num_arrays))
+    return numba.cfunc(signature, cache=True, fastmath=_FASTMATH, error_model="numpy")(function)
+
+
+def leaf_address(function: Callable[..., None], dtype: npt.DTypeLike, num_arrays: int) -> int:
+    """Compile a small function apart from all others and return its address for `call_address`.
+
+    The function takes pointers: one to int64 sizes, then `num_arrays` to numbers of type `dtype`. It calls no
+    other kernel, so its sums may be reassociated (fastmath) and still be the same in every process.
+    """
+    return int(_compiled_leaf(function, np.dtype(dtype).str, num_arrays).address)

@@ -1,0 +1,526 @@
+"""Sparse Cholesky factorisation of graph Laplacians, scalar (n x n) and in b x b blocks (nb x nb).
+
+The factorisation is multifrontal (Duff, Reid 1983; Liu 1992, "The multifrontal method for sparse matrix
+solution"). For each supernode, children first:
+
+    assemble   its panel from the edges' slots and from the children's update matrices
+    factor     the square part, L_JJ = chol, and the rows below, L_RJ = A_RJ L_JJ^-T
+    update     U = -L_RJ L_RJ^T + what the children leave for later fronts, kept on a stack
+
+What depends on the graph alone is planned once (`analyse`); `refactor` takes new edge weights and neither
+sorts nor allocates. A Laplacian is singular: constants are its null space. The mean weight is added to the
+last pivot instead of removing a row. For right-hand sides orthogonal to the constants the answer is exact,
+the one that is 0 at the last node.
+
+Cholesky does not fail on a singular matrix: rounding makes the zero pivot a tiny number of either sign and
+the answer garbage. Each pivot is therefore compared with the diagonal entry it came from; their smallest
+ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is disconnected or not rigid.
+"""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
+from sfm_shapefit.laplacian.dense import (
+    FLAGS,
+    one_blas_thread,
+    potrf,
+    routine_addresses,
+    syrk,
+    trsm,
+    work_integers,
+    work_scalars,
+)
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+
+PIVOT_TOLERANCE = 64.0
+"""Pivots below this many rounding units of their diagonal entry count as zero."""
+
+
+@dataclass(slots=True, eq=False)
+class CholeskyFactor:
+    """Numeric factor of one Laplacian: memory that `refactor` overwrites and `solve` reads."""
+
+    symbolic: SymbolicFactor
+    """The plan."""
+    block: int
+    """Size b of the blocks; 1 for the scalar graph Laplacian."""
+    panels: npt.NDArray[Any]
+    """All panels of L, float32 or float64."""
+    smallest_pivot: float = 0.0
+    """Least ratio of a pivot to its diagonal entry, in (0, 1]; near the rounding unit if singular."""
+    weakest_node: int = -1
+    """The node of that pivot."""
+    _stack: npt.NDArray[Any] = field(repr=False, default_factory=lambda: np.empty(0))
+    _diagonal: FloatArray = field(repr=False, default_factory=lambda: np.empty(0))
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Precision of the factor."""
+        return self.panels.dtype
+
+    def refactor(self, weights: FloatArray, ground: float | None = None) -> None:
+        """Factor the Laplacian with new edge weights, in place.
+
+        Args:
+            weights: (m,) for block 1, else (m, b, b) symmetric positive semidefinite blocks.
+            ground: added to the last pivot (times the identity); the mean diagonal weight if None.
+
+        Raises:
+            UnsolvableError: if a pivot is not positive to working precision: the graph is disconnected,
+                or (b > 1) not rigid under these weights, or a weight is negative or not finite. Use
+                nothing of the factor then.
+        """
+        _refactor(self, weights, ground)
+
+    def solve(self, rhs: FloatArray) -> FloatArray:
+        """Return x with L x = rhs, with x = 0 at the grounded node.
+
+        Args:
+            rhs: (n,) or (n, k) for block 1, else (n, b) or (n, b, k). Each right-hand side must be
+                orthogonal to the constants (of each of the b components).
+
+        Returns:
+            Float64 of the shape of `rhs`, accurate to the precision of the factor.
+        """
+        return _solve(self, rhs)
+
+
+def allocate_factor(
+    symbolic: SymbolicFactor, block: int = 1, dtype: npt.DTypeLike = np.float64
+) -> CholeskyFactor:
+    """Allocate the memory of a factor, `symbolic.num_bytes(block, dtype)` in all."""
+    area = block * block
+    return CholeskyFactor(
+        symbolic=symbolic,
+        block=block,
+        panels=np.empty(int(symbolic.panel_pointers[-1]) * area, dtype=dtype),
+        _stack=np.empty(symbolic.stack_size * area, dtype=dtype),
+        _diagonal=np.empty((symbolic.num_nodes, area)),
+    )
+
+
+def factorise(
+    symbolic: SymbolicFactor,
+    weights: FloatArray,
+    dtype: npt.DTypeLike = np.float64,
+    ground: float | None = None,
+) -> CholeskyFactor:
+    """Allocate a factor and compute it; see `CholeskyFactor.refactor`."""
+    block = 1 if np.ndim(weights) == 1 else np.shape(weights)[1]
+    factor = allocate_factor(symbolic, block, dtype)
+    factor.refactor(weights, ground)
+    return factor
+
+
+def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None) -> None:
+    plan, b = factor.symbolic, factor.block
+    shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
+    if np.shape(weights) != shape:
+        raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
+    w = np.ascontiguousarray(weights, dtype=np.float64).reshape(plan.num_edges, b * b)
+    diagonal = factor._diagonal
+    _sum_at_nodes(plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
+                  plan.first, plan.row_pointers, plan.rows, w, diagonal)  # fmt: skip
+    traces = diagonal[:, :: b + 1]
+    grounding = float(traces.mean()) if ground is None else ground
+    traces[-1] += grounding
+    pivot = np.empty(2)
+    with one_blas_thread():
+        failed = _run(factor, w, pivot)
+    factor.smallest_pivot = float(pivot[0])
+    factor.weakest_node = int(plan.permutation[int(pivot[1]) // b])
+    if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(factor.dtype).eps:
+        raise UnsolvableError(
+            f"the Laplacian is singular at node {factor.weakest_node} (relative pivot {pivot[0]:.1e}); "
+            "the graph is disconnected or not rigid there, or its weights are not positive"
+        )
+
+
+def _run(factor: CholeskyFactor, w: FloatArray, pivot: FloatArray) -> bool:
+    """Call the kernel with everything that it needs."""
+    plan, b, diagonal = factor.symbolic, factor.block, factor._diagonal
+    failed: bool = _factorise(
+        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.rows, plan.relative,
+        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets,
+        plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
+        w, diagonal, factor.panels, factor._stack, pivot,
+        routine_addresses(factor.dtype), FLAGS, work_integers(), work_scalars(factor.dtype),
+    )  # fmt: skip
+    return failed
+
+
+@kernel(exact=True)
+def _sum_at_nodes(
+    edge_pointers: Any,
+    edge_index: Any,
+    edge_row: Any,
+    edge_column: Any,
+    first: Any,
+    row_pointers: Any,
+    rows: Any,
+    weights: Any,
+    diagonal: Any,
+) -> None:
+    """Write the diagonal blocks of the Laplacian, in elimination order: sums over incident edges."""
+    diagonal[:] = 0.0
+    for s in range(len(first) - 1):
+        start, width = first[s], first[s + 1] - first[s]
+        for k in range(edge_pointers[s], edge_pointers[s + 1]):
+            position = edge_row[k]
+            i = start + edge_column[k]
+            j = start + position if position < width else rows[row_pointers[s] + position - width]
+            e = edge_index[k]
+            for a in range(weights.shape[1]):
+                w = weights[e, a]
+                diagonal[i, a] += w
+                diagonal[j, a] += w
+
+
+@kernel(exact=True)
+def _factorise(
+    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, relative: Any,
+    panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any,
+    edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
+    weights: Any, diagonal: Any, panels: Any, stack: Any, pivot: Any,
+    routines: Any, flags: Any, integers: Any, scalars: Any,
+) -> bool:  # fmt: skip
+    """Factor the supernodes begin..end-1; return True if a pivot was not positive.
+
+    `pivot` receives the least relative pivot and the row it stands in.
+    """
+    pivot[0] = np.inf
+    pivot[1] = 0.0
+    for s in range(begin, end):
+        start, width = first[s], (first[s + 1] - first[s]) * b
+        below = (row_pointers[s + 1] - row_pointers[s]) * b
+        height = width + below
+        offset = panel_pointers[s] * b * b
+        panel = panels[offset : offset + width * height]
+        panel[:] = 0.0
+        _assemble_edges(
+            panel, height, b, edge_pointers[s], edge_pointers[s + 1], edge_index, edge_row, edge_column, weights
+        )
+        _assemble_diagonal(panel, height, b, start, first[s + 1], diagonal)
+        for c in range(child_pointers[s], child_pointers[s + 1]):
+            child = children[c]
+            there = relative[row_pointers[child] : row_pointers[child + 1]]
+            size = len(there) * b
+            update = stack[update_offsets[child] * b * b :][: size * size]
+            _add_update(update, there, b, 0, width // b, panel, height)
+        info = potrf(routines, flags, integers, panels, offset, width, height)
+        if info != 0:
+            pivot[0] = 0.0
+            pivot[1] = start * b + info - 1
+            return True
+        _check_pivots(panel, height, width, b, start, diagonal, pivot)
+        if below == 0:
+            continue
+        trsm(routines, flags, integers, scalars, panels, offset, offset + width, below, width, height)
+        update_start = update_offsets[s] * b * b
+        syrk(
+            routines, flags, integers, scalars, panels, offset + width, height, below, width,
+            stack, update_start, below, False,
+        )  # fmt: skip
+        mine = stack[update_start : update_start + below * below]
+        for c in range(child_pointers[s], child_pointers[s + 1]):
+            child = children[c]
+            there = relative[row_pointers[child] : row_pointers[child + 1]]
+            size = len(there) * b
+            update = stack[update_offsets[child] * b * b :][: size * size]
+            _add_update(update, there, b, width // b, height // b, mine, below)
+    return False
+
+
+@kernel(exact=True)
+def _assemble_edges(
+    panel: Any, height: int, b: int, begin: int, end: int, index: Any, row: Any, column: Any, weights: Any
+) -> None:
+    """Subtract the edges' weights from a panel at their slots."""
+    for k in range(begin, end):
+        e = index[k]
+        for c in range(b):
+            at = (column[k] * b + c) * height + row[k] * b
+            for a in range(b):
+                panel[at + a] -= weights[e, c * b + a]
+
+
+@kernel(exact=True)
+def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, diagonal: Any) -> None:
+    """Add the diagonal blocks of the nodes start..stop-1 to a panel."""
+    for q in range(stop - start):
+        for c in range(b):
+            at = (q * b + c) * height + q * b
+            for a in range(b):
+                panel[at + a] += diagonal[start + q, c * b + a]
+
+
+@kernel(exact=True)
+def _check_pivots(
+    panel: Any, height: int, width: int, b: int, start: int, diagonal: Any, pivot: Any
+) -> None:
+    """Lower pivot[0] to the least ratio of a squared pivot to its diagonal entry, and note its row."""
+    for k in range(width):
+        root = panel[k * height + k]
+        ratio = root * root / diagonal[start + k // b, (k % b) * (b + 1)]
+        if not ratio >= pivot[0]:
+            pivot[0] = ratio
+            pivot[1] = start * b + k
+
+
+@kernel(exact=True)
+def _add_update(
+    update: Any, there: Any, b: int, lowest: int, highest: int, target: Any, leading: int
+) -> None:
+    """Add the columns of a child's update that go to the columns lowest..highest-1 of its parent's front.
+
+    `there` maps the child's rows to the parent's; `target` starts at row and column `lowest` if that is
+    not 0. Consecutive rows mostly stay consecutive and are added as vectors.
+    """
+    size = len(there)
+    run_end = np.empty(size, np.int64)
+    for i in range(size - 1, -1, -1):
+        joined = i + 1 < size and there[i + 1] == there[i] + 1
+        run_end[i] = run_end[i + 1] if joined else i + 1
+    for j in range(size):
+        if there[j] < lowest or there[j] >= highest:
+            continue
+        for c in range(b):
+            source = (j * b + c) * size * b
+            into = ((there[j] - lowest) * b + c) * leading
+            i = j
+            skip = c  # the part of the diagonal block above the diagonal was never written
+            while i < size:
+                count = (run_end[i] - i) * b
+                at = into + (there[i] - lowest) * b
+                _add(target[at + skip : at + count], update[source + i * b + skip : source + i * b + count])
+                i = run_end[i]
+                skip = 0
+
+
+@kernel(exact=True)
+def _add(target: Any, values: Any) -> None:
+    """Add one contiguous vector to another."""
+    for i in range(len(target)):
+        target[i] += values[i]
+
+
+def _solve(factor: CholeskyFactor, rhs: FloatArray) -> FloatArray:
+    plan, b = factor.symbolic, factor.block
+    n = plan.num_nodes
+    lead = (n,) if b == 1 else (n, b)
+    if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
+        raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
+    given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
+    heights = np.diff(plan.row_pointers) + np.diff(plan.first)
+    x = np.empty((n * b, 3), dtype=factor.dtype)
+    work = np.empty((3, int(np.max(heights, initial=1)) * b), dtype=factor.dtype)
+    out = np.empty_like(given)
+    for k in range(0, given.shape[1], 3):
+        _gather(given[:, k : k + 3], plan.permutation, b, x)
+        _substitute(
+            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x, work,
+            _leaves(factor.dtype), np.empty(3, np.int64), np.empty(12, factor.dtype),
+        )  # fmt: skip
+        _scatter(x, plan.permutation, b, out[:, k : k + 3])
+    return out.reshape(np.shape(rhs))
+
+
+def _leaves(dtype: np.dtype[Any]) -> IntArray:
+    """Return the addresses of `_subtract_four` and `_multiply_four` for float32 or float64."""
+    addresses = [leaf_address(leaf, dtype, 3) for leaf in (_subtract_four, _multiply_four)]
+    return np.array(addresses, dtype=np.int64)
+
+
+@kernel(exact=True)
+def _gather(columns: Any, permutation: Any, b: int, x: Any) -> None:
+    """Write up to three right-hand sides into the columns of x in elimination order; the others are 0."""
+    for i in range(len(permutation)):
+        for a in range(b):
+            for k in range(3):
+                x[i * b + a, k] = columns[permutation[i] * b + a, k] if k < columns.shape[1] else 0.0
+
+
+@kernel(exact=True)
+def _scatter(x: Any, permutation: Any, b: int, columns: Any) -> None:
+    """Undo `_gather`."""
+    for i in range(len(permutation)):
+        for a in range(b):
+            for k in range(columns.shape[1]):
+                columns[permutation[i] * b + a, k] = x[i * b + a, k]
+
+
+@kernel(exact=True)
+def _substitute(
+    b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any, x: Any, work: Any,
+    leaves: Any, sizes: Any, numbers: Any,
+) -> None:  # fmt: skip
+    """Solve L L^T y = x in place for three right-hand sides."""
+    num = len(first) - 1
+    for s in range(num):
+        height = _load_front(b, s, first, row_pointers, rows, x, work, False)
+        width = (first[s + 1] - first[s]) * b
+        _forward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
+        _store_front(b, s, first, row_pointers, rows, x, work, True)
+    for s in range(num - 1, -1, -1):
+        height = _load_front(b, s, first, row_pointers, rows, x, work, True)
+        width = (first[s + 1] - first[s]) * b
+        _backward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
+        _store_front(b, s, first, row_pointers, rows, x, work, False)
+
+
+@kernel(exact=True)
+def _load_front(
+    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
+) -> int:
+    """Copy the unknowns of a front to `work`, 0 for the rows below if not `with_below`; return its height."""
+    start, width = first[s] * b, (first[s + 1] - first[s]) * b
+    for i in range(width):
+        for k in range(3):
+            work[k, i] = x[start + i, k]
+    at = width
+    for p in range(row_pointers[s], row_pointers[s + 1]):
+        row = np.int64(rows[p]) * b
+        for a in range(b):
+            for k in range(3):
+                work[k, at + a] = x[row + a, k] if with_below else 0.0
+        at += b
+    return at
+
+
+@kernel(exact=True)
+def _store_front(
+    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
+) -> None:
+    """Copy a front's own unknowns back to `x`, and add what it leaves to the rows below if `with_below`."""
+    start, width = first[s] * b, (first[s + 1] - first[s]) * b
+    for i in range(width):
+        for k in range(3):
+            x[start + i, k] = work[k, i]
+    if not with_below:
+        return
+    at = width
+    for p in range(row_pointers[s], row_pointers[s + 1]):
+        row = np.int64(rows[p]) * b
+        for a in range(b):
+            for k in range(3):
+                x[row + a, k] += work[k, at + a]
+        at += b
+
+
+@kernel(exact=True)
+def _forward(
+    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
+) -> None:
+    """Divide by the square part of a panel and subtract its rows below, four columns at a time."""
+    j = 0
+    while j + 4 <= width:
+        for q in range(j, j + 4):
+            _eliminate(panels[offset + q * height :][:height], q, j + 4, work)
+            for k in range(3):
+                numbers[4 * k + q - j] = work[k, q]
+        _call_leaf(leaves[0], panels, offset, height, j, work, sizes, numbers)
+        j += 4
+    for q in range(j, width):
+        _eliminate(panels[offset + q * height :][:height], q, height, work)
+
+
+@kernel(exact=True)
+def _backward(
+    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
+) -> None:
+    """Solve with the transposed panel for its own unknowns, four columns at a time from the last."""
+    j = width
+    while j % 4 != 0:
+        j -= 1
+        _finish(panels[offset + j * height :][:height], j, height, work)
+    while j > 0:
+        j -= 4
+        _call_leaf(leaves[1], panels, offset, height, j, work, sizes, numbers)
+        for q in range(j + 3, j - 1, -1):
+            for k in range(3):
+                work[k, q] -= numbers[4 * k + q - j]
+            _finish(panels[offset + q * height :][:height], q, j + 4, work)
+
+
+@kernel(exact=True)
+def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
+    """Finish unknown q and subtract its column from the rows q+1..end-1."""
+    for k in range(3):
+        work[k, q] /= column[q]
+        for i in range(q + 1, end):
+            work[k, i] -= column[i] * work[k, q]
+
+
+@kernel(exact=True)
+def _finish(column: Any, q: int, end: int, work: Any) -> None:
+    """Subtract the rows q+1..end-1 of column q from unknown q and finish it."""
+    for k in range(3):
+        total = work[k, q]
+        for i in range(q + 1, end):
+            total -= column[i] * work[k, i]
+        work[k, q] = total / column[q]
+
+
+@kernel(exact=True)
+def _call_leaf(
+    leaf: int, panels: Any, offset: int, height: int, j: int, work: Any, sizes: Any, numbers: Any
+) -> None:
+    """Run a leaf on the columns j..j+3 of a panel and the rows from j+4 on."""
+    sizes[0], sizes[1], sizes[2] = height - j - 4, height, work.shape[1]
+    columns = array_address(panels) + (offset + j * height + j + 4) * panels.itemsize
+    vectors = array_address(work) + (j + 4) * work.itemsize
+    call_address(leaf, (array_address(sizes), columns, vectors, array_address(numbers)))
+
+
+def _subtract_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
+    """Leaf: subtract four columns times their coefficients from three vectors."""
+    size = carray(sizes, (3,))
+    count, height, stride = size[0], size[1], size[2]
+    panel = carray(columns, (3 * height + count,))
+    work = carray(vectors, (2 * stride + count,))
+    factor = carray(numbers, (12,))
+    l0, l1 = panel[:count], panel[height : height + count]
+    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
+    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
+    a0, a1, a2, a3 = factor[0], factor[1], factor[2], factor[3]
+    b0, b1, b2, b3 = factor[4], factor[5], factor[6], factor[7]
+    c0, c1, c2, c3 = factor[8], factor[9], factor[10], factor[11]
+    for i in range(count):
+        u[i] -= l0[i] * a0 + l1[i] * a1 + l2[i] * a2 + l3[i] * a3
+        v[i] -= l0[i] * b0 + l1[i] * b1 + l2[i] * b2 + l3[i] * b3
+        w[i] -= l0[i] * c0 + l1[i] * c1 + l2[i] * c2 + l3[i] * c3
+
+
+def _multiply_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
+    """Leaf: write the twelve products of four columns with three vectors."""
+    size = carray(sizes, (3,))
+    count, height, stride = size[0], size[1], size[2]
+    panel = carray(columns, (3 * height + count,))
+    work = carray(vectors, (2 * stride + count,))
+    sums = carray(numbers, (12,))
+    l0, l1 = panel[:count], panel[height : height + count]
+    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
+    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
+    u0 = u1 = u2 = u3 = v0 = v1 = v2 = v3 = w0 = w1 = w2 = w3 = sums.dtype.type(0)
+    for i in range(count):
+        u0 += l0[i] * u[i]
+        u1 += l1[i] * u[i]
+        u2 += l2[i] * u[i]
+        u3 += l3[i] * u[i]
+        v0 += l0[i] * v[i]
+        v1 += l1[i] * v[i]
+        v2 += l2[i] * v[i]
+        v3 += l3[i] * v[i]
+        w0 += l0[i] * w[i]
+        w1 += l1[i] * w[i]
+        w2 += l2[i] * w[i]
+        w3 += l3[i] * w[i]
+    sums[0], sums[1], sums[2], sums[3] = u0, u1, u2, u3
+    sums[4], sums[5], sums[6], sums[7] = v0, v1, v2, v3
+    sums[8], sums[9], sums[10], sums[11] = w0, w1, w2, w3

@@ -1,0 +1,257 @@
+"""Incidence operator and Laplacians of a graph, applied edge by edge or assembled by slots.
+
+    (D t)_e = t_i - t_j        e = (i, j)              incidence, m x n
+    L = D^T W D                W = diag(w)             graph Laplacian, n x n
+    L = D^T diag(B_e) D        B_e symmetric, b x b    block Laplacian, nb x nb
+
+A Laplacian with new weights has the old pattern. `LaplacianPattern` finds once where in the matrix
+each edge goes (its slots); `assemble` then only writes, without sorting or allocation of indices.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import bsr_array, csr_array
+
+from sfm_shapefit.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.jit import kernel
+
+Int32Array = npt.NDArray[np.int32]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Adjacency:
+    """The neighbours of each node, in compressed rows; within a row in the order of the edges."""
+
+    pointers: IntArray
+    """(n + 1,) row i is `neighbours[pointers[i]:pointers[i + 1]]`."""
+    neighbours: Int32Array
+    """(2m,) node indices."""
+    edge_of: Int32Array
+    """(2m,) the edge behind each entry."""
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes, n."""
+        return len(self.pointers) - 1
+
+
+def checked_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
+    """Return `edges` as a contiguous (m, 2) int64 array.
+
+    Raises:
+        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
+    """
+    array = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
+    if array.size and (array.min() < 0 or array.max() >= num_nodes):
+        raise InputError(f"an edge leaves the nodes 0..{num_nodes - 1}; give indices in [0, n)")
+    if (array[:, 0] == array[:, 1]).any():
+        raise InputError("an edge joins a node with itself; remove it")
+    return array
+
+
+def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
+    """Return the neighbours of each node; a repeated edge stands repeatedly.
+
+    Args:
+        num_nodes: n.
+        edges: (m, 2) int64, checked.
+    """
+    pointers, neighbours, edge_of = _adjacency(num_nodes, edges)
+    return Adjacency(frozen(pointers), frozen(neighbours), frozen(edge_of))
+
+
+@kernel()
+def _adjacency(num_nodes: int, edges: Any) -> Any:
+    """Counting sort of both ends of the edges by node."""
+    m = edges.shape[0]
+    pointers = np.zeros(num_nodes + 1, np.int64)
+    for e in range(m):
+        pointers[edges[e, 0] + 1] += 1
+        pointers[edges[e, 1] + 1] += 1
+    for i in range(num_nodes):
+        pointers[i + 1] += pointers[i]
+    fill = pointers[:-1].copy()
+    neighbours = np.empty(2 * m, np.int32)
+    edge_of = np.empty(2 * m, np.int32)
+    for e in range(m):
+        i, j = edges[e, 0], edges[e, 1]
+        neighbours[fill[i]], edge_of[fill[i]] = j, e
+        neighbours[fill[j]], edge_of[fill[j]] = i, e
+        fill[i] += 1
+        fill[j] += 1
+    return pointers, neighbours, edge_of
+
+
+def apply_incidence(edges: IntArray, t: FloatArray, out: FloatArray | None = None) -> FloatArray:
+    """Return D t: t_i - t_j for each edge (i, j).
+
+    Args:
+        edges: (m, 2) node indices.
+        t: (n, d) float64, C-contiguous.
+        out: (m, d), written and returned if given.
+    """
+    result = np.empty((len(edges), t.shape[1])) if out is None else out
+    _incidence(edges, t, result)
+    return result
+
+
+@kernel()
+def _incidence(edges: Any, t: Any, out: Any) -> None:
+    for e in range(edges.shape[0]):
+        i, j = edges[e, 0], edges[e, 1]
+        for k in range(t.shape[1]):
+            out[e, k] = t[i, k] - t[j, k]
+
+
+def apply_incidence_transposed(
+    edges: IntArray, y: FloatArray, num_nodes: int, out: FloatArray | None = None
+) -> FloatArray:
+    """Return D^T y: at each node the sum of signed y_e, + where the edge starts and - where it ends.
+
+    Args:
+        edges: (m, 2) node indices.
+        y: (m, d) float64, C-contiguous.
+        num_nodes: n.
+        out: (n, d), written and returned if given.
+    """
+    result = np.empty((num_nodes, y.shape[1])) if out is None else out
+    result[...] = 0.0
+    _incidence_transposed(edges, y, result)
+    return result
+
+
+@kernel(exact=True)
+def _incidence_transposed(edges: Any, y: Any, out: Any) -> None:
+    for e in range(edges.shape[0]):
+        i, j = edges[e, 0], edges[e, 1]
+        for k in range(y.shape[1]):
+            out[i, k] += y[e, k]
+            out[j, k] -= y[e, k]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LaplacianPattern:
+    """Where each edge stands in the assembled Laplacian: pattern and slots, found once per graph."""
+
+    pointers: IntArray
+    """(n + 1,) row pointers of the compressed (block) rows."""
+    columns: Int32Array
+    """(q,) column of each stored (block) entry, ascending within a row; the diagonal is stored."""
+    diagonal: IntArray
+    """(n,) slot of each diagonal entry."""
+    upper: IntArray
+    """(m,) slot of entry (i, j) of each edge (i, j)."""
+    lower: IntArray
+    """(m,) slot of entry (j, i)."""
+    edges: IntArray
+    """(m, 2) the edges."""
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes, n."""
+        return len(self.pointers) - 1
+
+
+def laplacian_pattern(num_nodes: int, edges: npt.ArrayLike) -> LaplacianPattern:
+    """Find the pattern and the slots of the Laplacian of a graph; repeated edges share their slots.
+
+    Args:
+        num_nodes: n.
+        edges: (m, 2) node indices.
+
+    Raises:
+        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
+    """
+    pairs = checked_edges(num_nodes, edges)
+    m = len(pairs)
+    nodes = np.arange(num_nodes)
+    rows = np.concatenate([nodes, pairs[:, 0], pairs[:, 1]])
+    columns = np.concatenate([nodes, pairs[:, 1], pairs[:, 0]])
+    keys, slots = np.unique(rows * num_nodes + columns, return_inverse=True)
+    pointers = np.searchsorted(keys, np.arange(num_nodes + 1) * num_nodes)
+    parts = np.split(slots.astype(np.int64), [num_nodes, num_nodes + m])
+    diagonal, upper, lower = (frozen(part) for part in parts)
+    column = frozen((keys % max(num_nodes, 1)).astype(np.int32))
+    return LaplacianPattern(frozen(pointers.astype(np.int64)), column, diagonal, upper, lower, frozen(pairs))
+
+
+def assemble(
+    pattern: LaplacianPattern, weights: FloatArray, out: FloatArray | None = None
+) -> csr_array | bsr_array:
+    """Return the Laplacian with the given edge weights as a scipy matrix.
+
+    Args:
+        pattern: from `laplacian_pattern`.
+        weights: (m,) for the graph Laplacian, or (m, b, b) symmetric blocks for the block Laplacian.
+        out: the `data` of a matrix assembled before, (q,) or (q, b, b), overwritten and shared if given.
+
+    Returns:
+        (n, n) csr_array, or (nb, nb) bsr_array, float64.
+    """
+    w = np.ascontiguousarray(weights, dtype=np.float64)
+    shape = (len(pattern.columns), *w.shape[1:])
+    data = np.empty(shape) if out is None else out
+    block = 1 if w.ndim == 1 else w.shape[1]
+    data[...] = 0.0
+    _assemble(
+        pattern.edges, pattern.diagonal, pattern.upper, pattern.lower,
+        w.reshape(len(w), -1), data.reshape(len(data), -1),
+    )  # fmt: skip
+    n = pattern.num_nodes * block
+    indices = (data, pattern.columns, pattern.pointers)
+    return csr_array(indices, shape=(n, n)) if w.ndim == 1 else bsr_array(indices, shape=(n, n))
+
+
+@kernel(exact=True)
+def _assemble(edges: Any, diagonal: Any, upper: Any, lower: Any, weights: Any, data: Any) -> None:
+    for e in range(edges.shape[0]):
+        i, j = diagonal[edges[e, 0]], diagonal[edges[e, 1]]
+        for k in range(weights.shape[1]):
+            w = weights[e, k]
+            data[i, k] += w
+            data[j, k] += w
+            data[upper[e], k] -= w
+            data[lower[e], k] -= w
+
+
+def apply_laplacian(graph: Adjacency, weights: FloatArray, x: FloatArray, out: FloatArray) -> FloatArray:
+    """Write L x into `out` and return it, without assembling L.
+
+    Args:
+        graph: the neighbours of each node.
+        weights: (m,) edge weights.
+        x: (n, k) float64, C-contiguous.
+        out: (n, k).
+    """
+    if x.shape[1] == 3:
+        _apply_laplacian_3(graph.pointers, graph.neighbours, graph.edge_of, weights, x, out)
+    else:
+        _apply_laplacian(graph.pointers, graph.neighbours, graph.edge_of, weights, x, out)
+    return out
+
+
+@kernel()
+def _apply_laplacian_3(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, x: Any, out: Any) -> None:
+    for i in range(len(pointers) - 1):
+        x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for p in range(pointers[i], pointers[i + 1]):
+            j, w = neighbours[p], weights[edge_of[p]]
+            s0 += w * (x0 - x[j, 0])
+            s1 += w * (x1 - x[j, 1])
+            s2 += w * (x2 - x[j, 2])
+        out[i, 0], out[i, 1], out[i, 2] = s0, s1, s2
+
+
+@kernel()
+def _apply_laplacian(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, x: Any, out: Any) -> None:
+    for i in range(len(pointers) - 1):
+        out[i] = 0.0
+        for p in range(pointers[i], pointers[i + 1]):
+            j, w = neighbours[p], weights[edge_of[p]]
+            for k in range(x.shape[1]):
+                out[i, k] += w * (x[i, k] - x[j, k])

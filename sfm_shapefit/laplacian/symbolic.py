@@ -1,0 +1,470 @@
+"""What a sparse Cholesky factorisation will do, from the graph alone: fill, work, and where all goes.
+
+Eliminating node k joins its later neighbours. The first of them is its parent in the elimination tree,
+and column k of the factor L is filled within the column of the parent (Liu 1990, "The role of elimination
+trees in sparse factorization"). From that:
+
+    column counts   entries per column of L, without forming L: count the leaves of the row subtrees
+                    (Gilbert, Ng, Peyton 1994, "An efficient algorithm to compute row and column counts")
+    supernodes      runs of columns with equal structure, stored as dense panels; small ones are merged
+                    into their parents at the price of some explicit zeros (Ashcraft, Grimes 1989)
+    fronts          one dense panel and one dense update matrix per supernode (Duff, Reid 1983); an update
+                    waits for its parent on a stack whose every offset is known here, before any number is
+
+All indices count nodes; a block size b enters only as a factor (positions times b, areas times b^2).
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.arrays import IntArray, frozen
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
+
+_MERGE_ALWAYS = 0.03  # a child joins its parent if the merged panel has at most this share of zeros,
+_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # or this share while it has at most so many columns
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EliminationTree:
+    """The elimination tree of a graph under a fill-reducing order, postordered, with column counts."""
+
+    permutation: IntArray
+    """(n,) the node that is eliminated k-th; every subtree is a contiguous range of k."""
+    inverse: IntArray
+    """(n,) when each node is eliminated."""
+    parent: IntArray
+    """(n,) parent of each elimination step, -1 at a root."""
+    counts: IntArray
+    """(n,) entries of each column of L, the diagonal included."""
+
+    @property
+    def num_nonzeros(self) -> int:
+        """Entries of L without any explicit zero, nnz(L)."""
+        return int(self.counts.sum())
+
+    @property
+    def flops(self) -> float:
+        """Multiplications and additions of the factorisation: the sum of squared column counts."""
+        return float(np.sum(self.counts.astype(np.float64) ** 2))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SymbolicFactor:
+    """The plan of a multifrontal Cholesky factorisation; serves every block size and precision.
+
+    Supernode s owns elimination steps `first[s]:first[s + 1]`. Its panel has those steps as columns, and
+    as rows the same steps followed by `rows[row_pointers[s]:row_pointers[s + 1]]`, column-major.
+    """
+
+    permutation: IntArray
+    """(n,) the node that is eliminated k-th."""
+    inverse: IntArray
+    """(n,) when each node is eliminated."""
+    first: IntArray
+    """(S + 1,) first column of each supernode."""
+    parent: IntArray
+    """(S,) parent supernode, -1 at a root; children come before parents."""
+    child_pointers: IntArray
+    """(S + 1,) into `children`."""
+    children: IntArray
+    """Children of each supernode, ascending; the order in which their updates are added."""
+    row_pointers: IntArray
+    """(S + 1,) into `rows` and `relative`."""
+    rows: Int32Array
+    """Rows below the own columns of each supernode, ascending."""
+    relative: Int32Array
+    """Position of each of these rows among all rows of the parent's panel."""
+    panel_pointers: IntArray
+    """(S + 1,) start of each panel in units of one (block) entry."""
+    update_offsets: IntArray
+    """(S,) start of each update matrix in the stack, in units of one (block) entry."""
+    stack_size: int
+    """(Block) entries of the stack of update matrices."""
+    edge_pointers: IntArray
+    """(S + 1,) into the three arrays below: the edges of each supernode."""
+    edge_index: Int32Array
+    """(m,) edges, grouped by the supernode that they enter."""
+    edge_row: Int32Array
+    """(m,) row of each of these edges in its panel."""
+    edge_column: Int32Array
+    """(m,) column of each of these edges in its panel."""
+    num_nonzeros: int
+    """Entries of the scalar factor L without any explicit zero."""
+    flops: float
+    """Multiplications and additions of the scalar factorisation, without explicit zeros."""
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes, n."""
+        return len(self.permutation)
+
+    @property
+    def num_edges(self) -> int:
+        """Number of edges, m."""
+        return len(self.edge_index)
+
+    @property
+    def num_supernodes(self) -> int:
+        """Number of supernodes, S."""
+        return len(self.parent)
+
+    def num_bytes(self, block: int = 1, dtype: npt.DTypeLike = np.float64) -> int:
+        """Return the memory of the numeric factor: its panels, and the stack while it is computed."""
+        entries = int(self.panel_pointers[-1]) + self.stack_size
+        return entries * block * block * np.dtype(dtype).itemsize
+
+
+def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> EliminationTree:
+    """Return the elimination tree and the column counts of L for a fill-reducing order.
+
+    Args:
+        graph: the neighbours of each node.
+        order: (n,) a permutation of the nodes, the first eliminated first.
+
+    Returns:
+        The tree for an equivalent order (same L up to renumbering) in which subtrees are contiguous.
+    """
+    permutation = np.ascontiguousarray(order, dtype=np.int64)
+    inverse = _inverse(permutation)
+    parent = _parents(graph.pointers, graph.neighbours, permutation, inverse)
+    post = _postorder(parent)
+    permutation = permutation[post]
+    rank = _inverse(post)
+    inverse = _inverse(permutation)
+    moved = parent[post]
+    parent = np.where(moved < 0, -1, rank[moved])
+    counts = _column_counts(graph.pointers, graph.neighbours, permutation, inverse, parent)
+    return EliminationTree(frozen(permutation), frozen(inverse), frozen(parent), frozen(counts))
+
+
+def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
+    """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
+
+    Args:
+        graph: the neighbours of each node.
+        edges: (m, 2) int64, the edges of `graph`.
+        tree: from `elimination_tree` on the same graph.
+    """
+    order, first, parent, below = _supernodes(tree.parent, tree.counts)
+    permutation = tree.permutation[order]
+    inverse = _inverse(permutation)
+    row_pointers = np.concatenate([[0], np.cumsum(below)])
+    owner = np.repeat(np.arange(len(parent)), np.diff(first))
+    rows = _panel_rows(
+        graph.pointers, graph.neighbours, permutation, inverse, owner, parent, row_pointers
+    )  # fmt: skip
+    relative = _relative_positions(first, parent, row_pointers, rows)
+    sizes = np.diff(first) * (np.diff(first) + below)
+    offsets, stack_size = _stack_plan(parent, below)
+    children = np.argsort(parent, kind="stable")[int(np.sum(parent < 0)) :]
+    child_pointers = np.searchsorted(parent[children], np.arange(len(parent) + 1))
+    slots = _edge_slots(edges, inverse, owner, first, row_pointers, rows)
+    edge_pointers, edge_index, edge_row, edge_column = slots
+    return SymbolicFactor(
+        permutation=frozen(permutation),
+        inverse=frozen(inverse),
+        first=frozen(first),
+        parent=frozen(parent),
+        child_pointers=frozen(child_pointers),
+        children=frozen(children),
+        row_pointers=frozen(row_pointers),
+        rows=frozen(rows),
+        relative=frozen(relative),
+        panel_pointers=frozen(np.concatenate([[0], np.cumsum(sizes)])),
+        update_offsets=frozen(offsets),
+        stack_size=int(stack_size),
+        edge_pointers=frozen(edge_pointers),
+        edge_index=frozen(edge_index),
+        edge_row=frozen(edge_row),
+        edge_column=frozen(edge_column),
+        num_nonzeros=tree.num_nonzeros,
+        flops=tree.flops,
+    )
+
+
+def _inverse(permutation: IntArray) -> IntArray:
+    """Return the inverse of a permutation."""
+    inverse = np.empty_like(permutation)
+    inverse[permutation] = np.arange(len(permutation))
+    return inverse
+
+
+@kernel()
+def _parents(pointers: Any, neighbours: Any, permutation: Any, inverse: Any) -> Any:
+    """Return the elimination tree: join the earlier neighbours' trees below each step (with compression)."""
+    n = len(permutation)
+    parent = np.full(n, -1, np.int64)
+    ancestor = np.full(n, -1, np.int64)
+    for k in range(n):
+        node = permutation[k]
+        for p in range(pointers[node], pointers[node + 1]):
+            i = inverse[neighbours[p]]
+            while i < k and i != -1:
+                above = ancestor[i]
+                ancestor[i] = k
+                if above == -1:
+                    parent[i] = k
+                i = above
+    return parent
+
+
+@kernel()
+def _postorder(parent: Any) -> Any:
+    """Return a postorder of a forest; siblings stay in ascending order."""
+    n = len(parent)
+    child = np.full(n + 1, -1, np.int64)  # entry n stands for the common parent of the roots
+    sibling = np.full(n, -1, np.int64)
+    for i in range(n - 1, -1, -1):
+        above = parent[i] if parent[i] >= 0 else n
+        sibling[i] = child[above]
+        child[above] = i
+    order = np.empty(n, np.int64)
+    filled = 0
+    node = n
+    while True:
+        while child[node] != -1:
+            down = child[node]
+            child[node] = sibling[down]
+            node = down
+        if node == n:
+            return order
+        order[filled] = node
+        filled += 1
+        node = parent[node] if parent[node] >= 0 else n
+
+
+@kernel()
+def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
+    """Count the entries of each column of L.
+
+    Row i of L is the subtree that joins i's earlier neighbours to i. Entry (i, j) is charged +1 at each
+    leaf j and -1 where two branches meet, so that sums over subtrees count every row that passes.
+    """
+    n = len(permutation)
+    delta = np.ones(n, np.int64)
+    lowest = np.arange(n)  # first descendant
+    for j in range(n):
+        if parent[j] >= 0:
+            delta[parent[j]] = 0  # not a leaf of the tree, so no leaf of its own row subtree
+            lowest[parent[j]] = min(lowest[parent[j]], lowest[j])
+    previous = np.full(n, -1, np.int64)  # latest leaf seen in each row subtree
+    ancestor = np.arange(n)
+    for j in range(n):
+        if parent[j] >= 0:
+            delta[parent[j]] -= 1
+        node = permutation[j]
+        for p in range(pointers[node], pointers[node + 1]):
+            i = inverse[neighbours[p]]
+            if i <= j or lowest[j] <= previous[i]:
+                continue  # an earlier neighbour of i lies below j: j is no leaf of row i
+            delta[j] += 1
+            if previous[i] >= 0:
+                meet = previous[i]
+                while ancestor[meet] != meet:
+                    ancestor[meet] = ancestor[ancestor[meet]]
+                    meet = ancestor[meet]
+                delta[meet] -= 1
+            previous[i] = j
+        if parent[j] >= 0:
+            ancestor[j] = parent[j]
+    for j in range(n):
+        if parent[j] >= 0:
+            delta[parent[j]] += delta[j]
+    return delta
+
+
+def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return the merged supernodes: column order, first columns (S + 1,), parents (S,), rows below (S,)."""
+    head = _fundamental_heads(parent, counts)
+    limits = np.array([limit for limit, _ in _MERGE_LIMITS], dtype=np.int64)
+    shares = np.array([share for _, share in _MERGE_LIMITS])
+    label, tree, width, height = _merge(parent, counts, head, limits, shares, _MERGE_ALWAYS)
+    post = _postorder(tree)
+    rank = _inverse(post)
+    order = np.argsort(rank[label], kind="stable")
+    first = np.concatenate([[0], np.cumsum(width[post])])
+    moved = tree[post]
+    supernode_parent = np.where(moved < 0, -1, rank[moved])
+    return order, first, supernode_parent, (height - width)[post]
+
+
+@kernel()
+def _fundamental_heads(parent: Any, counts: Any) -> Any:
+    """Return the first column of each maximal run of columns with nested equal structure."""
+    n = len(parent)
+    head = np.zeros(n, np.bool_)
+    for j in range(n):
+        head[j] = j == 0 or parent[j - 1] != j or counts[j - 1] != counts[j] + 1
+    return np.flatnonzero(head)
+
+
+@kernel()
+def _merge(
+    parent: Any, counts: Any, head: Any, limits: Any, shares: Any, always: float
+) -> Any:
+    """Merge children into parents while few zeros arise.
+
+    Returns the supernode of each column, and parent, columns and rows of each supernode.
+    """
+    n, num = len(parent), len(head)
+    label = np.empty(n, np.int64)
+    width = np.empty(num, np.int64)
+    height = np.empty(num, np.int64)
+    for s in range(num):
+        end = head[s + 1] if s + 1 < num else n
+        label[head[s] : end] = s
+        width[s] = end - head[s]
+        height[s] = counts[head[s]]
+    above = np.full(num, -1, np.int64)
+    for s in range(num):
+        last = head[s] + width[s] - 1
+        if parent[last] >= 0:
+            above[s] = label[parent[last]]
+    true_entries = np.empty(num)
+    for s in range(num):
+        true_entries[s] = width[s] * height[s] - width[s] * (width[s] - 1) / 2
+    target = np.arange(num)
+    for s in range(num):  # children before parents; a parent has already absorbed its earlier children
+        p = above[s]
+        if p < 0:
+            continue
+        columns, rows = width[s] + width[p], width[s] + height[p]
+        entries = columns * rows - columns * (columns - 1) / 2
+        zeros = 1.0 - (true_entries[s] + true_entries[p]) / entries
+        accept = zeros <= always
+        for q in range(len(limits)):
+            accept = accept or (columns <= limits[q] and zeros <= shares[q])
+        if accept:
+            target[s] = p
+            width[p], height[p] = columns, rows
+            true_entries[p] += true_entries[s]
+    kept = np.full(num, -1, np.int64)
+    count = 0
+    for s in range(num - 1, -1, -1):  # follow merges from the roots down
+        if target[s] != s:
+            target[s] = target[target[s]]
+    for s in range(num):
+        if target[s] == s:
+            kept[s] = count
+            count += 1
+    tree = np.full(count, -1, np.int64)
+    for s in range(num):
+        if target[s] == s and above[s] >= 0:
+            tree[kept[s]] = kept[target[above[s]]]
+    for j in range(n):
+        label[j] = kept[target[label[j]]]
+    chosen = np.flatnonzero(kept >= 0)
+    return label, tree, width[chosen], height[chosen]
+
+
+@kernel()
+def _panel_rows(
+    pointers: Any, neighbours: Any, permutation: Any, inverse: Any, owner: Any, parent: Any, row_pointers: Any
+) -> Any:
+    """Fill the rows below each supernode: row i is appended to all supernodes of its row subtree."""
+    num = len(parent)
+    fill = row_pointers[:num].copy()
+    rows = np.empty(row_pointers[num], np.int32)
+    mark = np.full(num, -1, np.int64)
+    for i in range(len(permutation)):
+        mark[owner[i]] = i
+        node = permutation[i]
+        for p in range(pointers[node], pointers[node + 1]):
+            j = inverse[neighbours[p]]
+            if j >= i:
+                continue
+            s = owner[j]
+            while mark[s] != i:
+                mark[s] = i
+                rows[fill[s]] = i
+                fill[s] += 1
+                s = parent[s]
+    return rows
+
+
+@kernel()
+def _relative_positions(first: Any, parent: Any, row_pointers: Any, rows: Any) -> Any:
+    """Locate the rows below each supernode in its parent's panel; both lists ascend."""
+    relative = np.empty(len(rows), np.int32)
+    for s in range(len(parent)):
+        p = parent[s]
+        if p < 0:
+            continue
+        width = first[p + 1] - first[p]
+        q = row_pointers[p]
+        for k in range(row_pointers[s], row_pointers[s + 1]):
+            row = rows[k]
+            if row < first[p + 1]:
+                relative[k] = row - first[p]
+                continue
+            while rows[q] < row:
+                q += 1
+            relative[k] = width + q - row_pointers[p]
+    return relative
+
+
+@kernel()
+def _stack_plan(parent: Any, below: Any) -> Any:
+    """Place each update matrix on one of two stacks that grow towards each other.
+
+    A front reads its children's updates and writes its own. With the levels of the tree on alternating
+    stacks, both are at the top of their stack and nothing is ever copied. Offsets of the second stack
+    are counted from the end.
+    """
+    num = len(parent)
+    level = np.zeros(num, np.int64)
+    for s in range(num - 1, -1, -1):
+        if parent[s] >= 0:
+            level[s] = 1 - level[parent[s]]
+    offsets = np.zeros(num, np.int64)
+    top = np.zeros(2, np.int64)
+    freed = np.full(num, -1, np.int64)  # where the children's stack stood before the first child
+    size = 0
+    for s in range(num):
+        side = level[s]
+        offsets[s] = top[side]
+        top[side] += below[s] * below[s]
+        size = max(size, top[0] + top[1])
+        if freed[s] >= 0:
+            top[1 - side] = freed[s]
+        if parent[s] >= 0 and freed[parent[s]] < 0:
+            freed[parent[s]] = offsets[s]
+    for s in range(num):
+        if level[s] == 1:
+            offsets[s] = size - offsets[s] - below[s] * below[s]
+    return offsets, size
+
+
+@kernel()
+def _edge_slots(edges: Any, inverse: Any, owner: Any, first: Any, row_pointers: Any, rows: Any) -> Any:
+    """Group the edges by the supernode of their earlier end and find their row and column in its panel."""
+    num, m = len(first) - 1, len(edges)
+    pointers = np.zeros(num + 1, np.int64)
+    for e in range(m):
+        pointers[owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])] + 1] += 1
+    for s in range(num):
+        pointers[s + 1] += pointers[s]
+    fill = pointers[:num].copy()
+    index = np.empty(m, np.int32)
+    for e in range(m):
+        s = owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])]
+        index[fill[s]] = e
+        fill[s] += 1
+    edge_row = np.empty(m, np.int32)
+    edge_column = np.empty(m, np.int32)
+    position = np.empty(len(inverse), np.int64)
+    for s in range(num):
+        start, width = first[s], first[s + 1] - first[s]
+        for k in range(width):
+            position[start + k] = k
+        for k in range(row_pointers[s], row_pointers[s + 1]):
+            position[rows[k]] = width + k - row_pointers[s]
+        for k in range(pointers[s], pointers[s + 1]):
+            i, j = inverse[edges[index[k], 0]], inverse[edges[index[k], 1]]
+            edge_column[k] = min(i, j) - start
+            edge_row[k] = position[max(i, j)]
+    return pointers, index, edge_row, edge_column
