@@ -34,8 +34,10 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 
 _PENALTY = 0.5  # rho_e = _PENALTY w_e / max(r_e, floor mean(r))
 _FLOORS = (0.1, 0.03, 0.01)  # of the successive renewals; the last one stays
+_ANDERSON_FLOOR = 0.3  # accelerated, on every renewal: even penalties leave more to the acceleration
 _BALANCE = 0.8  # primal over dual residual at which the scale of the penalties is left alone
-_ANDERSON_MEMORY = 5
+_ANDERSON_MEMORY = 6
+_ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other's way
 _ANDERSON_INTERIOR = 0.5  # fraction of edges fitted exactly from which acceleration pays
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _STEP_FACTOR = 10.0
@@ -132,8 +134,8 @@ class Iteration:
             elif k - best_at > max(_STALL_WINDOW, k // 2):
                 return Outcome(state=state, iterations=k, stop=Stop.STALLED)
             if before is not None:
-                self._renew(state, before, settings.renewals.index(k))
                 anderson = self._accelerator(state, anderson)
+                self._renew(state, before, self._floor(settings.renewals.index(k), anderson))
         return Outcome(state=state, iterations=settings.max_iterations, stop=Stop.MAX_ITERATIONS)
 
     def objective(self, state: State) -> float:
@@ -179,7 +181,7 @@ class Iteration:
 
     def _pass(self, state: State, anderson: Anderson | None) -> Anderson | None:
         """Take the proximal step, accelerated if there is a history; return the history to go on with."""
-        relaxation = self.settings.relaxation
+        relaxation = self.settings.relaxation if anderson is None else _ANDERSON_RELAXATION
         target = state.x if anderson is None else np.empty_like(state.x)
         state.pull, state.sums = self.passes.step(state.x, target, state.t, state.rho, relaxation)
         change, previous = float(state.sums[CHANGE]), state.previous
@@ -198,14 +200,17 @@ class Iteration:
         dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
         return float(max(abs(objective - dual_value), _STEP_FACTOR * change) / objective)
 
-    def _renew(self, state: State, before: FloatArray, index: int) -> None:
+    def _floor(self, renewal: int, anderson: Anderson | None) -> float:
+        """Return the least residual that penalties take seriously, relative to the mean residual."""
+        return _FLOORS[min(renewal, len(_FLOORS) - 1)] if anderson is None else _ANDERSON_FLOOR
+
+    def _renew(self, state: State, before: FloatArray, floor: float) -> None:
         """Replace the penalties by w / residual and factor anew; y and the dual rho u stay."""
         passes = self.passes
         state.scale *= np.sqrt(self._balance(state, before) / _BALANCE)
         residuals = passes.residuals(state.t)
-        mean = _mean(residuals, passes.data.weights)
-        floor = _FLOORS[min(index, len(_FLOORS) - 1)] * mean
-        rho = state.scale * _PENALTY * passes.data.weights / np.maximum(residuals, floor)
+        least = floor * _mean(residuals, passes.data.weights)
+        rho = state.scale * _PENALTY * passes.data.weights / np.maximum(residuals, least)
         passes.change_penalties(state.x, state.rho, rho)
         state.rho, state.previous = rho, np.inf
         self._factor(state)

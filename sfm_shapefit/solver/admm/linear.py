@@ -1,4 +1,4 @@
-"""The linear solve inside ADMM: what it asks of a factor, and conjugate gradients where none fits.
+"""The linear solve inside ADMM: a float32 Cholesky factor where it fits, conjugate gradients elsewhere.
 
 Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta
 (delta form). An error of delta is then an error relative to the *step*: a float32 factor loses nothing,
@@ -6,18 +6,37 @@ and conjugate gradients that reduce their residual tenfold count as solved, sinc
 next right-hand side.
 """
 
-from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.solver.admm.edges import EdgePasses, edge_data
+from sfm_shapefit.laplacian.approximate import (
+    Preconditioner,
+    approximate_cholesky,
+    conjugate_gradients,
+    jacobi,
+)
+from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.operators import Adjacency, adjacency, apply_laplacian
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import plan_factorisation
 from sfm_shapefit.viewgraph import ViewGraph
+
+DEFAULT_MEMORY_BYTES = 2_000_000_000
+"""What the factor may take if the caller says nothing."""
+
+_REDUCTION = 0.1  # of the residual per solve; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some
+_MAX_STEPS = 60  # approximate Cholesky needs 2-5 for that reduction on every family tried
+_JACOBI_STEPS = 8  # if Jacobi solves a probe to 1e-2 in so many, the graph is an expander
+_SEED = 1
 
 
 class LaplacianFactor(Protocol):
-    """Solves with the Laplacian L = D^T diag(weights) D of one graph, whose weights change now and then."""
+    """Solves with the Laplacian L = D^T diag(weights) D of one graph, whose weights change now and then.
+
+    `sfm_shapefit.laplacian.cholesky.CholeskyFactor` is one.
+    """
 
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,) in the order of the graph's edges."""
@@ -28,75 +47,58 @@ class LaplacianFactor(Protocol):
         ...
 
 
-class ConjugateGradients:
-    """A `LaplacianFactor` without fill: conjugate gradients from zero, preconditioned by the degrees.
+class IterativeSolver:
+    """A `LaplacianFactor` without fill: conjugate gradients from zero, to a tenth of the residual.
 
-    Serves expanders (random graphs), where a factor would be nearly dense and a few steps suffice. On
-    ill-conditioned graphs (geometric ones, chains) the step limit bites and ADMM stalls.
+    The preconditioner is the diagonal on expanders (random graphs), else an approximate Cholesky factor.
     """
 
-    reduction: float = 0.1
-    max_steps: int = 30
-
-    def __init__(self, graph: ViewGraph, threads: int = 1) -> None:
-        """Keep the edges of the graph; `refactor` must come before `solve`."""
-        data = edge_data(graph, -np.inf)
-        self._order = data.order
-        self._passes = EdgePasses(data, threads)
-        self._weights = np.ones(graph.num_edges)
-        self._inverse_degrees = np.ones((graph.num_cameras, 1))
+    def __init__(self, graph: Adjacency) -> None:
+        """Keep the graph; `refactor` must come before `solve`."""
+        self._graph = graph
+        self._weights = np.ones(len(graph.edge_of) // 2)
+        self._preconditioner: Preconditioner = jacobi(graph, self._weights)
 
     def refactor(self, weights: FloatArray) -> None:
-        """Take new edge weights, (m,) in the order of the graph's edges."""
-        self._weights = weights[self._order]
-        ends, n = self._passes.data.ends, self._passes.data.num_nodes
-        degrees = np.bincount(ends.ravel(), weights=np.repeat(self._weights, 2), minlength=n)
-        self._inverse_degrees = 1.0 / degrees[:, None]
+        """Take new edge weights, (m,), and choose the preconditioner by a probe."""
+        self._weights = np.ascontiguousarray(weights)
+        self._preconditioner = jacobi(self._graph, self._weights)
+        probe = np.random.default_rng(_SEED).normal(size=(self._graph.num_nodes, 1))
+        if not self._solve(probe, 1e-2, _JACOBI_STEPS)[1]:
+            self._preconditioner = approximate_cholesky(self._graph, self._weights, _SEED)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
-        """Return x with ||rhs - L x|| at most `reduction` ||rhs|| in the preconditioned norm, (n, d)."""
-        return conjugate_gradients(
-            lambda x: self._passes.laplacian(x, self._weights),
+        """Return x with ||rhs - L x|| at most a tenth of ||rhs||, column by column, (n, d)."""
+        return self._solve(rhs, _REDUCTION, _MAX_STEPS)[0]
+
+    def _solve(self, rhs: FloatArray, tol: float, max_steps: int) -> tuple[FloatArray, bool]:
+        """Return the solution and whether it is as accurate as asked."""
+        result = conjugate_gradients(
+            lambda x: apply_laplacian(self._graph, self._weights, x, np.empty_like(x)),
+            self._preconditioner,
             rhs,
-            lambda r: self._inverse_degrees * r,
-            reduction=self.reduction,
-            max_steps=self.max_steps,
+            tol=tol,
+            max_iterations=max_steps,
         )
+        return result.x, result.converged
 
 
-def conjugate_gradients(
-    matrix: Callable[[FloatArray], FloatArray],
-    rhs: FloatArray,
-    precondition: Callable[[FloatArray], FloatArray],
-    *,
-    reduction: float,
-    max_steps: int,
-) -> FloatArray:
-    """Return x near the solution of matrix(x) = rhs, from x = 0, for a positive semidefinite matrix.
+def laplacian_factor(
+    graph: ViewGraph, memory_bytes: int = DEFAULT_MEMORY_BYTES, coordinates: FloatArray | None = None
+) -> LaplacianFactor:
+    """Return a float32 Cholesky factor of the graph's Laplacian, or an iterative solver if it would not fit.
 
     Args:
-        matrix: symmetric and positive semidefinite; rhs must lie in its range.
-        rhs: array of any shape; all of it is one vector.
-        precondition: symmetric positive definite approximation of the inverse.
-        reduction: stop once the preconditioned residual norm has fallen to this fraction.
-        max_steps: stop after that many products with the matrix.
+        graph: a connected view graph.
+        memory_bytes: what the factor may take; predicted before anything is allocated.
+        coordinates: (n, k) rough positions that may help to order the nodes.
     """
-    x, r = np.zeros_like(rhs), rhs.copy()
-    z = precondition(r)
-    p, size = z.copy(), float(np.vdot(r, z))
-    target = reduction**2 * size
-    for _ in range(max_steps):
-        if not size > target:
-            break
-        q = matrix(p)
-        curvature = float(np.vdot(p, q))
-        if curvature <= 0.0:
-            break
-        step = size / curvature
-        x += step * p
-        r -= step * q
-        z = precondition(r)
-        size, previous = float(np.vdot(r, z)), size
-        p *= size / previous
-        p += z
-    return x
+    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    tree = best_order(neighbours, "auto", coordinates)
+    bytes_per_entry = np.dtype(np.float32).itemsize
+    if tree.num_nonzeros * bytes_per_entry > memory_bytes:
+        return IterativeSolver(neighbours)
+    plan = plan_factorisation(neighbours, np.ascontiguousarray(graph.edges), tree)
+    if plan.num_bytes(1, np.float32) > memory_bytes:
+        return IterativeSolver(neighbours)
+    return allocate_factor(plan, 1, np.float32)
