@@ -35,10 +35,12 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 _PENALTY = 0.5  # rho_e = _PENALTY w_e / max(r_e, floor mean(r))
 _FLOORS = (0.1, 0.03, 0.01)  # of the successive renewals; the last one stays
 _ANDERSON_FLOOR = 0.3  # accelerated, on every renewal: even penalties leave more to the acceleration
-_BALANCE = 0.8  # primal over dual residual at which the scale of the penalties is left alone
+_BALANCE = 1.3  # primal over dual residual at which the scale of the penalties is left alone
 _ANDERSON_MEMORY = 6
 _ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other's way
-_ANDERSON_INTERIOR = 0.5  # fraction of edges fitted exactly from which acceleration pays
+_ANDERSON_FIRST = 0.6  # fraction of edges inside their ball that starts acceleration at the first renewal
+_ANDERSON_LATER = 0.3  # and at later ones, where noise has had time to show,
+_ANDERSON_KEPT = 0.9  # provided the fraction has not fallen below this share of the one before
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _STEP_FACTOR = 10.0
 _STALL_WINDOW = 150
@@ -88,6 +90,8 @@ class State:
     sums: FloatArray = field(default_factory=lambda: np.zeros(5))
     previous: float = np.inf
     """Squared step of the iteration before."""
+    interior: float = np.nan
+    """Fraction of edges inside their ball at the last renewal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,9 +233,16 @@ class Iteration:
         return float(np.sqrt(np.clip(primal / dual, 1e-2, 1e2)))
 
     def _accelerator(self, state: State, anderson: Anderson | None) -> Anderson | None:
-        """Return an empty history if so many edges fit exactly that acceleration pays, else None."""
-        fraction = float(state.sums[INTERIOR]) / len(state.x)
-        if not self.settings.accelerate or fraction < _ANDERSON_INTERIOR:
+        """Return an empty history if so many edges fit exactly that acceleration pays, else None.
+
+        With noise, the edges inside their ball become few as the iteration converges; without, they stay.
+        """
+        before, state.interior = state.interior, float(state.sums[INTERIOR]) / len(state.x)
+        if np.isnan(before):
+            pays = state.interior >= _ANDERSON_FIRST
+        else:
+            pays = state.interior >= max(_ANDERSON_LATER, _ANDERSON_KEPT * before)
+        if not (self.settings.accelerate and pays):
             return None
         if anderson is None:
             return Anderson(self.passes, state.x.shape, _ANDERSON_MEMORY)
