@@ -22,7 +22,8 @@ import numba
 import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
-from numba.core import cgutils, types
+from numba import types
+from numba.core import cgutils
 from numba.extending import get_cython_function_address, intrinsic
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])

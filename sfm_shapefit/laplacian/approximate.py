@@ -77,11 +77,9 @@ class ApproximateCholesky:
 
 def jacobi(graph: Adjacency, weights: FloatArray) -> JacobiPreconditioner:
     """Return the Jacobi preconditioner of the graph Laplacian with edge weights (m,)."""
-    degree = np.bincount(
-        np.repeat(np.arange(graph.num_nodes), np.diff(graph.pointers)),
-        weights=weights[graph.edge_of],
-        minlength=graph.num_nodes,
-    )
+    owner = np.repeat(np.arange(graph.num_nodes), np.diff(graph.pointers))
+    degree: FloatArray = np.zeros(graph.num_nodes)
+    np.add.at(degree, owner, weights[graph.edge_of])
     return JacobiPreconditioner(frozen(degree))
 
 
@@ -128,7 +126,7 @@ def _push(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
 
 
 @kernel(exact=True)
-def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
+def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
     """Take node v out of the bucket of its degree."""
     if above[v] >= 0:
         below[above[v]] = below[v]
@@ -141,139 +139,157 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
 @kernel(exact=True)
 def _grown(array: Any, size: int) -> Any:
     """Return a copy of an array with room for `size` entries."""
-    larger = np.empty(size, array.dtype)
+    larger = np.empty((size, *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
     return larger
 
 
 @kernel(exact=True)
-def _merged_star(
-    v: int, head: Any, follow: Any, ends: Any, values: Any, step: Any, place: Any, star: Any, star_weight: Any,
-    copies: Any,
-) -> Any:  # fmt: skip
-    """Collect the neighbours of v that are left, parallel edges summed; return their number and the list's end."""
-    size, entry, last = 0, head[v], -1
-    while entry >= 0:
-        u = ends[entry]
-        if step[u] < 0:
-            if place[u] < 0:
-                place[u] = size
-                star[size], star_weight[size], copies[size] = u, 0.0, 0
-                size += 1
-            star_weight[place[u]] += values[entry]
-            copies[place[u]] += 1
-        last = entry
-        entry = follow[entry]
-    for k in range(size):
-        place[star[k]] = -1
-    return size, last
+def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> Any:
+    """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
-
-@kernel(exact=True)
-def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, state: Any) -> Any:
-    """Eliminate all nodes, each time one with the fewest edges left."""
+    Returns the heads, `links` (next entry, other end), weights, degrees, and [first free entry, entries used].
+    """
     n = len(pointers) - 1
-    room = len(neighbours) + len(neighbours) // 4 + 4 * n + 16
-    head = np.full(n, -1, np.int32)  # each node's edges are a linked list; both ends hold an edge
-    follow = np.empty(room, np.int32)
-    ends = np.empty(room, np.int32)
-    values = np.empty(room, np.float64)
+    head = np.full(n, -1, np.int64)
+    links = np.empty((len(neighbours) + 4 * n + 16, 2), np.int32)
+    values = np.empty(len(links), np.float64)
     degree = np.zeros(n, np.int64)
     used = 0
     for v in range(n):
         for p in range(pointers[v], pointers[v + 1]):
             w = weights[edge_of[p]]
             if w > 0.0:
-                ends[used], values[used], follow[used] = neighbours[p], w, head[v]
+                links[used, 0], links[used, 1], values[used] = head[v], neighbours[p], w
                 head[v] = used
                 used += 1
                 degree[v] += 1
-    free = np.int64(-1)  # list of entries that can be used again
-    limit = n + 1
-    for v in range(n):
-        limit = max(limit, degree[v] + 1)
-    bucket = np.full(limit + 1, -1, np.int64)
-    above = np.empty(n, np.int64)
-    below = np.empty(n, np.int64)
+    return head, links, values, degree, np.array([-1, used])
+
+
+@kernel(exact=True)
+def _add_entry(
+    head: Any, links: Any, values: Any, degree: Any, pool: Any, here: int, there: int, w: float
+) -> None:
+    """Add an entry to the list of node `here`."""
+    entry = pool[0]
+    if entry >= 0:
+        pool[0] = links[entry, 0]
+    else:
+        entry = pool[1]
+        pool[1] += 1
+    links[entry, 0], links[entry, 1], values[entry] = head[here], there, w
+    head[here] = entry
+    degree[here] += 1
+
+
+@kernel(exact=True)
+def _merged_star(
+    v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
+    below: Any, step: Any, place: Any, star: Any, star_weight: Any,
+) -> int:  # fmt: skip
+    """Collect the neighbours of v that are left, parallel edges summed, and free v's list.
+
+    Returns their number. Each neighbour leaves its bucket, and its degree falls by the number of its edges to v.
+    """
+    size, entry, last = 0, head[v], -1
+    while entry >= 0:
+        u = np.int64(links[entry, 1])
+        if step[u] < 0:
+            if place[u] < 0:
+                _remove(bucket, above, below, degree, u)
+                place[u] = size
+                star[size], star_weight[size] = u, 0.0
+                size += 1
+            star_weight[place[u]] += values[entry]
+            degree[u] -= 1
+        last = entry
+        entry = np.int64(links[entry, 0])
+    if last >= 0:
+        links[last, 0] = pool[0]
+        pool[0] = head[v]
+    for k in range(size):
+        place[star[k]] = -1
+    return size
+
+
+@kernel(exact=True)
+def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
+    """Sort the neighbours by weight, ascending, equal ones by node; sum the weights from each to the last.
+
+    Shell's method with Ciura's gaps: no allocation, and insertion sort where a star is small.
+    """
+    for gap in (4061, 1750, 701, 301, 132, 57, 23, 10, 4, 1):
+        for i in range(gap, size):
+            w, u = star_weight[i], star[i]
+            j = i - gap
+            while j >= 0 and (star_weight[j] > w or (star_weight[j] == w and star[j] > u)):
+                star_weight[j + gap], star[j + gap] = star_weight[j], star[j]
+                j -= gap
+            star_weight[j + gap], star[j + gap] = w, u
+    tail[size] = 0.0
+    for i in range(size - 1, -1, -1):
+        tail[i] = tail[i + 1] + star_weight[i]
+
+
+@kernel(exact=True)
+def _sample_clique(
+    size: int, star: Any, star_weight: Any, tail: Any, head: Any, links: Any, values: Any, degree: Any,
+    pool: Any, state: Any,
+) -> None:  # fmt: skip
+    """Join each neighbour to one of larger weight, drawn in proportion to the weights."""
+    for a in range(size - 1):
+        target = tail[a + 1] * (1.0 - _uniform(state))  # in (0, tail[a + 1]]
+        low, high = a + 1, size - 1
+        while low < high:  # the last index whose tail is still >= target
+            middle = (low + high + 1) // 2
+            if tail[middle] >= target:
+                low = middle
+            else:
+                high = middle - 1
+        w = star_weight[a] * tail[a + 1] / tail[0]
+        _add_entry(head, links, values, degree, pool, star[a], star[low], w)
+        _add_entry(head, links, values, degree, pool, star[low], star[a], w)
+
+
+@kernel(exact=True)
+def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, state: Any) -> Any:
+    """Eliminate all nodes, each time one with the fewest edges left."""
+    n = len(pointers) - 1
+    head, links, values, degree, pool = _edge_lists(pointers, neighbours, edge_of, weights)
+    bucket = np.full(len(neighbours) + 2, -1, np.int64)
+    above, below = np.empty(n, np.int64), np.empty(n, np.int64)
     for v in range(n - 1, -1, -1):
         _push(bucket, above, below, degree, v)
-
-    step = np.full(n, -1, np.int32)
-    place = np.full(n, -1, np.int64)
-    star = np.empty(n, np.int64)
-    star_weight = np.empty(n, np.float64)
-    copies = np.empty(n, np.int64)
-    partial = np.empty(n + 1, np.float64)
-    permutation = np.empty(n, np.int64)
-    pivots = np.zeros(n)
-    columns = np.zeros(n + 1, np.int64)
-    rows = np.empty(used // 2 + n, np.int32)
-    fractions = np.empty(used // 2 + n, np.float32)
+    step, place = np.full(n, -1, np.int32), np.full(n, -1, np.int64)
+    star, star_weight, tail = np.empty(n, np.int64), np.empty(n), np.empty(n + 1)
+    permutation, pivots, columns = np.empty(n, np.int64), np.empty(n), np.zeros(n + 1, np.int64)
+    rows = np.empty(len(neighbours) + n, np.int32)
+    fractions = np.empty(len(rows), np.float32)
     lowest = 0
     for k in range(n):
         while bucket[lowest] < 0:
             lowest += 1
         v = bucket[lowest]
         _remove(bucket, above, below, degree, v)
-        size, last = _merged_star(v, head, follow, ends, values, step, place, star, star_weight, copies)
-        if last >= 0:  # the whole list of v can be used again
-            follow[last] = free
-            free = head[v]
-        step[v] = k
-        permutation[k] = v
-        at = columns[k]
-        columns[k + 1] = at + size
-        if at + size > len(rows):
-            rows = _grown(rows, 2 * (at + size))
-            fractions = _grown(fractions, 2 * (at + size))
-        order = np.argsort(star_weight[:size], kind="mergesort")
-        partial[size] = 0.0
-        for a in range(size - 1, -1, -1):
-            partial[a] = partial[a + 1] + star_weight[order[a]]
-        total = partial[0]
-        pivots[k] = total if size > 0 else 0.0
-        for a in range(size):
-            u = star[order[a]]
-            rows[at + a] = u  # node now, step once all steps are known
-            fractions[at + a] = star_weight[order[a]] / total
-            _remove(bucket, above, below, degree, u)
-            degree[u] -= copies[order[a]]
-        for a in range(size - 1):
-            rest = partial[a + 1]
-            target = rest * (1.0 - _uniform(state))  # in (0, rest]
-            low, high = a + 1, size - 1
-            while low < high:  # the last index whose tail sum is still >= target
-                middle = (low + high + 1) // 2
-                if partial[middle] >= target:
-                    low = middle
-                else:
-                    high = middle - 1
-            i, j = star[order[a]], star[order[low]]
-            w = star_weight[order[a]] * rest / total
-            for end in range(2):
-                here, there = (i, j) if end == 0 else (j, i)
-                if free >= 0:
-                    entry = free
-                    free = np.int64(follow[free])
-                else:
-                    if used == len(ends):
-                        ends, follow = _grown(ends, 2 * used), _grown(follow, 2 * used)
-                        values = _grown(values, 2 * used)
-                    entry = np.int64(used)
-                    used += 1
-                ends[entry], values[entry], follow[entry] = there, w, head[here]
-                head[here] = entry
-                degree[here] += 1
-        for a in range(size):
-            u = star[order[a]]
-            degree[u] = min(degree[u], limit)
+        size = _merged_star(
+            v, head, links, values, degree, pool, bucket, above, below, step, place, star, star_weight
+        )
+        _sort_star(size, star, star_weight, tail)
+        step[v], permutation[k], pivots[k] = k, v, tail[0]
+        end = columns[k] + size
+        columns[k + 1] = end
+        if end > len(rows):
+            rows, fractions = _grown(rows, 2 * end), _grown(fractions, 2 * end)
+        if pool[1] + 2 * size > len(values):
+            links, values = _grown(links, 2 * len(values)), _grown(values, 2 * len(values))
+        rows[end - size : end] = star[:size]  # nodes now, steps once all steps are known
+        fractions[end - size : end] = star_weight[:size] / tail[0]
+        _sample_clique(size, star, star_weight, tail, head, links, values, degree, pool, state)
+        for u in star[:size]:
             _push(bucket, above, below, degree, u)
             lowest = min(lowest, degree[u])
-    count = columns[n]
-    out = np.empty(count, np.int32)
-    for p in range(count):
-        out[p] = step[rows[p]]
-    return permutation, columns, out, fractions[:count].copy(), pivots
+    return permutation, columns, step[rows[: columns[n]]], fractions[: columns[n]].copy(), pivots
 
 
 @kernel(exact=True)
@@ -384,10 +400,10 @@ def conjugate_gradients(
 
 def _products(a: FloatArray, b: FloatArray, coupled: bool) -> FloatArray:
     """Return the inner products of the columns, (k,), or of the whole, (1,)."""
-    products = np.einsum("ij,ij->j", a, b)
+    products: FloatArray = np.einsum("ij,ij->j", a, b)
     return products.sum(keepdims=True) if coupled else products
 
 
 def _norms(a: FloatArray, coupled: bool) -> FloatArray:
     """Return the norms of the columns, (k,), or of the whole, (1,)."""
-    return np.sqrt(_products(a, a, coupled))
+    return np.asarray(np.sqrt(_products(a, a, coupled)))

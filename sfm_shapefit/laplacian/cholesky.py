@@ -18,7 +18,7 @@ ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is
 """
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,7 +36,9 @@ from sfm_shapefit.laplacian.dense import (
     work_integers,
     work_scalars,
 )
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.operators import adjacency, checked_edges
+from sfm_shapefit.laplacian.ordering import Ordering, best_order
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
 
 PIVOT_TOLERANCE = 64.0
 """Pivots below this many rounding units of their diagonal entry count as zero."""
@@ -89,6 +91,36 @@ class CholeskyFactor:
             Float64 of the shape of `rhs`, accurate to the precision of the factor.
         """
         return _solve(self, rhs)
+
+
+def analyse(
+    num_nodes: int,
+    edges: npt.ArrayLike,
+    ordering: Ordering | IntArray = "auto",
+    coordinates: FloatArray | None = None,
+) -> SymbolicFactor:
+    """Plan the factorisation of the Laplacians of a graph, whatever their weights, block size and precision.
+
+    Args:
+        num_nodes: n >= 1.
+        edges: (m, 2) node indices; repeated edges add up.
+        ordering: a method of `ordering.best_order`, or an order of elimination (n,) itself.
+        coordinates: (n, d) approximate positions that help our own dissection.
+
+    Returns:
+        The plan. `num_nonzeros`, `flops` and `num_bytes` tell what a factorisation would cost. To know that
+        still earlier, and cheaper, ask `best_order` for the elimination tree alone.
+
+    Raises:
+        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
+    """
+    pairs = checked_edges(num_nodes, edges)
+    graph = adjacency(num_nodes, pairs)
+    if isinstance(ordering, str):
+        tree = best_order(graph, ordering, coordinates)
+    else:
+        tree = elimination_tree(graph, ordering)
+    return plan_factorisation(graph, pairs, tree)
 
 
 def allocate_factor(
@@ -146,7 +178,7 @@ def _run(factor: CholeskyFactor, w: FloatArray, pivot: FloatArray) -> bool:
     """Call the kernel with everything that it needs."""
     plan, b, diagonal = factor.symbolic, factor.block, factor._diagonal
     failed: bool = _factorise(
-        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.rows, plan.relative,
+        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.relative,
         plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets,
         plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
         w, diagonal, factor.panels, factor._stack, pivot,
@@ -184,7 +216,7 @@ def _sum_at_nodes(
 
 @kernel(exact=True)
 def _factorise(
-    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, relative: Any,
+    begin: int, end: int, b: int, first: Any, row_pointers: Any, relative: Any,
     panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any,
     edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
     weights: Any, diagonal: Any, panels: Any, stack: Any, pivot: Any,
@@ -204,7 +236,15 @@ def _factorise(
         panel = panels[offset : offset + width * height]
         panel[:] = 0.0
         _assemble_edges(
-            panel, height, b, edge_pointers[s], edge_pointers[s + 1], edge_index, edge_row, edge_column, weights
+            panel,
+            height,
+            b,
+            edge_pointers[s],
+            edge_pointers[s + 1],
+            edge_index,
+            edge_row,
+            edge_column,
+            weights,
         )
         _assemble_diagonal(panel, height, b, start, first[s + 1], diagonal)
         for c in range(child_pointers[s], child_pointers[s + 1]):
@@ -261,9 +301,7 @@ def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, d
 
 
 @kernel(exact=True)
-def _check_pivots(
-    panel: Any, height: int, width: int, b: int, start: int, diagonal: Any, pivot: Any
-) -> None:
+def _check_pivots(panel: Any, height: int, width: int, b: int, start: int, diagonal: Any, pivot: Any) -> None:
     """Lower pivot[0] to the least ratio of a squared pivot to its diagonal entry, and note its row."""
     for k in range(width):
         root = panel[k * height + k]
@@ -377,7 +415,7 @@ def _substitute(
 @kernel(exact=True)
 def _load_front(
     b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
-) -> int:
+) -> Any:
     """Copy the unknowns of a front to `work`, 0 for the rows below if not `with_below`; return its height."""
     start, width = first[s] * b, (first[s + 1] - first[s]) * b
     for i in range(width):

@@ -77,9 +77,7 @@ def work_scalars(dtype: npt.DTypeLike) -> npt.NDArray[Any]:
 
 
 @kernel(exact=True)
-def potrf(
-    routines: Any, flags: Any, integers: Any, a: Any, offset: int, order: int, leading: int
-) -> int:
+def potrf(routines: Any, flags: Any, integers: Any, a: Any, offset: int, order: int, leading: int) -> int:
     """Factor the block a = L L^T in place; return 0, or k if the leading minor of order k is not positive."""
     integers[0] = order
     integers[1] = leading

@@ -38,7 +38,9 @@ _IMBALANCE = 0.6  # no side may hold a larger share of a part
 _BALANCE_WEIGHT = 0.15  # weight of imbalance against separator size when passes are compared
 
 
-def best_order(graph: Adjacency, method: Ordering = "auto", coordinates: FloatArray | None = None) -> EliminationTree:
+def best_order(
+    graph: Adjacency, method: Ordering = "auto", coordinates: FloatArray | None = None
+) -> EliminationTree:
     """Return the elimination tree of the order with the least work.
 
     Args:
@@ -110,7 +112,9 @@ def dissection_order(graph: Adjacency, coordinates: FloatArray | None = None) ->
 def _without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
     """Return row pointers and neighbours with each neighbour once, as METIS demands."""
     n = graph.num_nodes
-    matrix = csc_array((np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers), shape=(n, n))
+    matrix = csc_array(
+        (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers), shape=(n, n)
+    )
     matrix.sum_duplicates()
     return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32)
 
@@ -250,7 +254,9 @@ def _axis_values(coordinates: Any, members: Any, value: Any) -> None:
 
 
 @kernel(exact=True)
-def _halve(pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, value: Any, side: Any) -> None:
+def _halve(
+    pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, value: Any, side: Any
+) -> None:
     """Cut at the median value: sides 0 and 1, and as separator (2) the nodes of side 1 that touch side 0."""
     values = np.empty(len(members))
     for k in range(len(members)):
@@ -342,10 +348,10 @@ def _refine_pass(
 
 @kernel(exact=True)
 def _move(
-    pointers: Any, neighbours: Any, part: Any, stamp: int, side: Any, sizes: Any, v: int, to: int,
+    pointers: Any, neighbours: Any, part: Any, stamp: int, side: Any, sizes: Any, v: Any, to: Any,
     pulled: Any, heap: Any, changed: Any, before: Any,
 ) -> None:  # fmt: skip
-    """Move v from the separator to a side, pull its neighbours on the other side in, and update the counts."""
+    """Move v from the separator to a side, pull in its neighbours on the other side, update the counts."""
     side[v] = to
     sizes[2] -= 1
     sizes[to] += 1

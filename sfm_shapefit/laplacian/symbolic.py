@@ -303,17 +303,11 @@ def _fundamental_heads(parent: Any, counts: Any) -> Any:
 
 
 @kernel()
-def _merge(
-    parent: Any, counts: Any, head: Any, limits: Any, shares: Any, always: float
-) -> Any:
-    """Merge children into parents while few zeros arise.
-
-    Returns the supernode of each column, and parent, columns and rows of each supernode.
-    """
+def _runs(parent: Any, counts: Any, head: Any) -> Any:
+    """Return the supernode of each column, and parent, columns, rows and entries of each supernode."""
     n, num = len(parent), len(head)
     label = np.empty(n, np.int64)
-    width = np.empty(num, np.int64)
-    height = np.empty(num, np.int64)
+    width, height = np.empty(num, np.int64), np.empty(num, np.int64)
     for s in range(num):
         end = head[s + 1] if s + 1 < num else n
         label[head[s] : end] = s
@@ -324,9 +318,18 @@ def _merge(
         last = head[s] + width[s] - 1
         if parent[last] >= 0:
             above[s] = label[parent[last]]
-    true_entries = np.empty(num)
-    for s in range(num):
-        true_entries[s] = width[s] * height[s] - width[s] * (width[s] - 1) / 2
+    entries = width * height - width * (width - 1) / 2
+    return label, above, width, height, entries
+
+
+@kernel()
+def _merge(parent: Any, counts: Any, head: Any, limits: Any, shares: Any, always: float) -> Any:
+    """Merge children into parents while few zeros arise.
+
+    Returns the supernode of each column, and parent, columns and rows of each supernode.
+    """
+    label, above, width, height, true_entries = _runs(parent, counts, head)
+    num = len(head)
     target = np.arange(num)
     for s in range(num):  # children before parents; a parent has already absorbed its earlier children
         p = above[s]
@@ -335,30 +338,20 @@ def _merge(
         columns, rows = width[s] + width[p], width[s] + height[p]
         entries = columns * rows - columns * (columns - 1) / 2
         zeros = 1.0 - (true_entries[s] + true_entries[p]) / entries
-        accept = zeros <= always
-        for q in range(len(limits)):
-            accept = accept or (columns <= limits[q] and zeros <= shares[q])
-        if accept:
+        if zeros <= always or np.any((columns <= limits) & (zeros <= shares)):
             target[s] = p
             width[p], height[p] = columns, rows
             true_entries[p] += true_entries[s]
-    kept = np.full(num, -1, np.int64)
-    count = 0
     for s in range(num - 1, -1, -1):  # follow merges from the roots down
-        if target[s] != s:
-            target[s] = target[target[s]]
-    for s in range(num):
-        if target[s] == s:
-            kept[s] = count
-            count += 1
-    tree = np.full(count, -1, np.int64)
-    for s in range(num):
-        if target[s] == s and above[s] >= 0:
-            tree[kept[s]] = kept[target[above[s]]]
-    for j in range(n):
-        label[j] = kept[target[label[j]]]
-    chosen = np.flatnonzero(kept >= 0)
-    return label, tree, width[chosen], height[chosen]
+        target[s] = target[target[s]]
+    chosen = np.flatnonzero(target == np.arange(num))
+    rank = np.full(num, -1, np.int64)
+    rank[chosen] = np.arange(len(chosen))
+    tree = np.full(len(chosen), -1, np.int64)
+    for k in range(len(chosen)):
+        if above[chosen[k]] >= 0:
+            tree[k] = rank[target[above[chosen[k]]]]
+    return rank[target[label]], tree, width[chosen], height[chosen]
 
 
 @kernel()

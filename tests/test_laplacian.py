@@ -1,0 +1,518 @@
+"""Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from graph_families import FAMILIES, random_blocks, random_weights
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.sparse import csc_array, csr_array
+from scipy.sparse.linalg import splu
+
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.laplacian import ordering
+from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients, jacobi
+from sfm_shapefit.laplacian.cholesky import allocate_factor, analyse, factorise
+from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.laplacian.operators import (
+    adjacency,
+    apply_incidence,
+    apply_incidence_transposed,
+    apply_laplacian,
+    assemble,
+    laplacian_pattern,
+)
+from sfm_shapefit.laplacian.symbolic import elimination_tree
+
+Array = npt.NDArray[np.float64]
+EPS = np.finfo(np.float64).eps
+SIZES = {"geo": (400, 15.0), "er": (200, 8.0), "comm": (900, 20.0), "seq": (500, 12.0)}
+
+
+def family(name: str, seed: int = 1) -> tuple[int, npt.NDArray[np.int64], Array]:
+    """Number of nodes, edges and locations of a small connected graph of a family."""
+    n, degree = SIZES[name]
+    edges, t = FAMILIES[name](n, degree, seed)
+    chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)  # connects what chance left apart
+    return n, np.unique(np.concatenate([edges, chain]), axis=0), t
+
+
+def incidence(n: int, edges: npt.NDArray[np.int64]) -> csr_array:
+    m = len(edges)
+    rows = np.repeat(np.arange(m), 2)
+    return csr_array((np.tile([1.0, -1.0], m), (rows, edges.ravel())), shape=(m, n))
+
+
+def reference_laplacian(n: int, edges: npt.NDArray[np.int64], weights: Array) -> csc_array:
+    """D^T W D by scipy alone, for weights (m,) or blocks (m, b, b)."""
+    d = incidence(n, edges)
+    if weights.ndim == 1:
+        return csc_array(d.T @ (weights[:, None] * d))
+    b = weights.shape[1]
+    dense = np.zeros((n, n, b, b))
+    i, j = edges.T
+    for p, q, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+        np.add.at(dense, (p, q), sign * weights)
+    return csc_array(dense.transpose(0, 2, 1, 3).reshape(n * b, n * b))
+
+
+def balanced_rhs(shape: tuple[int, ...], seed: int) -> Array:
+    """Right-hand sides orthogonal to the constants."""
+    r = np.random.default_rng(seed).normal(size=shape)
+    return r - r.mean(axis=0)
+
+
+def assert_same_up_to_constants(x: Array, y: Array, rtol: float) -> None:
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    error = np.linalg.norm(x - y) / np.linalg.norm(y)
+    assert error <= rtol, f"solutions differ by {error:.1e} of their norm (limit {rtol:.1e})"
+
+
+def splu_solution(laplacian: csc_array, block: int, rhs: Array) -> Array:
+    """Solve L x = rhs by splu, the last node grounded by removal."""
+    size = laplacian.shape[0] - block
+    x = np.zeros_like(rhs.reshape(laplacian.shape[0], -1))
+    x[:size] = splu(laplacian[:size, :size].tocsc()).solve(rhs.reshape(laplacian.shape[0], -1)[:size])
+    return x.reshape(rhs.shape)
+
+
+@pytest.mark.parametrize("d", [1, 2, 3, 5])
+def test_incidence_and_its_transpose_are_those_of_the_sparse_matrix(d):
+    n, edges, _ = family("er")
+    rng = np.random.default_rng(d)
+    t, y = rng.normal(size=(n, d)), rng.normal(size=(len(edges), d))
+    matrix = incidence(n, edges)
+    np.testing.assert_array_equal(apply_incidence(edges, t), matrix @ t)
+    np.testing.assert_allclose(
+        apply_incidence_transposed(edges, y, n), matrix.T @ y, atol=50 * EPS * np.abs(y).max()
+    )
+
+
+@pytest.mark.parametrize("block", [1, 2, 3])
+def test_assembly_by_slots_equals_the_product_of_incidence_matrices(block):
+    n, edges, _ = family("er")
+    w = random_weights(len(edges), 1) if block == 1 else random_blocks(len(edges), block, 1)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    difference = np.abs((csc_array(matrix) - reference_laplacian(n, edges, w)).toarray()).max()
+    assert difference <= 50 * EPS * np.abs(matrix.data).max()
+
+
+def test_assembly_into_given_memory_forgets_the_old_weights():
+    n, edges, _ = family("er")
+    pattern = laplacian_pattern(n, edges)
+    first = assemble(pattern, random_weights(len(edges), 1))
+    w = random_weights(len(edges), 2)
+    again = assemble(pattern, w, out=first.data)
+    assert again.data is first.data or np.shares_memory(again.data, first.data)
+    np.testing.assert_array_equal(again.toarray(), assemble(pattern, w).toarray())
+
+
+@pytest.mark.parametrize("columns", [1, 3, 4])
+def test_applying_the_laplacian_edge_by_edge_equals_the_assembled_matrix(columns):
+    n, edges, _ = family("comm")
+    w = random_weights(len(edges), 1)
+    x = np.random.default_rng(0).normal(size=(n, columns))
+    product = apply_laplacian(adjacency(n, edges), w, x, np.empty_like(x))
+    matrix = reference_laplacian(n, edges, w)
+    np.testing.assert_allclose(product, matrix @ x, atol=100 * EPS * abs(matrix).max() * np.abs(x).max())
+
+
+@pytest.mark.parametrize("edges", [[[0, 3]], [[-1, 1]]])
+def test_an_edge_that_leaves_the_graph_is_refused(edges):
+    with pytest.raises(InputError, match=r"nodes 0\.\.2"):
+        analyse(3, np.array(edges))
+
+
+def test_a_self_loop_is_refused():
+    with pytest.raises(InputError, match="itself"):
+        laplacian_pattern(3, np.array([[0, 1], [2, 2]]))
+
+
+def true_counts(n: int, edges: npt.NDArray[np.int64], order: npt.NDArray[np.int64]) -> list[int]:
+    """Column counts of L by playing the elimination game on sets."""
+    neighbours = [set() for _ in range(n)]
+    for i, j in edges:
+        neighbours[i].add(j)
+        neighbours[j].add(i)
+    counts = []
+    for v in order:
+        star = neighbours[v]
+        counts.append(len(star) + 1)
+        for u in star:
+            neighbours[u] |= star - {u}
+            neighbours[u].discard(v)
+    return counts
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40), density=st.floats(0.0, 0.4))
+def test_predicted_fill_is_that_of_the_elimination_game(seed, n, density):
+    rng = np.random.default_rng(seed)
+    i, j = np.triu_indices(n, 1)
+    kept = rng.uniform(size=len(i)) < density
+    edges = np.stack([i[kept], j[kept]], axis=1)
+    edges = np.concatenate([edges, edges[: len(edges) // 3, ::-1]])  # repeated pairs must not matter
+    tree = elimination_tree(adjacency(n, edges), rng.permutation(n))
+    counts = true_counts(n, edges, tree.permutation)
+    assert tree.counts.tolist() == counts
+    assert tree.num_nonzeros == sum(counts)
+    assert tree.flops == sum(c * c for c in counts)
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n=st.integers(2, 60),
+    extra=st.floats(0.0, 0.3),
+    block=st.sampled_from([1, 2, 3]),
+    columns=st.integers(1, 5),
+)
+def test_solutions_agree_with_splu_on_any_connected_graph_and_order(seed, n, extra, block, columns):
+    rng = np.random.default_rng(seed)
+    i, j = np.triu_indices(n, 1)
+    kept = rng.uniform(size=len(i)) < extra
+    tree = np.stack([np.arange(1, n), rng.integers(np.arange(1, n))], axis=1)
+    edges = np.concatenate([tree, np.stack([i[kept], j[kept]], axis=1)])  # some edges repeat: weights add
+    w = random_weights(len(edges), seed) if block == 1 else random_blocks(len(edges), block, seed)
+    rhs = balanced_rhs((n, columns) if block == 1 else (n, block, columns), seed)
+    x = factorise(analyse(n, edges, rng.permutation(n)), w).solve(rhs)
+    # Paths of up to 60 edges with weights within a factor 10: condition below 1e5.
+    assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), block, rhs), 1e5 * EPS)
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+@pytest.mark.parametrize("block", [1, 3])
+def test_every_family_is_solved_to_rounding(name, block):
+    n, edges, _ = family(name)
+    w = random_weights(len(edges), 3) if block == 1 else random_blocks(len(edges), block, 3)
+    rhs = balanced_rhs((n, 3) if block == 1 else (n, block, 2), 4)
+    factor = factorise(analyse(n, edges), w)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    x = factor.solve(rhs)
+    flat = (n * block, -1)
+    residual = np.linalg.norm(matrix @ x.reshape(flat) - rhs.reshape(flat)) / np.linalg.norm(rhs)
+    assert residual < 1e-11  # seq has condition 1e4; the others stay near 1e-14
+    assert 1e-6 < factor.smallest_pivot <= 1.0
+
+
+def test_single_precision_loses_digits_only_and_refinement_regains_them():
+    n, edges, _ = family("geo")
+    w = random_weights(len(edges), 3)
+    rhs = balanced_rhs((n, 3), 4)
+    plan = analyse(n, edges)
+    exact = factorise(plan, w).solve(rhs)
+    factor = factorise(plan, w, np.float32)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    assert factor.panels.dtype == np.float32
+    x = factor.solve(rhs)
+    first = np.linalg.norm(x - exact) / np.linalg.norm(exact)
+    assert 1e-9 < first < 1e-4
+    for _ in range(2):
+        x += factor.solve(rhs - matrix @ x)
+    assert_same_up_to_constants(x, exact, 1e-12)
+
+
+def test_refactoring_in_place_gives_the_bits_of_a_fresh_factor():
+    n, edges, _ = family("comm")
+    plan = analyse(n, edges)
+    rhs = balanced_rhs((n, 3), 0)
+    used = factorise(plan, random_weights(len(edges), 1))
+    used.refactor(random_weights(len(edges), 2))
+    fresh = factorise(plan, random_weights(len(edges), 2))
+    np.testing.assert_array_equal(used.panels, fresh.panels)
+    np.testing.assert_array_equal(used.solve(rhs), fresh.solve(rhs))
+
+
+def test_grounding_does_not_change_differences():
+    n, edges, _ = family("geo")
+    w, rhs = random_weights(len(edges), 1), balanced_rhs((n, 3), 0)
+    plan = analyse(n, edges)
+    light, heavy = (factorise(plan, w, ground=g).solve(rhs) for g in (0.01, 1e3))
+    assert_same_up_to_constants(light, heavy, 1e-9)
+    last = plan.permutation[-1]
+    np.testing.assert_allclose(light[last], 0.0, atol=1e-9 * np.abs(light).max())
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_disconnected_graph_is_refused_not_answered(dtype):
+    n, edges, _ = family("geo")
+    both = np.concatenate([edges, edges + n])
+    with pytest.raises(UnsolvableError, match="singular"):
+        factorise(analyse(2 * n, both), random_weights(len(both), 1), dtype)
+
+
+def test_a_pendant_camera_makes_the_projected_laplacian_singular_and_is_named():
+    n, edges, t = family("geo")
+    edges = np.concatenate([edges, [[0, n]]])
+    t = np.concatenate([t, [[0.5, 0.5, 1.0]]])
+    d = apply_incidence(edges, t)
+    v = d / np.linalg.norm(d, axis=1, keepdims=True)
+    rng = np.random.default_rng(0)
+    v[:-1] += 0.1 * rng.normal(size=v[:-1].shape)  # otherwise t itself is in the null space
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    projectors = np.eye(3) - v[:, :, None] * v[:, None, :]
+    with pytest.raises(UnsolvableError, match=rf"singular at node {n} "):
+        factorise(analyse(n + 1, edges), projectors)
+    factorise(analyse(n, edges[:-1]), projectors[:-1])  # without it, all is well
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e3])
+def test_a_bad_weight_is_refused(bad):
+    n, edges, _ = family("er")
+    w = random_weights(len(edges), 1)
+    w[7] = bad
+    with pytest.raises(UnsolvableError, match="weights are not positive"):
+        factorise(analyse(n, edges), w)
+
+
+def test_weights_and_right_hand_sides_of_the_wrong_shape_are_refused():
+    n, edges, _ = family("er")
+    factor = factorise(analyse(n, edges), random_weights(len(edges), 1))
+    with pytest.raises(ValueError, match="weights have shape"):
+        factor.refactor(np.ones(3))
+    with pytest.raises(ValueError, match="rhs has shape"):
+        factor.solve(np.ones(n + 1))
+
+
+def test_memory_is_predicted_before_it_is_allocated():
+    n, edges, _ = family("geo")
+    plan = analyse(n, edges)
+    for block, dtype in ((1, np.float64), (3, np.float32)):
+        factor = allocate_factor(plan, block, dtype)
+        assert plan.num_bytes(block, dtype) == factor.panels.nbytes + factor._stack.nbytes
+    assert plan.num_nonzeros <= plan.panel_pointers[-1]
+
+
+@pytest.mark.parametrize("n", [1, 2])
+def test_the_smallest_graphs_are_solved(n):
+    edges = np.array([[1, 0]])[: n - 1]
+    factor = factorise(analyse(n, edges), np.full(n - 1, 2.0), ground=1.0)
+    rhs = np.array([1.0, -1.0])[:n] * (n - 1)
+    x = factor.solve(rhs)
+    np.testing.assert_allclose(x - x.mean(), rhs / 4.0, atol=4 * EPS)
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+def test_every_ordering_is_a_permutation_and_beats_a_random_order(name):
+    n, edges, t = family(name)
+    rng = np.random.default_rng(5)
+    graph = adjacency(n, edges)
+    random = elimination_tree(graph, rng.permutation(n)).flops
+    orders = [ordering.minimum_degree_order(graph), ordering.dissection_order(graph)]
+    orders.append(ordering.dissection_order(graph, t))
+    for order in orders:
+        np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    # Random graphs have no small separators: dissection is no better there than chance.
+    useful = orders[:1] if name == "er" else orders
+    for order in useful:
+        assert elimination_tree(graph, order).flops < 0.7 * random
+
+
+def test_dissection_halves_a_grid_with_separators_of_about_its_width():
+    side = 40
+    k = np.arange(side * side).reshape(side, side)
+    pairs = [(k[:, :-1], k[:, 1:]), (k[:-1], k[1:])]
+    edges = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
+    graph = adjacency(side * side, edges)
+    tree = elimination_tree(graph, ordering.dissection_order(graph))
+    # George's dissection has 31/4 n log2(side) entries to first order (7.75 * 1600 * 5.3 = 66,000); the
+    # row-by-row order has side^3 = 64,000. Small grids do better than the asymptote.
+    assert tree.num_nonzeros < 40_000
+
+
+def test_the_automatic_order_is_the_one_of_least_work(monkeypatch):
+    n, edges, _ = family("seq")
+    graph = adjacency(n, edges)
+    monkeypatch.setattr(ordering, "find_spec", lambda _: None)
+    best = ordering.best_order(graph)
+    tried = [ordering.best_order(graph, m).flops for m in ("dissection", "minimum-degree")]
+    assert best.flops == min(tried)
+    assert tried[0] != tried[1]
+
+
+def test_metis_gives_a_good_order_where_it_is_installed():
+    pytest.importorskip("pymetis", reason="pymetis (extra `fast`) is not installed")
+    n, edges, _ = family("geo")
+    graph = adjacency(n, np.concatenate([edges, edges[:5]]))
+    order = ordering.metis_order(graph)
+    np.testing.assert_array_equal(np.sort(order), np.arange(n))
+    assert elimination_tree(graph, order).flops < 2 * ordering.best_order(graph, "minimum-degree").flops
+
+
+@pytest.mark.parametrize("name", sorted(FAMILIES))
+def test_approximate_cholesky_needs_few_iterations(name):
+    n, edges, _ = family(name)
+    w = random_weights(len(edges), 1)
+    graph = adjacency(n, edges)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    rhs = balanced_rhs((n, 3), 2)
+    factor = approximate_cholesky(graph, w, seed=1)
+    result = conjugate_gradients(lambda x: matrix @ x, factor, rhs, tol=1e-10)
+    assert result.converged
+    assert result.iterations <= 30  # 25 on sequences of 1e4 nodes, 15-19 elsewhere, at any size
+    assert_same_up_to_constants(result.x, splu_solution(csc_array(matrix), 1, rhs), 1e-6)
+
+
+def test_approximate_cholesky_of_a_tree_is_exact():
+    rng = np.random.default_rng(0)
+    n = 300
+    edges = np.stack([np.arange(1, n), rng.integers(np.arange(1, n))], axis=1)
+    w = random_weights(n - 1, 1)
+    rhs = balanced_rhs((n, 2), 2)
+    x = approximate_cholesky(adjacency(n, edges), w, seed=0).solve(rhs)
+    # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbour.
+    assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), 1, rhs), 1e-10)
+
+
+def test_the_sampled_laplacian_is_right_on_average():
+    # Eliminate the hub of a star: the mean of the sampled edges is the clique w_i w_j / W.
+    w = np.array([1.0, 2.0, 3.0, 4.0])
+    edges = np.stack([np.zeros(4, np.int64), np.arange(1, 5)], axis=1)
+    ring = np.array([[1, 2], [2, 3], [3, 4], [4, 1], [1, 3], [2, 4]])
+    all_edges = np.concatenate([edges, ring])
+    # Heavy ring edges raise the other nodes' degrees to 4 + 3, so that the hub (degree 4) goes first.
+    repeated = np.concatenate([all_edges, ring, ring])
+    weights = np.concatenate([w, np.full(18, 1e-9)])
+    graph = adjacency(5, repeated)
+    mean = np.zeros((5, 5))
+    draws = 4000
+    for seed in range(draws):
+        f = approximate_cholesky(graph, weights, seed)
+        assert f.permutation[0] == 0
+        lower = np.eye(5)
+        for k in range(5):
+            part = slice(f.pointers[k], f.pointers[k + 1])
+            lower[f.rows[part], k] = -f.fractions[part]
+        back = np.argsort(f.permutation)
+        mean += (lower * f.pivots @ lower.T)[np.ix_(back, back)] / draws
+    exact = reference_laplacian(5, repeated, weights).toarray()
+    # Entries are at most 1.2 with a standard deviation below 1: 4 sigma of the mean is 4 / sqrt(4000) = 0.063.
+    np.testing.assert_allclose(mean, exact, atol=0.065)
+
+
+def test_the_seed_decides_the_sample():
+    n, edges, _ = family("er")
+    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
+    first, again, other = (approximate_cholesky(graph, w, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.fractions, again.fractions)
+    np.testing.assert_array_equal(first.permutation, again.permutation)
+    assert first.num_entries != other.num_entries or not np.array_equal(first.rows, other.rows)
+
+
+def test_jacobi_is_enough_on_random_graphs_and_not_on_sequences():
+    iterations = {}
+    for name in ("er", "seq"):
+        n, edges, _ = family(name)
+        w = random_weights(len(edges), 1)
+        matrix = assemble(laplacian_pattern(n, edges), w)
+        preconditioner = jacobi(adjacency(n, edges), w)
+        np.testing.assert_allclose(preconditioner.diagonal, matrix.diagonal())
+        result = conjugate_gradients(
+            lambda x, a=matrix: a @ x, preconditioner, balanced_rhs((n, 3), 2), tol=1e-8
+        )
+        iterations[name] = result.iterations
+    assert iterations["er"] < 40 < iterations["seq"]
+
+
+def test_a_warm_start_saves_iterations_and_can_set_the_scale():
+    n, edges, _ = family("geo")
+    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    factor, rhs = approximate_cholesky(graph, w, 0), balanced_rhs((n, 3), 2)
+
+    def run(**options):
+        return conjugate_gradients(lambda x: matrix @ x, factor, rhs, **options)
+
+    cold = run(tol=1e-8)
+    near = cold.x + 1e-5 * balanced_rhs((n, 3), 3) * np.abs(cold.x).max()
+    warm = run(tol=1e-8, start=near)
+    assert warm.iterations < cold.iterations
+    tenth = run(tol=0.1, start=near, relative_to="start")
+    before, after = (np.linalg.norm(rhs - matrix @ x) for x in (near, tenth.x))
+    assert after < 0.12 * before
+    assert 1 <= tenth.iterations <= 4
+
+
+def test_an_iteration_limit_is_reported():
+    n, edges, _ = family("geo")
+    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
+    matrix = assemble(laplacian_pattern(n, edges), w)
+    rhs = balanced_rhs((n, 3), 2)
+    result = conjugate_gradients(lambda x: matrix @ x, jacobi(graph, w), rhs, max_iterations=2)
+    assert (result.converged, result.iterations) == (False, 2)
+    assert result.residual > 1e-10
+
+
+def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
+    n, edges, t = family("geo")
+    d = apply_incidence(edges, t)
+    v = d + 0.3 * np.linalg.norm(d, axis=1, keepdims=True) * np.random.default_rng(0).normal(size=d.shape)
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    projectors = np.eye(3) - v[:, :, None] * v[:, None, :]
+    plan = analyse(n, edges)
+    rhs = balanced_rhs((n, 3), 1)
+    matrix = assemble(laplacian_pattern(n, edges), projectors)
+    result = conjugate_gradients(
+        lambda x: (matrix @ x.ravel()).reshape(n, 3),
+        factorise(plan, np.ones(len(edges)), np.float32),
+        rhs,
+        tol=1e-12,
+        coupled=True,
+    )
+    assert result.converged
+    assert result.iterations < 60  # 30-40 at any size
+    assert_same_up_to_constants(result.x, factorise(plan, projectors).solve(rhs), 1e-8)
+
+
+CHILD = """
+import json, sys, time
+import numpy as np
+sys.path.insert(0, sys.argv[1])
+from graph_families import geo, random_weights
+from sfm_shapefit.laplacian.cholesky import analyse, factorise
+edges, t = geo(2000, 20.0, 1)
+begin = time.perf_counter()
+plan = analyse(2000, edges, "minimum-degree")
+answers = []
+for dtype in (np.float64, np.float32):
+    factor = factorise(plan, random_weights(len(edges), 1), dtype)
+    answers.append(factor.solve(t - t.mean(axis=0)).tobytes().hex())
+print(json.dumps({"seconds": time.perf_counter() - begin, "answers": hash_of(answers)}))
+""".replace("hash_of(answers)", "[__import__('hashlib').sha256(a.encode()).hexdigest() for a in answers]")
+
+
+def run_child(cache: Path, blas_threads: int) -> dict:
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(cache),
+        "OPENBLAS_NUM_THREADS": str(blas_threads),
+        "PYTHONPATH": str(Path(__file__).parents[1]),
+    }
+    command = [sys.executable, "-c", CHILD, str(Path(__file__).parent)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.slow
+def test_compiled_code_is_cached_and_neither_cache_nor_blas_threads_change_a_bit(tmp_path):
+    compiling = run_child(tmp_path, blas_threads=1)
+    cached = run_child(tmp_path, blas_threads=2)
+    assert compiling["answers"] == cached["answers"]
+    assert cached["seconds"] < 0.2 * compiling["seconds"]
+
+
+def test_blas_threads_are_restored_after_nested_limits():
+    from threadpoolctl import threadpool_info
+
+    def threads() -> list[int]:
+        return [library["num_threads"] for library in threadpool_info() if library["user_api"] == "blas"]
+
+    before = threads()
+    with one_blas_thread(), one_blas_thread():
+        assert set(threads()) == {1}
+    assert threads() == before
