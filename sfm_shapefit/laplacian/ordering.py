@@ -112,9 +112,8 @@ def dissection_order(graph: Adjacency, coordinates: FloatArray | None = None) ->
 def _without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
     """Return row pointers and neighbours with each neighbour once, as METIS demands."""
     n = graph.num_nodes
-    matrix = csc_array(
-        (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers), shape=(n, n)
-    )
+    entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
+    matrix = csc_array(entries, shape=(n, n), copy=True)  # summed in place, and the graph is read-only
     matrix.sum_duplicates()
     return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32)
 

@@ -1,11 +1,11 @@
 """Splitting for large view graphs: ShapeFit and LUD by ADMM with the scalar graph Laplacian.
 
-    edges      the proximal step, fused into one pass over the edges
-    anderson   acceleration of the iteration
-    linear     the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
-    engine     the iteration that both programs share
-    shapefit   solve_admm
-    lud        solve_lud
+edges      the proximal step, fused into one pass over the edges
+anderson   acceleration of the iteration
+linear     the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
+engine     the iteration that both programs share
+shapefit   solve_admm
+lud        solve_lud
 """
 
 from sfm_shapefit.solver.admm.engine import Stop

@@ -18,7 +18,7 @@ the order of the chunks: the result does not depend on the number of threads, to
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -119,9 +119,7 @@ class EdgePasses:
         data, run = self.data, _pull(self.data.directions.shape[1])
 
         def chunk(k: int, first: int, last: int) -> None:
-            run(
-                first, last, data.ends, data.directions, data.weights, data.least, rho, t, x, self._sums[k]
-            )
+            run(first, last, data.ends, data.directions, data.weights, data.least, rho, t, x, self._sums[k])
 
         return self._accumulate(chunk)
 
@@ -138,9 +136,7 @@ class EdgePasses:
         """Return rho u, (m, d), in the edge order of the passes."""
         out = np.empty_like(x)
         data, run = self.data, _dual(self.data.directions.shape[1])
-        self.over_chunks(
-            lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, x, out)
-        )
+        self.over_chunks(lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, x, out))
         return out
 
     def residuals(self, t: FloatArray) -> FloatArray:
@@ -165,7 +161,7 @@ class EdgePasses:
             chunk(k, first, last)
 
         self.over_chunks(cleared)
-        total = self._sums[0].copy()
+        total: FloatArray = self._sums[0].copy()
         for part in self._sums[1:]:
             total += part
         return total
@@ -185,7 +181,7 @@ class EdgePasses:
 # The kernels are made per dimension: with d a constant the loops over coordinates unroll.
 
 
-@lru_cache(maxsize=None)
+@cache
 def _clip_factor(d: int) -> Any:
     """Return f(x, v, e, least, radius) -> (a, shrink): r = x - a v, clip(r) = shrink * r."""
 
@@ -205,7 +201,7 @@ def _clip_factor(d: int) -> Any:
     return clip_factor
 
 
-@lru_cache(maxsize=None)
+@cache
 def _step(d: int) -> Any:
     clip_factor = _clip_factor(d)
 
@@ -254,7 +250,7 @@ def _step(d: int) -> Any:
     return step
 
 
-@lru_cache(maxsize=None)
+@cache
 def _pull(d: int) -> Any:
     clip_factor = _clip_factor(d)
 
@@ -274,7 +270,7 @@ def _pull(d: int) -> Any:
     return pull
 
 
-@lru_cache(maxsize=None)
+@cache
 def _laplacian(d: int) -> Any:
     @kernel()
     def laplacian(first: int, last: int, ends: Any, rho: Any, x: Any, sums: Any) -> None:
@@ -288,7 +284,7 @@ def _laplacian(d: int) -> Any:
     return laplacian
 
 
-@lru_cache(maxsize=None)
+@cache
 def _dual(d: int) -> Any:
     clip_factor = _clip_factor(d)
 
@@ -302,7 +298,7 @@ def _dual(d: int) -> Any:
     return dual
 
 
-@lru_cache(maxsize=None)
+@cache
 def _residuals(d: int) -> Any:
     @kernel()
     def residuals(first: int, last: int, ends: Any, v: Any, least: float, t: Any, out: Any) -> None:
@@ -321,7 +317,7 @@ def _residuals(d: int) -> Any:
     return residuals
 
 
-@lru_cache(maxsize=None)
+@cache
 def _change_penalties(d: int) -> Any:
     clip_factor = _clip_factor(d)
 

@@ -21,26 +21,24 @@ method of multipliers" (2011), sections 3.4.1 and 3.4.3.
 """
 
 import enum
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.solver.admm.anderson import Anderson
-from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses
+from sfm_shapefit.solver.admm.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
 from sfm_shapefit.solver.admm.linear import LaplacianFactor
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
 
 _PENALTY = 0.5  # rho_e = _PENALTY w_e / max(r_e, floor mean(r))
 _FLOORS = (0.1, 0.03, 0.01)  # of the successive renewals; the last one stays
 _ANDERSON_FLOOR = 0.3  # accelerated, on every renewal: even penalties leave more to the acceleration
-_BALANCE = 1.3  # primal over dual residual at which the scale of the penalties is left alone
+_BALANCE = 1.0  # primal over dual residual at which the scale of the penalties is left alone
 _ANDERSON_MEMORY = 6
 _ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other's way
-_ANDERSON_FIRST = 0.6  # fraction of edges inside their ball that starts acceleration at the first renewal
-_ANDERSON_LATER = 0.3  # and at later ones, where noise has had time to show,
-_ANDERSON_KEPT = 0.9  # provided the fraction has not fallen below this share of the one before
+_ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which acceleration can pay, and the
+_ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _STEP_FACTOR = 10.0
 _STALL_WINDOW = 150
@@ -88,9 +86,11 @@ class State:
     unit: FloatArray = field(default_factory=lambda: np.empty(0))
     """h with L h = c."""
     sums: FloatArray = field(default_factory=lambda: np.zeros(5))
+    spare: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Room for the next x while acceleration needs the old one."""
     previous: float = np.inf
     """Squared step of the iteration before."""
-    interior: float = np.nan
+    interior: float = np.inf
     """Fraction of edges inside their ball at the last renewal."""
 
 
@@ -107,7 +107,12 @@ class Iteration:
     """One run: the program, its factor and passes, and the steps between them."""
 
     def __init__(
-        self, passes: EdgePasses, factor: LaplacianFactor, settings: Settings, c: FloatArray | None, kappa: float
+        self,
+        passes: EdgePasses,
+        factor: LaplacianFactor,
+        settings: Settings,
+        c: FloatArray | None,
+        kappa: float,
     ) -> None:
         """Set up the program <c, T> = kappa over the edges of `passes`; no such constraint if c is None."""
         self.passes = passes
@@ -186,7 +191,9 @@ class Iteration:
     def _pass(self, state: State, anderson: Anderson | None) -> Anderson | None:
         """Take the proximal step, accelerated if there is a history; return the history to go on with."""
         relaxation = self.settings.relaxation if anderson is None else _ANDERSON_RELAXATION
-        target = state.x if anderson is None else np.empty_like(state.x)
+        if anderson is not None and state.spare.shape != state.x.shape:
+            state.spare = np.empty_like(state.x)
+        target = state.x if anderson is None else state.spare
         state.pull, state.sums = self.passes.step(state.x, target, state.t, state.rho, relaxation)
         change, previous = float(state.sums[CHANGE]), state.previous
         state.previous = change
@@ -194,7 +201,7 @@ class Iteration:
             return None
         if change > _ANDERSON_GIVE_UP**2 * previous:
             anderson.restart()
-        state.x = anderson.advance(state.x, target, state.rho)
+        state.x, state.spare = anderson.advance(state.x, target, state.rho), state.x
         state.pull = self.passes.pull(state.x, state.t, state.rho)
         return anderson
 
@@ -221,7 +228,7 @@ class Iteration:
         state.pull = passes.pull(state.x, state.t, state.rho)
 
     def _balance(self, state: State, before: FloatArray) -> float:
-        """Return the norm of the primal residual D T - y over that of the dual residual rho (y - y before)."""
+        """Return the norm of the primal residual, D T - y, over that of the dual one, rho (y - y before)."""
         passes, rho = self.passes, state.rho
         y = state.x - passes.dual(state.x, rho) / rho[:, None]
         y_before = before - passes.dual(before, rho) / rho[:, None]
@@ -235,13 +242,11 @@ class Iteration:
     def _accelerator(self, state: State, anderson: Anderson | None) -> Anderson | None:
         """Return an empty history if so many edges fit exactly that acceleration pays, else None.
 
-        With noise, the edges inside their ball become few as the iteration converges; without, they stay.
+        With noise, the edges inside their ball become few as the iteration converges; without, they
+        stay. The first renewal only takes note, for noise has not had time to show.
         """
         before, state.interior = state.interior, float(state.sums[INTERIOR]) / len(state.x)
-        if np.isnan(before):
-            pays = state.interior >= _ANDERSON_FIRST
-        else:
-            pays = state.interior >= max(_ANDERSON_LATER, _ANDERSON_KEPT * before)
+        pays = state.interior >= max(_ANDERSON_INTERIOR, _ANDERSON_KEPT * before)
         if not (self.settings.accelerate and pays):
             return None
         if anderson is None:

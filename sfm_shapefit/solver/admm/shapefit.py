@@ -51,7 +51,12 @@ def solve_admm(
         UnsolvableError: if the factor finds the Laplacian singular: the graph is not connected.
     """
     settings = Settings(
-        tol=tol, max_iterations=max_iterations, relaxation=1.7, renewals=_RENEWALS, penalty=0.5, accelerate=True
+        tol=tol,
+        max_iterations=max_iterations,
+        relaxation=1.7,
+        renewals=_RENEWALS,
+        penalty=0.5,
+        accelerate=True,
     )
     factor = laplacian_factor(graph) if factor is None else factor
     passes = EdgePasses(edge_data(graph, -np.inf), threads)
