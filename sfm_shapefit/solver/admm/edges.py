@@ -195,8 +195,7 @@ def _clip_factor(d: int) -> Any:
         for k in range(d):
             r = x[e, k] - a * v[e, k]
             square += r * r
-        shrink = radius / np.sqrt(square) if square > radius * radius else 1.0
-        return a, shrink
+        return a, radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
 
     return clip_factor
 
