@@ -16,11 +16,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, TypeVar, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
 
 import typer
 
-from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
+from sfm_shapefit.colmap.workspace import WorkspaceOptions
+from sfm_shapefit.errors import ShapeFitError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.synthetic import SceneOptions
 
@@ -41,21 +42,22 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its columns break long sentences into one word a line
     help="Place the cameras of a COLMAP model whose rotations are known.",
 )
 
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
-    Optional[Path], typer.Argument(metavar="MODEL", help="COLMAP model folder (binary or text).")
+    Path | None, typer.Argument(metavar="MODEL", help="COLMAP model folder (binary or text).")
 ]
-OutArgument = Annotated[Optional[Path], typer.Argument(metavar="OUT", help="Folder to be made.")]
-InputPath = Annotated[Optional[Path], typer.Option("--input_path", hidden=True)]
-OutputPath = Annotated[Optional[Path], typer.Option("--output_path", hidden=True)]
+OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
+InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]
+OutputPath = Annotated[Path | None, typer.Option("--output_path", hidden=True)]
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Config = Annotated[
-    Optional[Path],
+    Path | None,
     typer.Option("--config", metavar="FILE.toml", help="Options from a TOML file; flags win over it."),
 ]
 
@@ -89,9 +91,9 @@ def _flags(options_type: type) -> list[inspect.Parameter]:
     for item in fields(options_type):
         flag = f"--{item.name.replace('_', '-')}"
         names = f"{flag}/--no{flag[1:]}" if hints[item.name] is bool else flag
-        shown = {True: "yes", False: "no"}.get(item.default, str(item.default))  # type: ignore[call-overload]
-        option = typer.Option(names, help=documentation[item.name], show_default=shown)
-        annotation = Annotated[Optional[hints[item.name]], option]  # type: ignore[name-defined]
+        shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
+        text = f"{documentation[item.name]} [default: {shown}]"
+        annotation: Any = Annotated[hints[item.name] | None, typer.Option(names, help=text)]
         parameters.append(
             inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
         )
@@ -213,11 +215,11 @@ def locate_command(
     input_path: InputPath = None,
     output_path: OutputPath = None,
     database: Annotated[
-        Optional[Path],
+        Path | None,
         typer.Option(
             "--database",
             "--database_path",
-            help="COLMAP database with the matches; by default database.db in MODEL, its parent or grandparent.",
+            help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
         ),
     ] = None,
     overwrite: Overwrite = False,
@@ -255,9 +257,11 @@ def _locate_table(found: "LocateResult", out: Path) -> Text:
 
     facts = summary(found)
     left_out = [f"{row.name}: {row.reason}" for row in camera_rows(found) if not row.placed]
-    pairs = ", ".join(f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count)
+    pairs = ", ".join(
+        f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count
+    )
     solve = found.solve
-    rows = [
+    return [
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", _shortened(left_out))] if left_out else []),
@@ -270,7 +274,6 @@ def _locate_table(found: "LocateResult", out: Path) -> Text:
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
     ]
-    return rows
 
 
 def _adjustment_line(found: "LocateResult") -> str:
@@ -287,16 +290,16 @@ def _adjustment_line(found: "LocateResult") -> str:
 def evaluate_command(
     model: ModelArgument = None,
     reference: Annotated[
-        Optional[Path], typer.Argument(metavar="REF", help="COLMAP model with the true poses.")
+        Path | None, typer.Argument(metavar="REF", help="COLMAP model with the true poses.")
     ] = None,
     *,
     input_path: InputPath = None,
     threshold: Annotated[
-        Optional[list[float]],
+        list[float] | None,
         typer.Option("--threshold", help="Recall at this position error in REF's units; may be repeated."),
     ] = None,
     csv: Annotated[
-        Optional[Path], typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
+        Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
     as_json: Json = False,
 ) -> None:
@@ -357,7 +360,7 @@ def synth_command(out: OutArgument = None, *, output_path: OutputPath = None, **
         rows = [
             ("images", str(len(scene.keypoints))),
             ("points", str(len(scene.points))),
-            ("pairs", f"{len(scene.pairs)}, of which {int(scene.corrupted.sum())} wrong"),
+            ("pairs", f"{len(scene.pairs)}, of which {int(scene.pair_is_corrupted.sum())} wrong"),
             ("written to", str(target)),
         ]
         _print_table(f"{scene_options.shape}, seed {scene_options.seed}", rows)

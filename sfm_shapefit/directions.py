@@ -270,7 +270,7 @@ def from_relative_poses(
     )
 
 
-@kernel()
+@kernel(exact=True)
 def _estimate_pairs(
     rows: IntArray,
     offsets: IntArray,
@@ -298,7 +298,7 @@ def _estimate_pairs(
         directions[p] = sign * d
 
 
-@kernel()
+@kernel(exact=True)
 def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> FloatArray:
     """Return (a x b) / pixel_angle for every match: its length is the parallax in pixels."""
     normals = np.empty_like(a)
@@ -309,7 +309,7 @@ def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> Float
     return normals
 
 
-@kernel()
+@kernel(exact=True)
 def _squared_gradient(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> float:
     """Return |a x d|^2 + |b x d|^2 of match k, floored where both rays run along the baseline."""
     along_a = a[k, 0] * d[0] + a[k, 1] * d[1] + a[k, 2] * d[2]
@@ -317,14 +317,14 @@ def _squared_gradient(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> fl
     return float(max(2.0 - along_a * along_a - along_b * along_b, 1e-12))
 
 
-@kernel()
+@kernel(exact=True)
 def _squared_residual(a: FloatArray, b: FloatArray, normals: FloatArray, d: FloatArray, k: int) -> float:
     """Return the squared Sampson error of match k in px^2."""
     e = normals[k, 0] * d[0] + normals[k, 1] * d[1] + normals[k, 2] * d[2]
     return float(e * e / _squared_gradient(a, b, d, k))
 
 
-@kernel()
+@kernel(exact=True)
 def _best_hypothesis(
     a: FloatArray, b: FloatArray, normals: FloatArray, threshold_px: float, num_hypotheses: int
 ) -> FloatArray:
@@ -359,7 +359,7 @@ def _best_hypothesis(
     return best
 
 
-@kernel()
+@kernel(exact=True)
 def _reweighted(a: FloatArray, b: FloatArray, normals: FloatArray, start: FloatArray) -> FloatArray:
     """Return the direction refined by reweighted least squares with the Geman-McClure kernel."""
     d = start.copy()
@@ -384,7 +384,7 @@ def _reweighted(a: FloatArray, b: FloatArray, normals: FloatArray, start: FloatA
     return d
 
 
-@kernel()
+@kernel(exact=True)
 def _depth_sign(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> int:
     """Return 1 if match k meets in front of both cameras for the baseline +d, -1 if behind both, else 0."""
     cosine = a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1] + a[k, 2] * b[k, 2]
@@ -394,7 +394,7 @@ def _depth_sign(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> int:
     return int(depth_i > 0.0 and depth_j > 0.0) - int(depth_i < 0.0 and depth_j < 0.0)
 
 
-@kernel()
+@kernel(exact=True)
 def _measure(
     a: FloatArray,
     b: FloatArray,
@@ -430,7 +430,7 @@ def _measure(
     return -1.0 if behind > front else 1.0
 
 
-@kernel()
+@kernel(exact=True)
 def _inlier_information(
     a: FloatArray,
     b: FloatArray,

@@ -25,7 +25,7 @@ from sfm_shapefit.evaluation import Evaluation, evaluate_poses
 from sfm_shapefit.gauge import choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.results import Inputs, LocateResult
-from sfm_shapefit.rigidity import rigid_pieces
+from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust import Assessment, assess
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.solve import solve
@@ -73,7 +73,7 @@ def locate(
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("rigidity"):
             graph = _view_graph(model, directions)
-            pieces = rigid_pieces(graph)
+            pieces = _checked_pieces(graph)
             piece, cameras = graph.restricted_to(pieces[0].edges)
         with clock("solve"):
             solved = solve(piece, options.for_solver())
@@ -156,6 +156,8 @@ def _measure_directions(
     """Return the direction of every pair that the source has."""
     if matches is not None and source == "relative-poses":
         poses = matches.relative_poses()
+        if len(poses.pairs) == 0:
+            raise UnsolvableError("the database has no stored relative pose; use directions from matches")
         return from_relative_poses(
             poses.pairs,
             (poses.rotations, poses.translations),
@@ -199,6 +201,17 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     return ViewGraph(
         model.num_images, directions.pairs[usable], directions.directions[usable], names=model.names
     )
+
+
+def _checked_pieces(graph: ViewGraph) -> list[RigidPiece]:
+    """Return the rigid pieces of the graph, if the largest is more than a pair of many cameras."""
+    pieces = rigid_pieces(graph)
+    if len(pieces[0].cameras) < min(3, graph.num_cameras):
+        raise UnsolvableError(
+            f"the {graph.num_edges} usable directions tie no three cameras to one another; "
+            "match more pairs, above all pairs that close triangles"
+        )
+    return pieces
 
 
 def _seed_and_tracks(

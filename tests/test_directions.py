@@ -49,7 +49,9 @@ def estimate(pairs, options=None, threads=1) -> PairDirections:
     )
 
 
-@pytest.mark.parametrize("baseline", [(1.0, 0.2, -0.1), (-0.4, 0.0, 0.0), (0.05, 0.02, 1.0), (0.0, 0.0, -1.0)])
+@pytest.mark.parametrize(
+    "baseline", [(1.0, 0.2, -0.1), (-0.4, 0.0, 0.0), (0.05, 0.02, 1.0), (0.0, 0.0, -1.0)]
+)
 def test_exact_matches_give_the_exact_direction_with_its_sign(baseline):
     pair = make_pair(1, baseline=baseline)
     found = estimate([pair])

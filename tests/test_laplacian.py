@@ -392,7 +392,7 @@ def test_the_sampled_laplacian_is_right_on_average():
         back = np.argsort(f.permutation)
         mean += (lower * f.pivots @ lower.T)[np.ix_(back, back)] / draws
     exact = reference_laplacian(5, repeated, weights).toarray()
-    # Entries are at most 1.2 with a standard deviation below 1: 4 sigma of the mean is 4 / sqrt(4000) = 0.063.
+    # Entries have a standard deviation below 1: 4 sigma of the mean is 4 / sqrt(4000) = 0.063.
     np.testing.assert_allclose(mean, exact, atol=0.065)
 
 

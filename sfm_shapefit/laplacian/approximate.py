@@ -148,7 +148,8 @@ def _grown(array: Any, size: int) -> Any:
 def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> Any:
     """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
-    Returns the heads, `links` (next entry, other end), weights, degrees, and [first free entry, entries used].
+    Returns the heads, `links` (next entry, other end), weights, degrees, and the pool: [first free entry,
+    entries used].
     """
     n = len(pointers) - 1
     head = np.full(n, -1, np.int64)
@@ -190,7 +191,7 @@ def _merged_star(
 ) -> int:  # fmt: skip
     """Collect the neighbours of v that are left, parallel edges summed, and free v's list.
 
-    Returns their number. Each neighbour leaves its bucket, and its degree falls by the number of its edges to v.
+    Returns their number. Each neighbour leaves its bucket; its degree falls by the number of its edges to v.
     """
     size, entry, last = 0, head[v], -1
     while entry >= 0:

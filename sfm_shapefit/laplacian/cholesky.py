@@ -355,9 +355,8 @@ def _solve(factor: CholeskyFactor, rhs: FloatArray) -> FloatArray:
     if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
         raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
     given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
-    heights = np.diff(plan.row_pointers) + np.diff(plan.first)
     x = np.empty((n * b, 3), dtype=factor.dtype)
-    work = np.empty((3, int(np.max(heights, initial=1)) * b), dtype=factor.dtype)
+    work = np.empty((3, plan.largest_front * b), dtype=factor.dtype)
     out = np.empty_like(given)
     for k in range(0, given.shape[1], 3):
         _gather(given[:, k : k + 3], plan.permutation, b, x)

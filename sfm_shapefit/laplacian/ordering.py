@@ -35,7 +35,7 @@ _MINIMUM_DEGREE_FLOPS = 100_000  # operations per edge of the dissection; above,
 _LEAF = 48  # nodes; smaller parts are not cut further
 _SMOOTHING = 6  # averaging sweeps over the integer graph distances, to make cuts straight
 _PASSES = 6  # refinement passes over a separator
-_DIPS = 60  # moves without improvement before a pass gives up
+_DIPS = 300  # moves without improvement before a pass gives up
 _IMBALANCE = 0.6  # no side may hold a larger share of a part
 _BALANCE_WEIGHT = 0.15  # weight of imbalance against separator size when passes are compared
 
@@ -116,7 +116,7 @@ def _without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
     """Return row pointers and neighbours with each neighbour once, as METIS demands."""
     n = graph.num_nodes
     entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
-    matrix = csc_array(entries, shape=(n, n), copy=True)  # summed in place, and the graph is read-only
+    matrix = csc_array(entries, shape=(n, n), copy=True)
     matrix.sum_duplicates()
     return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32)
 
@@ -132,6 +132,7 @@ def _dissect(pointers: Any, neighbours: Any, coordinates: Any) -> Any:
     scratch = np.empty(n, np.int64)
     smooth = np.empty(n)
     pulled = np.zeros((n, 2), np.int64)
+    locked = np.zeros(n, np.bool_)
     stack = [(0, n)]
     stamp = 0
     while len(stack) > 0:
@@ -151,7 +152,7 @@ def _dissect(pointers: Any, neighbours: Any, coordinates: Any) -> Any:
         if coordinates.shape[1] > 0:
             _axis_values(coordinates, members, value)
         _halve(pointers, neighbours, members, part, stamp, value, side)
-        _refine(pointers, neighbours, members, part, stamp, side, pulled)
+        _refine(pointers, neighbours, members, part, stamp, side, pulled, locked)
         first, second = _gather_sides(members, side, scratch)
         if first == 0 or second == 0:
             continue  # nothing to gain by cutting: a dense part
@@ -277,14 +278,15 @@ def _halve(
 
 @kernel(exact=True)
 def _refine(
-    pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, side: Any, pulled: Any
-) -> None:
+    pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, side: Any, pulled: Any,
+    locked: Any,
+) -> None:  # fmt: skip
     """Shrink the separator: passes of single moves, each pass undone back to its best point."""
     sizes = np.zeros(3, np.int64)
     for v in members:
         sizes[side[v]] += 1
     for _ in range(_PASSES):
-        if not _refine_pass(pointers, neighbours, members, part, stamp, side, sizes, pulled):
+        if not _refine_pass(pointers, neighbours, members, part, stamp, side, sizes, pulled, locked):
             return
 
 
@@ -312,8 +314,9 @@ def _count_pulled(
 
 @kernel(exact=True)
 def _refine_pass(
-    pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, side: Any, sizes: Any, pulled: Any
-) -> bool:
+    pointers: Any, neighbours: Any, members: Any, part: Any, stamp: int, side: Any, sizes: Any, pulled: Any,
+    locked: Any,
+) -> bool:  # fmt: skip
     """Move separator nodes, the best first and each once, then undo the moves after the best state.
 
     Returns whether the separation became better.
@@ -332,8 +335,9 @@ def _refine_pass(
     best_changes, dips = 0, 0
     while len(heap) > 0 and dips < _DIPS:
         count, v, to = heapq.heappop(heap)
-        if side[v] != 2 or count != pulled[v, to] or sizes[to] + 1 > limit:
+        if side[v] != 2 or locked[v] or count != pulled[v, to] or sizes[to] + 1 > limit:
             continue  # out of date, moved already, or against the balance
+        locked[v] = True
         changed.append(v)
         before.append(np.int64(2))
         _move(pointers, neighbours, part, stamp, side, sizes, v, to, pulled, heap, changed, before)
@@ -345,6 +349,8 @@ def _refine_pass(
         sizes[side[v]] -= 1
         sizes[was] += 1
         side[v] = was
+    for v in members:
+        locked[v] = False
     return best < start
 
 

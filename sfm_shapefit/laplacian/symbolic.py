@@ -84,6 +84,8 @@ class SymbolicFactor:
     """(S,) start of each update matrix in the stack, in units of one (block) entry."""
     stack_size: int
     """(Block) entries of the stack of update matrices."""
+    largest_front: int
+    """Rows of the tallest panel."""
     edge_pointers: IntArray
     """(S + 1,) into the three arrays below: the edges of each supernode."""
     edge_index: Int32Array
@@ -177,6 +179,7 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
         panel_pointers=frozen(np.concatenate([[0], np.cumsum(sizes)])),
         update_offsets=frozen(offsets),
         stack_size=int(stack_size),
+        largest_front=int(np.max(np.diff(first) + below, initial=0)),
         edge_pointers=frozen(edge_pointers),
         edge_index=frozen(edge_index),
         edge_row=frozen(edge_row),

@@ -1,0 +1,74 @@
+"""Draw the README's picture: `python scripts/make_figures.py --out docs`.
+
+The bundled courtyard from above: on the left what `locate` is given (a direction per pair, a quarter of
+them wrong), on the right what it returns, coloured by verdict.
+"""
+
+import argparse
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+
+import sfm_shapefit
+from sfm_shapefit.results import LocateResult
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+SCENE = Path(__file__).parents[1] / "data_synthetic" / "courtyard"
+INLIER, OUTLIER, CAMERA, POINT = "#2a9d5c", "#d1495b", "#1d3557", "#a0a0a0"
+STUB_M = 1.5  # length at which directions are drawn; they have none
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the pictures")
+    out = parser.parse_args().out
+    found = sfm_shapefit.locate(SCENE / "truth", SCENE / "database.db")
+    draw_courtyard(found, out / "courtyard.png")
+
+
+def draw_courtyard(found: LocateResult, path: Path) -> None:
+    """Draw the directions before and after as two plans side by side."""
+    figure, (given, solved) = plt.subplots(1, 2, figsize=(11, 4.9), dpi=110, sharex=True, sharey=True)
+    images = [found.reconstruction.image(i) for i in found.model.image_ids.tolist()]
+    centers = np.array([image.projection_center() for image in images])
+    forward = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
+    piece = found.pieces[0]
+    edges = found.graph.edges[piece.edges]
+    directions = found.graph.directions[piece.edges]
+
+    for (i, j), v in zip(edges, directions, strict=True):
+        for start, end in ((centers[i], centers[i] - STUB_M * v), (centers[j], centers[j] + STUB_M * v)):
+            given.plot(*zip(start[:2], end[:2], strict=True), color="#6c757d", lw=0.8, alpha=0.8)
+    given.set_title(f"given: {len(images)} rotations, {len(edges)} directions, 44 of them wrong")
+
+    points = np.array([point.xyz for point in found.reconstruction.points3D.values()])
+    solved.scatter(points[:, 0], points[:, 1], s=1.5, color=POINT, linewidths=0)
+    order = np.argsort(~found.assessment.inliers, kind="stable")
+    for e in order:
+        i, j = edges[e]
+        color = INLIER if found.assessment.inliers[e] else OUTLIER
+        ends = np.stack([centers[i], centers[j]])
+        solved.plot(ends[:, 0], ends[:, 1], color=color, lw=0.7, alpha=0.55 if color == INLIER else 0.9)
+    rejected = int(np.sum(~found.assessment.inliers))
+    for color, label in ((INLIER, "agrees with the solution"), (OUTLIER, "contradicts it")):
+        solved.plot([], [], color=color, label=label)
+    solved.legend(loc="lower center", bbox_to_anchor=(0.5, 0.08), ncols=2, fontsize=8)
+    solved.set_title(f"found: {len(piece.cameras)} cameras, {rejected} pairs rejected, {len(points)} points")
+
+    for axes in (given, solved):
+        axes.quiver(*centers[:, :2].T, *forward[:, :2].T, color=CAMERA, width=0.006, scale=22, zorder=5)
+        axes.scatter(*centers[:, :2].T, s=16, color=CAMERA, zorder=6)
+        axes.set_aspect("equal")
+        axes.set_xlim(-13, 13)
+        axes.set_ylim(-10.2, 10.2)
+        axes.set_xlabel("x [m]")
+    given.set_ylabel("y [m]")
+    figure.tight_layout()
+    figure.savefig(path)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,534 @@
+"""Inlier matches and relative poses of a COLMAP database, read by sqlite3 without touching the file.
+
+Opening the database with pycolmap would migrate it in place, and a mere read by sqlite3 creates -shm and
+-wal files beside a database in WAL mode. So a database is read
+
+    where it is, as immutable   if it is in WAL mode and has no -wal file: nobody has it open,
+    where it is, with mode=ro   if it is in another mode and has no -journal file,
+    from a private copy         if it has a -wal or a -journal: the copy is recovered, the original kept.
+
+Images of the database and of the model are matched by name, since their ids may differ. A pair of
+database images (a, b), a < b, has pair_id = 2147483647 a + b; `cam2_from_cam1` maps camera a to camera b.
+
+Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc`; facts on versions 3.6
+to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
+"""
+
+import os
+import shutil
+import sqlite3
+import struct
+import tempfile
+from collections import OrderedDict
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.matches import MatchBatch, RelativePoses
+from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import normalized
+
+MAX_NUM_IMAGES = 2147483647
+"""COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
+
+# COLMAP's TwoViewGeometryConfiguration: 0 undefined, 1 degenerate, 2 calibrated, 3 uncalibrated, 4 planar,
+# 5 panoramic, 6 planar or panoramic, 7 watermark, 8 multiple, 9 calibrated rig.
+_CONFIGS_WITHOUT_MATCHES = (0, 1, 7)  # what they list is not verified, or a watermark
+_CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)  # 5: pure rotation; 8: several motions, none of them stored
+
+_SIDECARS = ("-wal", "-journal")
+_WAL_VERSION = 2  # bytes 18 and 19 of the header
+_LOCK_TIMEOUT_S = 2.0
+_COPY_ATTEMPTS = 3
+_MIN_TRANSLATION = 1e-12  # stored translations are 1, or of the scene's size; shorter ones mean "none"
+
+_REQUIRED_COLUMNS = {
+    "images": ("image_id", "name"),
+    "keypoints": ("image_id", "rows", "cols", "data"),
+    "two_view_geometries": ("pair_id", "rows", "cols", "data", "config"),
+}
+
+
+def find_database(model_folder: Path) -> Path | None:
+    """Return database.db in the model's folder, its parent or its grandparent, whichever comes first."""
+    folder = Path(os.path.abspath(model_folder))
+    for candidate in (folder, *folder.parents[:2]):
+        path = candidate / "database.db"
+        if os.path.isfile(path):  # False, not an error, where the folder may not be read
+            return path
+    return None
+
+
+@contextmanager
+def open_database(
+    path: Path | str, model: PosedModel, *, cache_bytes: int = 1_000_000_000
+) -> Iterator["MatchDatabase"]:
+    """Open a COLMAP database for reading; neither it nor its folder is changed.
+
+    Args:
+        path: the database.
+        model: the posed images whose matches are wanted.
+        cache_bytes: limit of the memory for rays of keypoints that may be needed again.
+
+    Raises:
+        InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
+            than two images of the model; later reads raise it for damaged rows, naming image or pair.
+    """
+    file = Path(path)
+    with ExitStack() as stack:
+        with _sqlite_errors(file):
+            connection = stack.enter_context(_readonly_connection(file))
+            _check_schema(file, connection)
+            database = MatchDatabase(file, connection, model, cache_bytes)
+        yield database
+
+
+class MatchDatabase:
+    """The matches of a database between the images of a model; made by `open_database`."""
+
+    def __init__(
+        self, path: Path, connection: sqlite3.Connection, model: PosedModel, cache_bytes: int
+    ) -> None:
+        self.path = path
+        self._connection = connection
+        self._model = model
+        self._cache_bytes = cache_bytes
+        self._rays: OrderedDict[int, FloatArray] = OrderedDict()
+        self._cached_bytes = 0
+        self._index_of_id = _match_names(path, connection, model)
+        self._id_of_index = {index: i for i, index in self._index_of_id.items() if index >= 0}
+        self._pairs = _read_pairs(path, connection, self._index_of_id)
+
+    @property
+    def unmatched_names(self) -> tuple[str, ...]:
+        """Names of the model's images that the database does not have, in model order."""
+        return tuple(name for k, name in enumerate(self._model.names) if k not in self._id_of_index)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs of posed images with verified inlier matches."""
+        return int(self._pairs.has_matches.sum())
+
+    @property
+    def num_matches(self) -> int:
+        """Number of inlier matches of those pairs, for progress."""
+        return int(self._pairs.num_inliers[self._pairs.has_matches].sum())
+
+    def keypoints(self, image: int) -> FloatArray:
+        """Return the pixels of the keypoints of one image.
+
+        Args:
+            image: index into `PosedModel.image_ids`.
+
+        Returns:
+            (k, 2) pixels in COLMAP's convention; k = 0 if the database has no keypoints of this image.
+
+        Raises:
+            InputError: if the row is damaged or a coordinate is not finite.
+        """
+        if image not in self._id_of_index:
+            return np.zeros((0, 2))
+        with _sqlite_errors(self.path):
+            row = self._connection.execute(
+                "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (self._id_of_index[image],)
+            ).fetchone()
+        if row is None or not row[0]:
+            return np.zeros((0, 2))
+        name = self._model.names[image]
+        rows, cols, data = row
+        if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
+            raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
+        xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
+        if not np.isfinite(xy).all():
+            raise InputError(
+                f"{self.path}: image {name} has a keypoint that is not finite; extract them again"
+            )
+        return xy
+
+    def iter_matches(self, min_matches: int, max_matches_per_batch: int = 2_000_000) -> Iterator[MatchBatch]:
+        """Yield the verified inlier matches of all pairs, in the order of pairs (i, j), in batches.
+
+        Repeated matches of a pair count once, and matches whose pixel has no ray are left out.
+
+        Args:
+            min_matches: pairs with fewer matches are left out; at least 1.
+            max_matches_per_batch: bounds the memory; only a single pair may exceed it.
+
+        Raises:
+            InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
+        """
+        enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
+        chosen = np.flatnonzero(enough)
+        limit = max(max_matches_per_batch, 1)
+        first = 0
+        while first < len(chosen):
+            total = np.cumsum(self._pairs.num_inliers[chosen[first : first + limit]])
+            count = max(int(np.searchsorted(total, limit, side="right")), 1)
+            batch = self._match_batch(chosen[first : first + count], max(min_matches, 1))
+            first += count
+            if len(batch.pairs):
+                yield batch
+
+    def relative_poses(self) -> RelativePoses:
+        """Return the relative poses that the database stores, most often none.
+
+        Left out are pairs whose configuration has no pose with a direction, and poses that are NULL, not
+        finite, of zero quaternion, or of zero translation (older COLMAP wrote the identity for "none").
+        Pairs are oriented i < j in the model's order: the pose is inverted when the database's ids
+        are in the other order. Translations are scaled to length 1.
+
+        Raises:
+            InputError: naming the pair whose pose is damaged.
+        """
+        columns = _columns(self._connection, "two_view_geometries")
+        keep = np.flatnonzero(~np.isin(self._pairs.configs, _CONFIGS_WITHOUT_POSE))
+        poses = np.full((len(keep), 7), np.nan)
+        if {"qvec", "tvec"} <= columns:
+            for k, pair in enumerate(keep.tolist()):
+                poses[k] = self._stored_pose(pair)
+        sound = np.isfinite(poses).all(axis=1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            rotation_norm = np.linalg.norm(poses[:, :4], axis=1)
+            translation_norm = np.linalg.norm(poses[:, 4:], axis=1)
+        sound &= (rotation_norm > 0.0) & (rotation_norm < np.inf)
+        sound &= (translation_norm > _MIN_TRANSLATION) & (translation_norm < np.inf)
+        keep, poses = keep[sound], poses[sound]
+
+        rotations, translations = rotation_matrices(poses[:, :4]), normalized(poses[:, 4:])
+        swapped = self._pairs.swapped[keep]
+        inverted = -np.einsum("nji,nj->ni", rotations, translations)
+        return RelativePoses(
+            pairs=self._pairs.pairs[keep],
+            rotations=np.where(swapped[:, None, None], rotations.transpose(0, 2, 1), rotations),
+            translations=np.where(swapped[:, None], inverted, translations),
+            configs=self._pairs.configs[keep],
+            num_inliers=self._pairs.num_inliers[keep],
+        )
+
+    def _stored_pose(self, pair: int) -> FloatArray:
+        """Return (qw, qx, qy, qz, tx, ty, tz) of a pair as stored, NaN if it has none."""
+        with _sqlite_errors(self.path):
+            qvec, tvec = self._connection.execute(
+                "SELECT qvec, tvec FROM two_view_geometries WHERE rowid = ?", (int(self._pairs.rowids[pair]),)
+            ).fetchone()
+        if qvec is None or tvec is None:
+            return np.full(7, np.nan)
+        if not (_is_blob(qvec, 4, 1, itemsize=8) and _is_blob(tvec, 3, 1, itemsize=8)):
+            raise self._damaged_pair(pair, "a relative pose of wrong length")
+        return np.frombuffer(qvec + tvec, dtype="<f8")
+
+    def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
+        """Return the matches of the chosen pairs, without repetitions and matches that have no ray."""
+        keypoints, pair_of = self._read_match_rows(chosen)
+        keypoints, pair_of = _without_repetitions(keypoints, pair_of)
+        bounds = np.searchsorted(pair_of, np.arange(len(chosen) + 1))
+        rays = np.empty((2, len(keypoints), 3))
+        for k, pair in enumerate(chosen.tolist()):
+            rows = slice(bounds[k], bounds[k + 1])
+            for side in (0, 1):
+                table = self._world_rays(int(self._pairs.pairs[pair, side]))
+                if rows.stop > rows.start and keypoints[rows, side].max() >= len(table):
+                    raise self._damaged_pair(pair, "matches of keypoints that do not exist")
+                rays[side, rows] = table[keypoints[rows, side]]
+
+        keep = np.asarray(np.isfinite(rays).all(axis=(0, 2)), dtype=np.bool_)
+        counts = np.bincount(pair_of[keep], minlength=len(chosen))
+        keep &= (counts >= min_matches)[pair_of]
+        kept = counts >= min_matches
+        return MatchBatch(
+            pairs=self._pairs.pairs[chosen[kept]],
+            offsets=np.append(0, np.cumsum(counts[kept])),
+            keypoints=keypoints[keep],
+            rays_i=rays[0, keep],
+            rays_j=rays[1, keep],
+        )
+
+    def _read_match_rows(self, chosen: IntArray) -> tuple[IntArray, IntArray]:
+        """Return the stored matches (M, 2), image i first, and for each the position of its pair."""
+        blobs = []
+        for pair in chosen.tolist():
+            with _sqlite_errors(self.path):
+                cols, data = self._connection.execute(
+                    "SELECT cols, data FROM two_view_geometries WHERE rowid = ?",
+                    (int(self._pairs.rowids[pair]),),
+                ).fetchone()
+            if cols != 2 or not _is_blob(data, int(self._pairs.num_inliers[pair]), 2, itemsize=4):
+                raise self._damaged_pair(pair, "matches of wrong length")
+            blobs.append(data)
+        keypoints = np.frombuffer(b"".join(blobs), dtype="<u4").reshape(-1, 2).astype(np.int64)
+        pair_of = np.repeat(np.arange(len(chosen)), self._pairs.num_inliers[chosen])
+        swapped = self._pairs.swapped[chosen][pair_of]
+        keypoints[swapped] = keypoints[swapped][:, ::-1]
+        return keypoints, pair_of
+
+    def _world_rays(self, image: int) -> FloatArray:
+        """Return the rays of all keypoints of an image, from the cache if it was used recently."""
+        if image in self._rays:
+            self._rays.move_to_end(image)
+            return self._rays[image]
+        rays = world_rays(self._model, image, self.keypoints(image))
+        self._rays[image] = rays
+        self._cached_bytes += rays.nbytes
+        while self._cached_bytes > self._cache_bytes:
+            self._cached_bytes -= self._rays.popitem(last=False)[1].nbytes
+        return rays
+
+    def _damaged_pair(self, pair: int, what: str) -> InputError:
+        """Return the error that names a pair of images."""
+        i, j = self._pairs.pairs[pair]
+        names = f"{self._model.names[i]} and {self._model.names[j]}"
+        return InputError(f"{self.path}: the pair {names} has {what}; match the images again")
+
+
+# --- opening ---------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _sqlite_errors(path: Path) -> Iterator[None]:
+    """Turn sqlite's errors into one sentence that names the database."""
+    try:
+        yield
+    except sqlite3.Error as error:
+        if "locked" in str(error) or "busy" in str(error):
+            raise InputError(f"the database {path} is locked by another program; close it first") from error
+        raise InputError(f"the database {path} cannot be read: {error}") from error
+
+
+@contextmanager
+def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
+    """Connect to a database so that no file of it changes and none appears; see the module's header."""
+    header = _read_header(path)
+    with ExitStack() as stack:
+        if any(_size(_sidecar(path, suffix)) for suffix in _SIDECARS):
+            target, mode = _private_copy(path, stack), "mode=rw"
+        else:
+            _refuse_truncated(path, header)
+            in_wal_mode = _WAL_VERSION in header[18:20]
+            target, mode = path, "mode=ro&immutable=1" if in_wal_mode else "mode=ro"
+        uri = f"file://{quote(os.fsencode(target.absolute()))}?{mode}"
+        connection = stack.enter_context(
+            closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None))
+        )
+        connection.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
+        connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA query_only = ON")
+        yield connection
+
+
+def _read_header(path: Path) -> bytes:
+    """Return the first 100 bytes of a database, or refuse a file that is none."""
+    try:
+        with path.open("rb") as stream:
+            header = stream.read(100)
+    except FileNotFoundError:
+        raise InputError(f"the database {path} does not exist") from None
+    except IsADirectoryError:
+        raise InputError(f"{path} is a folder; give the database file itself") from None
+    except OSError as error:
+        raise InputError(f"the database {path} cannot be read: {error.strerror}") from None
+    if not header:
+        raise InputError(f"the database {path} is empty; run COLMAP's feature extraction and matching first")
+    if len(header) < 100 or not header.startswith(b"SQLite format 3\0"):
+        raise InputError(f"{path} is not a COLMAP database; give the database.db that COLMAP wrote")
+    return header
+
+
+def _refuse_truncated(path: Path, header: bytes) -> None:
+    """Refuse a file that is shorter than its header says; sqlite notices only when it reads a lost page.
+
+    Header (https://sqlite.org/fileformat.html): page size at 16, where 1 means 65536, change counter at
+    24, size in pages at 28, and at 92 the change counter for which that size holds.
+    """
+    page_size, change_counter, num_pages = struct.unpack_from(">H6xII", header, 16)
+    (size_valid_for,) = struct.unpack_from(">I", header, 92)
+    size = num_pages * (65536 if page_size == 1 else page_size)
+    if change_counter == size_valid_for and _size(path) < size:
+        raise InputError(
+            f"the database {path} is truncated: it has {_size(path)} of {size} bytes; copy it again"
+        )
+
+
+def _sidecar(path: Path, suffix: str) -> Path:
+    """Return the path of a database's -wal or -journal file."""
+    return path.with_name(path.name + suffix)
+
+
+def _size(path: Path) -> int:
+    """Return the size of a file, 0 if it does not exist."""
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0
+
+
+def _private_copy(path: Path, stack: ExitStack) -> Path:
+    """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
+    files = [path, *(_sidecar(path, suffix) for suffix in _SIDECARS)]
+    for _ in range(_COPY_ATTEMPTS):
+        before = _fingerprints(files)
+        try:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sfm_shapefit_")))
+            for file in filter(Path.exists, files):
+                shutil.copyfile(file, folder / file.name)
+        except OSError as error:
+            raise InputError(
+                f"the database {path} has unfinished changes and cannot be copied to a temporary folder "
+                f"({error.strerror}); close the program that uses it, or make room"
+            ) from None
+        if before == _fingerprints(files):
+            return folder / path.name
+    raise InputError(f"the database {path} is being written by another program; wait until it is done")
+
+
+def _fingerprints(files: Sequence[Path]) -> list[tuple[int, int] | None]:
+    """Return size and modification time of each file that exists."""
+    found: list[tuple[int, int] | None] = []
+    for file in files:
+        try:
+            stat = file.stat()
+            found.append((stat.st_size, stat.st_mtime_ns))
+        except FileNotFoundError:
+            found.append(None)
+    return found
+
+
+# --- tables ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Pairs:
+    """The pairs of posed images that have inlier matches, sorted by (i, j)."""
+
+    pairs: IntArray
+    """(k, 2) model indices, i < j."""
+    rowids: IntArray
+    """(k,) rows of two_view_geometries."""
+    swapped: BoolArray
+    """(k,) whether the database has image j first."""
+    configs: IntArray
+    """(k,)"""
+    num_inliers: IntArray
+    """(k,)"""
+
+    @property
+    def has_matches(self) -> BoolArray:
+        """Whether the pair's inlier matches may be used, (k,)."""
+        return np.asarray(~np.isin(self.configs, _CONFIGS_WITHOUT_MATCHES), dtype=np.bool_)
+
+
+def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
+    """Return the names of a table's columns, none if there is no such table."""
+    return {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
+
+
+def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
+    """Refuse a database without the tables and columns that are read."""
+    for table, required in _REQUIRED_COLUMNS.items():
+        columns = _columns(connection, table)
+        if missing := [name for name in required if name not in columns]:
+            what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
+            raise InputError(f"{path} is not a COLMAP database: it has {what}")
+
+
+def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -> dict[int, int]:
+    """Return for each image id of the database the index of the model's image of that name, or -1."""
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    index_of_id: dict[int, int] = {}
+    example, matched = None, set()
+    for image_id, name in connection.execute("SELECT image_id, name FROM images ORDER BY image_id"):
+        if not (isinstance(image_id, int) and 0 <= image_id < MAX_NUM_IMAGES and isinstance(name, str)):
+            raise InputError(
+                f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
+            )
+        index = index_of_name.get(name, -1)
+        if index in matched or image_id in index_of_id:
+            raise InputError(f"{path}: the image {name} stands twice; remove one of them")
+        index_of_id[image_id] = index
+        if index >= 0:
+            matched.add(index)
+        elif example is None:
+            example = name
+    if not index_of_id:
+        raise InputError(f"{path} has no images; run COLMAP's feature extraction and matching first")
+    if len(matched) < 2:
+        raise InputError(_other_scene_message(path, model, matched, example))
+    return index_of_id
+
+
+def _other_scene_message(path: Path, model: PosedModel, matched: set[int], example: str | None) -> str:
+    """Return the sentence about a database whose images are not those of the model."""
+    unmatched = next(name for index, name in enumerate(model.names) if index not in matched)
+    there = f", and the database's {example} is not in the model" if example is not None else ""
+    return (
+        f"{path} has {len(matched)} of the model's {model.num_images} images: the model's {unmatched} is not "
+        f"in the database{there}; give the database this model was made from"
+    )
+
+
+def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> _Pairs:
+    """Read which pairs of posed images have inlier matches."""
+    damaged = connection.execute(
+        "SELECT pair_id FROM two_view_geometries WHERE typeof(pair_id) != 'integer' "
+        "OR typeof(rows) != 'integer' OR typeof(config) != 'integer' OR pair_id < 0 OR rows < 0 LIMIT 1"
+    ).fetchone()
+    if damaged is not None:
+        raise InputError(f"{path}: the two-view geometry of pair {damaged[0]!r} is damaged")
+    rows = connection.execute(
+        "SELECT rowid, pair_id, config, rows FROM two_view_geometries WHERE rows > 0"
+    ).fetchall()
+    rowids, pair_ids, configs, num_inliers = np.array(rows, dtype=np.int64).reshape(-1, 4).T
+    ends = _indices_of_pairs(path, pair_ids, index_of_id)
+    known = np.logical_and(ends[:, 0] >= 0, ends[:, 1] >= 0)
+    swapped = ends[:, 0] > ends[:, 1]
+    ends = np.sort(ends, axis=1)
+    order = np.lexsort((ends[:, 1], ends[:, 0]))
+    order = order[known[order]]
+    pairs = ends[order]
+    repeated = (pairs[1:] == pairs[:-1]).all(axis=1)
+    if repeated.any():
+        pair_id = pair_ids[order][int(np.argmax(repeated))]
+        raise InputError(f"{path}: the two-view geometry of pair {pair_id} stands twice")
+    return _Pairs(
+        pairs=pairs,
+        rowids=rowids[order],
+        swapped=swapped[order],
+        configs=configs[order],
+        num_inliers=num_inliers[order],
+    )
+
+
+def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:
+    """Decode pair ids into model indices (k, 2), first image first; -1: it has no pose."""
+    ids = np.stack(np.divmod(pair_ids, MAX_NUM_IMAGES), axis=1)
+    known = np.array(sorted(index_of_id), dtype=np.int64)
+    position = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+    bad = (known[position] != ids).any(axis=1) | (ids[:, 0] >= ids[:, 1])
+    if bad.any():
+        a, b = ids[int(np.argmax(bad))]
+        raise InputError(f"{path}: a two-view geometry joins the images with ids {a} and {b}; it is damaged")
+    indices = np.array([index_of_id[i] for i in known.tolist()], dtype=np.int64)
+    return indices[position]
+
+
+def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
+    """Return whether `data` is a blob of rows x cols items."""
+    return isinstance(data, bytes) and isinstance(rows, int) and len(data) == rows * cols * itemsize
+
+
+def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Drop all but the first occurrence of each match (M, 2) within its pair; pairs stay in order."""
+    columns = (pair_of, keypoints[:, 0], keypoints[:, 1])
+    order = np.lexsort(columns[::-1])
+    in_order = [column[order] for column in columns]
+    repeated = np.logical_and.reduce([column[1:] == column[:-1] for column in in_order])
+    if not repeated.any():
+        return keypoints, pair_of
+    keep = np.ones(len(keypoints), dtype=np.bool_)
+    keep[order[1:][repeated]] = False  # lexsort is stable: the first of equals comes first
+    return keypoints[keep], pair_of[keep]

@@ -1,0 +1,359 @@
+"""Models with known rotations: what is read of a COLMAP reconstruction, and the rays of its pixels.
+
+COLMAP's convention is x_cam = R x_world + t with centre C = -R^T t. Only R and the intrinsics are
+trusted: the centres of the input are carried along for comparison and never place a camera.
+
+Poses live in frames (`rig_from_world`); for a model of an older COLMAP, pycolmap makes one frame per
+image. A rig with several sensors would tie positions together by metric offsets; it is refused here.
+
+Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.colmap.check import check_model_files, model_suffix
+from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import normalized
+
+PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
+"""What pycolmap raises on bad data."""
+
+_UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
+_QUIET = 3  # glog's FATAL
+_NO_POINT = np.uint64(2**64 - 1)
+# For this camera, pixel coordinates and normalised coordinates are the same numbers.
+_IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedModel:
+    """The posed images of a COLMAP model, in ascending order of their ids. Arrays are read-only."""
+
+    reconstruction: pycolmap.Reconstruction
+    """The input; nobody modifies it."""
+    image_ids: IntArray
+    """(n,) ascending ids of the images that have a pose."""
+    names: tuple[str, ...]
+    """The names of those images, all different."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3) the input's camera centres; they never place a camera, and may all be 0."""
+    focal_lengths_px: FloatArray
+    """(n,) mean focal length; for a camera without one (equirectangular) its pixels per radian."""
+
+    @property
+    def num_images(self) -> int:
+        """Number of posed images, n."""
+        return len(self.image_ids)
+
+
+def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
+    """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
+
+    Args:
+        source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
+            3.12 on, rigs and frames; or a reconstruction, which is not modified.
+
+    Raises:
+        InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
+            refuses them, if a rig has several sensors, or if fewer than two images have a pose.
+    """
+    if isinstance(source, pycolmap.Reconstruction):
+        label, reconstruction = "the reconstruction", source
+        is_checked = False
+    else:
+        folder = Path(source)
+        label, reconstruction = str(folder), _load(folder)
+        is_checked = model_suffix(folder) == ".bin"
+    try:
+        with quiet_pycolmap():
+            _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
+            return _posed_model(label, reconstruction)
+    except PYCOLMAP_ERRORS as error:
+        raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
+
+
+def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
+    """Return the unit rays R^T f(xy) of pixels in world axes.
+
+    Args:
+        model: the posed images.
+        image: index into `model.image_ids`.
+        xy: (k, 2) pixels in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+
+    Returns:
+        (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
+    """
+    reconstruction = model.reconstruction
+    camera = reconstruction.camera(reconstruction.image(int(model.image_ids[image])).camera_id)
+    rays = np.asarray(camera.cam_ray_from_img(np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2)))
+    return normalized(rays @ model.rotations[image])
+
+
+def track_matches(
+    model: PosedModel, min_matches: int, max_matches_per_batch: int = 2_000_000
+) -> Iterator[MatchBatch]:
+    """Yield the pairs of images that share at least `min_matches` of the model's own 3D points.
+
+    The keypoints of a match are the `points2D` indices of the two images. An image that observes the
+    same 3D point with several keypoints gives no match for that point: it is unknown which one is right.
+
+    Args:
+        model: the posed images and their tracks.
+        min_matches: pairs with fewer matches are left out; at least 1.
+        max_matches_per_batch: bounds the memory; a batch holds all pairs (i, j > i) of one or more images
+            i, and only a single image with more matches than that makes it larger.
+
+    Raises:
+        InputError: if an observed point of an image is not finite.
+    """
+    tracks = _Observations.of(model)
+    num_matches = np.zeros(model.num_images)
+    np.add.at(num_matches, tracks.images, tracks.num_following())
+    for first, last in _batches(num_matches, max_matches_per_batch):
+        batch = _track_batch(
+            tracks, first, last, num_images=model.num_images, min_matches=max(min_matches, 1)
+        )
+        if len(batch.pairs):
+            yield batch
+
+
+@contextmanager
+def quiet_pycolmap() -> Iterator[None]:
+    """Keep pycolmap's log of a reading call off stderr; its errors arrive as exceptions."""
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = _QUIET
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+# --- reading ---------------------------------------------------------------------------------------
+
+
+def _load(folder: Path) -> pycolmap.Reconstruction:
+    """Check the files of a model and only then let pycolmap read them."""
+    check_model_files(folder)
+    try:
+        with quiet_pycolmap():
+            return pycolmap.Reconstruction(folder)
+    except PYCOLMAP_ERRORS as error:
+        raise InputError(
+            f"{folder} cannot be read as a COLMAP model ({_first_line(error)}); write it again with COLMAP"
+        ) from error
+
+
+def _first_line(error: BaseException) -> str:
+    """Return the first line of an exception's text, or its type if it has none."""
+    text = str(error).strip()
+    return text.splitlines()[0].strip() if text else type(error).__name__
+
+
+def _refuse_inconsistent(label: str, reconstruction: pycolmap.Reconstruction, *, is_checked: bool) -> None:
+    """Refuse dangling references, and what is not finite unless the files were checked for that."""
+    if not reconstruction.is_valid():
+        raise InputError(
+            f"{label} refers to an image, a frame or a 3D point that it does not have; "
+            "write it again with COLMAP or pycolmap"
+        )
+    if is_checked:
+        return
+    points = reconstruction.points3D
+    _refuse_not_finite(label, "3D point", list(points), [point.xyz for point in points.values()])
+    cameras = reconstruction.cameras
+    params = [float(np.sum(camera.params)) for camera in cameras.values()]  # NaN or infinite if one is
+    _refuse_not_finite(label, "camera", list(cameras), params)
+    for image_id in sorted(reconstruction.images):
+        if not np.isfinite(points2d_xy(reconstruction.image(image_id))).all():
+            raise InputError(f"{label}: image {image_id} has a point whose coordinates are not finite")
+
+
+def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayLike) -> None:
+    """Raise InputError for the first of `ids` whose row of `values` is not finite."""
+    array = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(array).all(axis=tuple(range(1, array.ndim)))
+    if not finite.all():
+        raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
+
+
+def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedModel:
+    """Collect the posed images of a reconstruction."""
+    image_ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    if len(image_ids) < 2:
+        raise InputError(
+            f"{label} has {len(image_ids)} images with a pose, but two or more are needed; register more"
+        )
+    images = [reconstruction.image(i) for i in image_ids]
+    for image in images:
+        _refuse_rig(label, image, reconstruction.frame(image.frame_id))
+    names = tuple(image.name for image in images)
+    if len(set(names)) < len(names):
+        repeated = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"{label} has two images of the name {repeated}; rename one")
+
+    cameras = [reconstruction.camera(image.camera_id) for image in images]
+    poses = [image.cam_from_world() for image in images]
+    rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
+    translations = np.array([pose.translation for pose in poses], dtype=np.float64)
+    _refuse_not_finite(label, "the position of image", image_ids, translations)
+    return PosedModel(
+        reconstruction=reconstruction,
+        image_ids=frozen(np.array(image_ids, dtype=np.int64)),
+        names=names,
+        rotations=frozen(rotations),
+        centers=frozen(-np.einsum("nji,nj->ni", rotations, translations)),
+        focal_lengths_px=frozen(_focal_lengths_px(label, cameras)),
+    )
+
+
+def _refuse_rig(label: str, image: pycolmap.Image, frame: pycolmap.Frame) -> None:
+    """Refuse an image whose frame has other images, or whose camera is not its rig's reference."""
+    if len(list(frame.image_ids)) > 1 or not image.is_ref_in_frame():
+        raise InputError(
+            f"{label}: image {image.name} belongs to a rig with several sensors, which is not supported yet; "
+            "give a model with one trivial rig per camera"
+        )
+
+
+def _checked_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
+    """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
+    quaternions = np.array(quaternions_xyzw, dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= _UNIT_QUATERNION_TOLERANCE
+    if not sound.all():
+        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
+    return rotation_matrices(quaternions[:, [3, 0, 1, 2]])
+
+
+def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
+    """Return the (n, 3, 3) rotations of quaternions (n, 4) in the order w, x, y, z; none may be zero."""
+    w, x, y, z = normalized(quaternions_wxyz).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
+
+
+def _focal_lengths_px(label: str, cameras: list[pycolmap.Camera]) -> FloatArray:
+    """Return the focal length of each camera, or refuse one that is not positive."""
+    focals = [
+        camera.params[0] / (2.0 * np.pi)  # its width covers a full turn
+        if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR
+        else camera.mean_focal_length()
+        for camera in cameras
+    ]
+    for camera, focal in zip(cameras, focals, strict=True):
+        if not (np.isfinite(focal) and focal > 0.0):
+            raise InputError(
+                f"{label}: camera {camera.camera_id} has focal length {focal:g} px; it must be > 0"
+            )
+    return np.array(focals, dtype=np.float64)
+
+
+# --- tracks ----------------------------------------------------------------------------------------
+
+
+def points2d_xy(image: pycolmap.Image) -> FloatArray:
+    """Return the pixels of all points of an image, (k, 2), without a Python loop over them."""
+    if not len(image.points2D):
+        return np.zeros((0, 2))
+    return np.asarray(_IDENTITY_CAMERA.cam_from_img(image.points2D), dtype=np.float64).reshape(-1, 2)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observations:
+    """All unambiguous observations of 3D points by posed images, sorted by point, then by image."""
+
+    images: IntArray
+    """(O,) index of the image."""
+    keypoints: IntArray
+    """(O,) index of the point in the image's points2D."""
+    rays: FloatArray
+    """(O, 3) unit rays in world axes."""
+    track_ends: IntArray
+    """(O,) position after the last observation of the same 3D point."""
+
+    @classmethod
+    def of(cls, model: PosedModel) -> "_Observations":
+        """Collect the observations of a model."""
+        parts = [_image_observations(model, image) for image in range(model.num_images)]
+        images = np.repeat(np.arange(model.num_images), [len(ids) for ids, _, _ in parts])
+        ids, keypoints, rays = (np.concatenate(column) for column in zip(*parts, strict=True))
+        order = np.lexsort((keypoints, images, ids))
+        ids, images, keypoints, rays = ids[order], images[order], keypoints[order], rays[order]
+
+        same_as_next = (ids[1:] == ids[:-1]) & (images[1:] == images[:-1])
+        ambiguous = np.append(same_as_next, False) | np.insert(same_as_next, 0, False)
+        keep = ~ambiguous & np.isfinite(rays).all(axis=1)
+        ids = ids[keep]
+        return cls(
+            images=images[keep],
+            keypoints=keypoints[keep],
+            rays=rays[keep],
+            track_ends=np.searchsorted(ids, ids, side="right").astype(np.int64),
+        )
+
+    def num_following(self) -> IntArray:
+        """Return how many observations of the same 3D point come after each one, (O,)."""
+        return self.track_ends - np.arange(len(self.track_ends)) - 1
+
+
+def _image_observations(model: PosedModel, index: int) -> tuple[npt.NDArray[np.uint64], IntArray, FloatArray]:
+    """Return point ids, keypoint indices and rays of the observed points of one image."""
+    image = model.reconstruction.image(int(model.image_ids[index]))
+    ids = np.array([point.point3D_id for point in image.points2D], dtype=np.uint64)
+    keypoints = np.flatnonzero(ids != _NO_POINT)
+    xy = points2d_xy(image)[keypoints]
+    if not np.isfinite(xy).all():
+        raise InputError(f"image {image.name} has a point whose coordinates are not finite")
+    return ids[keypoints], keypoints, world_rays(model, index, xy)
+
+
+def _batches(sizes: FloatArray, limit: int) -> Iterator[tuple[int, int]]:
+    """Yield ranges [first, last) of consecutive items whose sizes sum to at most `limit`, or of one item."""
+    first, total = 0, 0.0
+    for item, size in enumerate(sizes.tolist()):
+        if item > first and total + size > limit:
+            yield first, item
+            first, total = item, 0.0
+        total += size
+    if first < len(sizes):
+        yield first, len(sizes)
+
+
+def _track_batch(
+    tracks: _Observations, first: int, last: int, *, num_images: int, min_matches: int
+) -> MatchBatch:
+    """Return the matches of all pairs (i, j > i) with first <= i < last that have enough of them."""
+    own = np.flatnonzero((tracks.images >= first) & (tracks.images < last))
+    follows = tracks.num_following()[own]
+    left = np.repeat(own, follows)
+    right = left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)
+    pair = tracks.images[left] * num_images + tracks.images[right]
+    order = np.lexsort((tracks.keypoints[left], pair))
+    left, right, pair = left[order], right[order], pair[order]
+
+    keys, counts = np.unique(pair, return_counts=True)
+    keep: BoolArray = np.repeat(counts >= min_matches, counts)
+    left, right = left[keep], right[keep]
+    kept = counts >= min_matches
+    return MatchBatch(
+        pairs=np.stack(np.divmod(keys[kept], num_images), axis=1),
+        offsets=np.append(0, np.cumsum(counts[kept])),
+        keypoints=np.stack([tracks.keypoints[left], tracks.keypoints[right]], axis=1),
+        rays_i=tracks.rays[left],
+        rays_j=tracks.rays[right],
+    )

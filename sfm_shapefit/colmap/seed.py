@@ -1,0 +1,95 @@
+"""A seeded model: the input's rotations and intrinsics, our camera centres, and no 3D points yet.
+
+COLMAP keeps poses in frames, x_cam = R x_world + t with t = -R C. Moving a camera replaces t and hands on
+the very same quaternion, so that rotations and intrinsics come out bit-identical.
+"""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.colmap.check import check_model_files
+from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, PosedModel
+from sfm_shapefit.errors import InputError
+
+Keypoints = Mapping[int, FloatArray] | Callable[[int], FloatArray]
+"""Pixels (k, 2) of the keypoints of an image, by its index into `PosedModel.image_ids`."""
+
+
+def build_seed(
+    model: PosedModel, placed: BoolArray, centers: FloatArray, keypoints: Keypoints | None = None
+) -> pycolmap.Reconstruction:
+    """Return a new reconstruction with the cameras at `centers`; the input is not touched.
+
+    Cameras, rigs, frames and images keep their ids and names, rotations and intrinsics their bits.
+
+    Args:
+        model: the input.
+        placed: (n,) which images have a centre; the others, and images that had no pose, are unregistered.
+        centers: (n, 3) camera centres in world axes; rows of images that are not placed are ignored.
+        keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
+            it has none (a missing key, or no rows), and all images if None, keep those of the model.
+
+    Raises:
+        ValueError: if the shapes do not fit the model, or the centre of a placed image is not finite.
+    """
+    n = model.num_images
+    if placed.shape != (n,) or centers.shape != (n, 3):
+        raise ValueError(f"expected placed ({n},) and centers ({n}, 3), got {placed.shape}, {centers.shape}")
+    if not np.isfinite(centers[placed]).all():
+        worst = int(np.flatnonzero(placed & ~np.isfinite(centers).all(axis=1))[0])
+        raise ValueError(f"the centre of image {model.names[worst]} is not finite")
+
+    seed = without_points(model.reconstruction)
+    for index, image_id in enumerate(model.image_ids.tolist()):
+        image = seed.image(image_id)
+        if placed[index]:
+            translation = -(model.rotations[index] @ centers[index])
+            pose = pycolmap.Rigid3d(image.cam_from_world().rotation, translation)
+            seed.frame(image.frame_id).rig_from_world = pose  # frames are trivial: one image each
+        xy = _keypoints_of(keypoints, index)
+        if xy is not None and len(xy):
+            image.points2D.clear()  # the setter insists on it
+            image.points2D = pycolmap.Image(keypoints=np.ascontiguousarray(xy, dtype=np.float64)).points2D
+    registered = {seed.image(i).frame_id for i in model.image_ids[placed].tolist()}
+    for frame_id in sorted(set(seed.reg_frame_ids()) - registered):
+        seed.deregister_frame(frame_id)
+    return seed
+
+
+def without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """Return a copy that has no 3D points; its points2D stay and observe nothing."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    for point_id in list(copy.point3D_ids()):
+        copy.delete_point3D(point_id)
+    return copy
+
+
+def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
+    """Write a model in COLMAP's binary format into an existing folder, and walk the files once more.
+
+    pycolmap does not notice a disk that is full, hence the second look.
+
+    Raises:
+        InputError: if the files cannot be written, or are not complete afterwards.
+    """
+    try:
+        reconstruction.write_binary(folder)
+    except PYCOLMAP_ERRORS as error:
+        raise InputError(f"{folder} cannot be written; check its permissions and the free space") from error
+    try:
+        check_model_files(folder)
+    except InputError as error:
+        raise InputError(
+            f"the model in {folder} could not be written completely; check the free space"
+        ) from error
+
+
+def _keypoints_of(keypoints: Keypoints | None, index: int) -> FloatArray | None:
+    """Return the keypoints of one image, or None if there are none for it."""
+    if keypoints is None:
+        return None
+    return keypoints(index) if callable(keypoints) else keypoints.get(index)

@@ -1,0 +1,292 @@
+"""The commands as users type them: results, exit codes, one sentence per error, nothing left over."""
+
+import dataclasses
+import json
+import os
+import shutil
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from typer.testing import CliRunner
+
+from sfm_shapefit.cli import app
+from sfm_shapefit.options import LocateOptions
+from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint
+
+RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def refused(result, code):
+    """Return the one sentence of a refusal after checking that it is one."""
+    assert result.exit_code == code, result.output
+    assert result.stdout == ""
+    assert result.stderr.startswith("sfm-shapefit: ")
+    assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
+    return result.stderr
+
+
+@pytest.fixture(scope="module")
+def ring_out(tmp_path_factory):
+    out = tmp_path_factory.mktemp("ring") / "out"
+    assert run("locate", RING_MODEL, out).exit_code == 0
+    return out
+
+
+def test_locate_writes_the_model_and_its_tables(ring_out):
+    written = {path.name for path in ring_out.iterdir()}
+    model = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
+    assert written == model | {"locate.json", "cameras.csv", "pairs.csv"}
+    assert pycolmap.Reconstruction(ring_out).num_reg_images() == 8
+
+
+def test_the_summary_says_what_was_placed_and_where_it_is(tmp_path):
+    out = tmp_path / "out"
+    result = run("locate", RING_MODEL, out)
+    assert "8 of 8 images" in result.stdout
+    assert "certified to" in result.stdout
+    assert "locate.json" in result.stdout
+    assert result.stderr == ""
+
+
+def test_json_is_the_only_thing_on_stdout_and_equals_the_file(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--json")
+    assert json.loads(result.stdout) == json.loads((tmp_path / "out" / "locate.json").read_text())
+
+
+def test_quiet_prints_nothing(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--quiet")
+    assert (result.exit_code, result.output) == (0, "")
+
+
+def test_colmaps_own_names_are_accepted(tmp_path):
+    out = tmp_path / "out"
+    names = ("--input_path", RING_MODEL, "--output_path", out, "--database_path", RING / "database.db")
+    assert run("locate", *names).exit_code == 0
+    assert out.is_dir()
+
+
+def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
+    assert run("locate", RING_MODEL).exit_code == 2
+    assert run("locate", RING_MODEL, tmp_path / "out", "--output_path", tmp_path / "o").exit_code == 2
+    assert run("locate", RING_MODEL, tmp_path / "out", "--scale", "metric").exit_code == 2
+    assert run("locate", RING_MODEL, tmp_path / "out", "--min-inlier-ratio", "7").exit_code == 2
+    assert run("frobnicate").exit_code == 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_path):
+    text = run("locate", "--help").stdout
+    for field in dataclasses.fields(LocateOptions):
+        assert f"--{field.name.replace('_', '-')}" in text
+    result = run("locate", FACADE_MODEL, tmp_path / "out", "--scale", "unit", "--threads", "1", "--json")
+    assert json.loads(result.stdout)["options"]["scale"] == "unit"
+    assert json.loads(result.stdout)["scale"].startswith("unit")
+
+
+@pytest.mark.parametrize(
+    ("flag", "value", "key"),
+    [
+        ("--min-inliers", "1000000", "num_pairs_rejected"),
+        ("--inlier-threshold-px", "0.3", "num_pairs_rejected"),
+        ("--max-reprojection-error-px", "0.3", "num_points"),
+        ("--min-triangulation-angle-deg", "40", "num_points"),
+        ("--directions", "tracks", "inputs"),
+    ],
+)
+def test_each_flag_matters(tmp_path, flag, value, key):
+    plain = json.loads(run("locate", COURTYARD / "truth", tmp_path / "a", "--json").stdout)
+    result = run("locate", COURTYARD / "truth", tmp_path / "b", "--json", flag, value)
+    if flag == "--min-inliers":
+        assert "none of the" in refused(result, 4)
+    else:
+        assert json.loads(result.stdout)[key] != plain[key]
+
+
+def test_a_config_file_sets_options_and_flags_win(tmp_path):
+    config = tmp_path / "options.toml"
+    config.write_text('scale = "unit"\nmin_inliers = 20\n')
+    result = run("locate", FACADE_MODEL, tmp_path / "a", "--json", "--config", config, "--min-inliers", "16")
+    options = json.loads(result.stdout)["options"]
+    assert (options["scale"], options["min_inliers"]) == ("unit", 16)
+
+
+@pytest.mark.parametrize("text", ["scale = ", "colour = 3", "min_inliers = 'many'", "scale = 'metric'"])
+def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
+    (tmp_path / "options.toml").write_text(text)
+    result = run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml")
+    assert result.exit_code == 2
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):
+    out = tmp_path / "out"
+    assert run("locate", RING_MODEL, out, "-q").exit_code == 0
+    before = fingerprint(out)
+    assert "exists already" in refused(run("locate", RING_MODEL, out), 3)
+    assert fingerprint(out) == before
+    assert run("locate", RING_MODEL, out, "-q", "--overwrite", "--scale", "unit").exit_code == 0
+    assert fingerprint(out) != before
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_input_is_never_overwritten(tmp_path):
+    scene = copied(RING, tmp_path)
+    before = fingerprint(scene)
+    for target in (scene, scene / "sparse", scene / "sparse" / "0"):
+        refused(run("locate", scene / "sparse" / "0", target, "--overwrite"), 3)
+    assert fingerprint(scene) == before
+
+
+def broken_scenes(folder: Path):
+    """Yield (what is wrong, arguments after `locate`, exit code, a word of the message)."""
+
+    def scene(name, damage):
+        root = Path(shutil.copytree(RING, folder / name))
+        damage(root / "sparse" / "0", root / "database.db")
+        return root / "sparse" / "0"
+
+    def cut(file):
+        return lambda model, _: (model / file).write_bytes((model / file).read_bytes()[:-5])
+
+    def not_finite(model, _database):
+        rec = pycolmap.Reconstruction(model)
+        rotation = pycolmap.Rotation3d()
+        rec.frame(rec.image(2).frame_id).rig_from_world = pycolmap.Rigid3d(rotation, np.full(3, np.nan))
+        rec.write(model)
+
+    def without_poses(model, _database):
+        rec = pycolmap.Reconstruction(model)
+        for frame_id in list(rec.frames):
+            rec.deregister_frame(frame_id)
+        rec.write(model)
+
+    def no_pairs(_model, database):
+        execute(database, "DELETE FROM two_view_geometries")
+
+    def unusable_pairs(_model, database):
+        execute(database, "UPDATE two_view_geometries SET config = 7")
+
+    def other_scene(_model, database):
+        execute(database, "UPDATE images SET name = 'other/' || name")
+
+    def no_database(_model, database):
+        database.write_bytes(b"not a database" * 100)
+
+    yield "missing folder", [folder / "nowhere"], 3, "nowhere"
+    for file in ("cameras.bin", "images.bin", "points3D.bin", "frames.bin", "rigs.bin"):
+        yield f"cut {file}", [scene(f"cut-{file}", cut(file))], 3, file
+    yield "NaN in a pose", [scene("nan", not_finite)], 3, "finite"
+    yield "no rotations", [scene("unposed", without_poses)], 3, "pose"
+    yield "no pairs", [scene("pairless", no_pairs)], 4, "matches"
+    yield "only watermark pairs", [scene("watermark", unusable_pairs)], 4, "matches"
+    yield "database of another scene", [scene("other", other_scene)], 3, "not in the model"
+    yield "database is no database", [scene("text", no_database)], 3, "database"
+    missing = folder / "missing.db"
+    yield "database missing", [RING_MODEL, "--database", missing], 3, "missing.db"
+
+
+def execute(database, statement):
+    with sqlite3.connect(database) as connection:
+        connection.execute(statement)
+    connection.close()
+
+
+def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
+    (tmp_path / "scenes").mkdir()
+    for what, arguments, code, word in broken_scenes(tmp_path / "scenes"):
+        before = fingerprint(tmp_path)
+        model, *rest = arguments
+        result = run("locate", model, tmp_path / "out", *rest)
+        assert word in refused(result, code), what
+        assert fingerprint(tmp_path) == before, what
+        assert not (tmp_path / "out").exists(), what
+
+
+def test_a_database_in_use_is_read_and_left_alone(tmp_path):
+    scene = copied(RING, tmp_path)
+    writer = sqlite3.connect(scene / "database.db")
+    writer.execute("PRAGMA journal_mode = WAL")
+    writer.execute("UPDATE images SET name = name")
+    writer.commit()
+    before = fingerprint(scene)
+    assert {"database.db-wal", "database.db-shm"} <= set(before)
+    assert run("locate", scene / "sparse" / "0", tmp_path / "out", "-q").exit_code == 0
+    assert fingerprint(scene) == before
+    writer.close()
+
+
+def test_an_unwritable_place_is_refused_before_any_work(tmp_path):
+    (tmp_path / "file").write_text("in the way")
+    assert "not a folder" in refused(run("locate", RING_MODEL, tmp_path / "file" / "out"), 3)
+    assert "is a file" in refused(run("locate", RING_MODEL, tmp_path / "file"), 3)
+
+
+def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
+    from sfm_shapefit import results
+
+    def interrupted(*_arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(results, "write_csv", interrupted)
+    assert "interrupted" in refused(run("locate", RING_MODEL, tmp_path / "out"), 130)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_evaluate_prints_a_table_json_and_csv(ring_out, tmp_path):
+    table = run("evaluate", ring_out, RING_MODEL, "--threshold", "0.5", "--csv", tmp_path / "errors.csv")
+    assert table.exit_code == 0
+    assert "8 in common of 8" in table.stdout
+    errors = json.loads(run("evaluate", ring_out, RING_MODEL, "--json", "--threshold", "0.5").stdout)
+    assert errors["position_error"]["max"] < 1e-5
+    assert errors["recall"][-1] == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0}
+    lines = (tmp_path / "errors.csv").read_text().splitlines()
+    assert lines[0] == "name,position_error,rotation_error_deg,x,y,z"
+    assert len(lines) == 9
+
+
+def test_evaluate_refuses_models_without_common_cameras(tmp_path):
+    other = pycolmap.Reconstruction(RING_MODEL)
+    for image_id in list(other.images):
+        other.image(image_id).name = f"other{image_id}.jpg"
+    other.write(tmp_path)
+    refused(run("evaluate", RING_MODEL, tmp_path), 3)
+
+
+def test_synth_makes_a_workspace_that_locate_takes(tmp_path):
+    made = run("synth", tmp_path / "scene", "--shape", "ring", "--num-images", "12", "--seed", "3")
+    assert made.exit_code == 0
+    assert "12" in made.stdout
+    assert run("locate", tmp_path / "scene" / "sparse" / "0", tmp_path / "out", "-q").exit_code == 0
+    refused(run("synth", tmp_path / "scene"), 3)
+    assert run("synth", tmp_path / "other", "--num-images", "1").exit_code == 2
+
+
+def test_names_cannot_play_with_the_terminal(tmp_path):
+    model = pycolmap.Reconstruction(RING_MODEL)
+    model.image(8).name = "[red]\x1b[2Jgone.jpg"
+    model.write(tmp_path)
+    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db")
+    assert result.exit_code == 0
+    assert "\x1b[2J" not in result.output
+    assert "[red]" in result.stdout
+
+
+def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):
+    command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", "nowhere", str(tmp_path / "out")]
+    root = str(Path(__file__).parents[1])
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": root}
+    )
+    assert done.returncode == 3
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1

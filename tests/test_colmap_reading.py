@@ -1,0 +1,1000 @@
+"""COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
+
+import hashlib
+import itertools
+import os
+import shutil
+import sqlite3
+import struct
+import time
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit.colmap.check import check_model_files
+from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
+from sfm_shapefit.colmap.model import read_model, track_matches, world_rays
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import angle_between_deg, normalized
+
+EPS = np.finfo(np.float64).eps
+SHARED = Path(__file__).parents[1].parent / "shared" / "data"
+MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
+CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
+
+
+# --- scenes ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene() -> pycolmap.Reconstruction:
+    """Six posed images of two cameras around twelve points that all of them see, without noise."""
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 1, 3
+    options.num_points3D, options.num_points2D_without_point3D = 12, 2
+    return pycolmap.synthesize_dataset(options)
+
+
+@pytest.fixture
+def folder(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
+    """The scene as a binary model."""
+    path = tmp_path / "model"
+    path.mkdir()
+    scene.write_binary(path)
+    return path
+
+
+def digest(folder: Path) -> dict[str, str]:
+    """Hash every file below a folder, by name."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+NO_POINT = 2**64 - 1
+
+
+def tiny_model() -> dict[str, list]:
+    """A sound model of two images and two points as plain records; tests break one of them."""
+    return {
+        "cameras": [[1, 1, 640, 480, [500.0, 500.0, 320.0, 240.0]]],
+        "images": [
+            [1, IDENTITY_POSE, 1, b"a.jpg", [(1.0, 2.0, 7), (3.0, 4.0, NO_POINT)]],
+            [2, IDENTITY_POSE, 1, b"b.jpg", [(5.0, 6.0, 7)]],
+        ],
+        "points3D": [[7, (0.0, 0.0, 4.0), [(1, 0), (2, 0)]], [9, (0.0, 0.0, 5.0), []]],
+        "rigs": [[1, [(0, 1)]]],
+        "frames": [[1, 1, IDENTITY_POSE, [(0, 1, 1)]], [2, 1, IDENTITY_POSE, [(0, 1, 2)]]],
+    }
+
+
+def write_tiny(folder: Path, records: dict[str, list]) -> Path:
+    """Write records in COLMAP's binary layouts."""
+    folder.mkdir(exist_ok=True)
+    packed = {
+        "cameras": lambda i, m, w, h, p: struct.pack(f"<IiQQ{len(p)}d", i, m, w, h, *p),
+        "images": lambda i, pose, camera, name, points: (
+            struct.pack("<I7dI", i, *pose, camera)
+            + name
+            + b"\0"
+            + struct.pack("<Q", len(points))
+            + b"".join(struct.pack("<ddQ", *point) for point in points)
+        ),
+        "points3D": lambda i, xyz, track: (
+            struct.pack("<Q3d3BdQ", i, *xyz, 9, 9, 9, 0.5, len(track))
+            + b"".join(struct.pack("<II", *element) for element in track)
+        ),
+        "rigs": lambda i, sensors: (
+            struct.pack("<II", i, len(sensors))
+            + struct.pack("<iI", *sensors[0])
+            + b"".join(struct.pack("<iIB7d", *sensor, 1, *IDENTITY_POSE) for sensor in sensors[1:])
+        ),
+        "frames": lambda i, rig, pose, data: (
+            struct.pack("<II7dI", i, rig, *pose, len(data)) + b"".join(struct.pack("<iIQ", *d) for d in data)
+        ),
+    }
+    for name, rows in records.items():
+        body = b"".join(packed[name](*row) for row in rows)
+        (folder / f"{name}.bin").write_bytes(struct.pack("<Q", len(rows)) + body)
+    return folder
+
+
+# --- models that are sound -----------------------------------------------------------------------------
+
+
+def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_path):
+    text, legacy = tmp_path / "text", tmp_path / "legacy"
+    text.mkdir()
+    scene.write_text(text)
+    shutil.copytree(folder, legacy)
+    (legacy / "rigs.bin").unlink()
+    (legacy / "frames.bin").unlink()
+
+    models = [read_model(source) for source in (scene, folder, str(text), legacy)]
+
+    for model in models:
+        assert model.image_ids.tolist() == sorted(scene.images)
+        assert model.names == tuple(scene.image(i).name for i in sorted(scene.images))
+        for k, i in enumerate(model.image_ids.tolist()):
+            pose = scene.image(i).cam_from_world()
+            np.testing.assert_allclose(model.rotations[k], pose.rotation.matrix(), atol=8 * EPS)
+            np.testing.assert_allclose(
+                model.centers[k], scene.image(i).projection_center(), atol=64 * EPS * 5.0
+            )
+            assert model.focal_lengths_px[k] == 1280.0
+
+
+def test_the_tiny_model_of_these_tests_is_sound(tmp_path):
+    model = read_model(write_tiny(tmp_path / "m", tiny_model()))
+    assert model.names == ("a.jpg", "b.jpg")
+    assert not model.centers.any()  # all centres at the origin are fine
+
+
+def test_binary_files_win_over_text_files_in_the_same_folder(scene, folder):
+    for name in ("cameras", "images", "points3D"):
+        (folder / f"{name}.txt").write_text("not a model")
+    assert read_model(folder).num_images == scene.num_images()
+
+
+def test_poses_in_frames_win_over_those_in_images(tmp_path):
+    records = tiny_model()
+    records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
+    model = read_model(write_tiny(tmp_path / "m", records))
+    np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
+
+
+def test_a_model_without_points_is_read(tmp_path):
+    records = tiny_model()
+    records["points3D"] = []
+    for image in records["images"]:
+        image[4] = []
+    model = read_model(write_tiny(tmp_path / "m", records))
+    assert model.num_images == 2
+    assert list(track_matches(model, 1)) == []
+
+
+def test_images_without_a_pose_are_left_out(scene):
+    copy = pycolmap.Reconstruction(scene)
+    copy.deregister_frame(copy.image(3).frame_id)
+    assert 3 not in read_model(copy).image_ids
+
+
+def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
+    scene, folder, tmp_path, capfd
+):
+    before = digest(folder)
+    copy = pycolmap.Reconstruction(scene)
+    for source in (folder, copy):
+        list(track_matches(read_model(source), 1))
+    (tmp_path / "again").mkdir()
+    copy.write_binary(tmp_path / "again")
+    assert digest(folder) == before == digest(tmp_path / "again")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_arrays_of_a_model_are_read_only(scene):
+    with pytest.raises(ValueError, match="read-only"):
+        read_model(scene).rotations[0, 0, 0] = 2.0
+
+
+# --- models that are bad -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_a_binary_file_cut_at_any_byte_is_refused_at_once(tmp_path, name):
+    folder = write_tiny(tmp_path / "m", tiny_model())
+    check_model_files(folder)  # compiles the kernels, so that the clock below sees only the check
+    data = (folder / name).read_bytes()
+    for length in range(len(data)):
+        (folder / name).write_bytes(data[:length])
+        start = time.perf_counter()
+        with pytest.raises(InputError, match=rf"{name}: the file ends inside .* truncated"):
+            check_model_files(folder)
+        assert time.perf_counter() - start < 2.0  # it takes under a millisecond; a hang would not end
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
+    data = (folder / name).read_bytes()
+    rng = np.random.default_rng(MODEL_FILES.index(name))
+    refused = 0
+    for _ in range(60):
+        changed = bytearray(data)
+        changed[int(rng.integers(len(data)))] ^= int(rng.integers(1, 256))
+        (folder / name).write_bytes(changed)
+        try:
+            check_model_files(folder)
+        except InputError:
+            refused += 1
+    assert refused > 5  # most bytes of a model are digits of floats, where a change is a sound model
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+@pytest.mark.parametrize("count", [2**63, 2**64 - 1, 10**6])
+def test_an_absurd_count_is_refused(folder, name, count):
+    data = (folder / name).read_bytes()
+    (folder / name).write_bytes(struct.pack("<Q", count) + data[8:])
+    with pytest.raises(InputError, match=rf"{name}.*truncated"):
+        check_model_files(folder)
+
+
+@pytest.mark.parametrize("name", MODEL_FILES)
+def test_bytes_after_the_last_record_are_refused(folder, name):
+    with (folder / name).open("ab") as stream:
+        stream.write(b"\0")
+    with pytest.raises(InputError, match=rf"{name}: 1 bytes follow"):
+        check_model_files(folder)
+
+
+def _set(*path_and_value):
+    """Return a function that sets one nested entry of the tiny model's records."""
+    *path, last, value = path_and_value
+
+    def change(records):
+        for key in path:
+            records = records[key]
+        records[last] = value
+
+    return change
+
+
+def _append(name, record):
+    return lambda records: records[name].append(record)
+
+
+NAN, INF = float("nan"), float("inf")
+BROKEN_RECORDS = {
+    "unknown camera model": (_set("cameras", 0, 1, 99), "camera 1 has the unknown camera model 99"),
+    "NaN parameter": (_set("cameras", 0, 4, [NAN, 1.0, 1.0, 1.0]), "camera 1 has a parameter that is not"),
+    "camera twice": (_append("cameras", [1, 0, 9, 9, [1.0, 1.0, 1.0]]), "camera 1 stands twice"),
+    "NaN pose": (_set("images", 1, 1, (1.0, 0, 0, 0, NAN, 0, 0)), "image 2 has a pose that is not finite"),
+    "zero rotation": (_set("images", 1, 1, (0.0,) * 7), "image 2 has a rotation quaternion of norm 0 "),
+    "long rotation": (
+        _set("images", 1, 1, (2.0, *(0.0,) * 6)),
+        "image 2 has a rotation quaternion of norm 2 ",
+    ),
+    "no camera": (_set("images", 1, 2, 5), "image 2 refers to camera 5"),
+    "no name": (_set("images", 1, 3, b""), "image 2 has no name"),
+    "name twice": (_set("images", 1, 3, b"a.jpg"), r"image 2 \(a.jpg\) stands twice"),
+    "image twice": (_set("images", 1, 0, 1), r"image 1 \(b.jpg\) stands twice"),
+    "NaN pixel": (_set("images", 1, 4, [(5.0, NAN, 7)]), "image 2 has a point whose coordinates are not"),
+    "no such point": (_set("images", 1, 4, [(5.0, 6.0, 8)]), "an image observes 3D point 8"),
+    "NaN point": (_set("points3D", 0, 1, (0.0, NAN, 1.0)), "3D point 7 has coordinates that are not finite"),
+    "infinite point": (_set("points3D", 0, 1, (-INF, 0.0, 1.0)), "3D point 7 has coordinates that are not"),
+    "point twice": (_append("points3D", [7, (0.0, 0.0, 1.0), []]), "3D point 7 stands twice"),
+    "track of no image": (_set("points3D", 0, 2, [(1, 0), (9, 0)]), "refers to point 0 of image 9"),
+    "track of no pixel": (_set("points3D", 0, 2, [(1, 0), (2, 1)]), "refers to point 1 of image 2"),
+    "rig of no camera": (_set("rigs", 0, 1, [(0, 4)]), "rig 1 refers to camera 4"),
+    "rig twice": (_append("rigs", [1, [(0, 1)]]), "rig 1 stands twice"),
+    "sensor twice": (_set("rigs", 0, 1, [(0, 1), (0, 1)]), "rig 1 has a sensor that stands twice"),
+    "frame twice": (_set("frames", 1, 0, 1), "frame 1 stands twice"),
+    "frame of no rig": (_set("frames", 1, 1, 6), "frame 2 refers to rig 6"),
+    "NaN frame": (_set("frames", 1, 2, (1.0, 0, 0, 0, 0, 0, INF)), "frame 2 has a pose that is not finite"),
+    "frame of no sensor": (_set("frames", 1, 3, [(0, 3, 2)]), "frame 2 refers to sensor 3"),
+    "frame of no image": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 5)]), "a frame refers to image 5"),
+    "image in two frames": (_set("frames", 1, 3, [(0, 1, 2), (0, 1, 1)]), "image 1 stands in two frames"),
+    "image in no frame": (_set("frames", 1, 3, []), "image 2 of images.bin is in no frame"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN_RECORDS)
+def test_a_broken_record_is_named(tmp_path, case):
+    change, message = BROKEN_RECORDS[case]
+    records = tiny_model()
+    change(records)
+    with pytest.raises(InputError, match=message):
+        read_model(write_tiny(tmp_path / "m", records))
+
+
+TEXT_MODEL = {
+    "cameras": "# a comment\n1 PINHOLE 640 480 500 500 320 240\n",
+    "images": "1 1 0 0 0 0 0 0 1 a.jpg\n1 2 7 3 4 -1\n2 1 0 0 0 0 0 0 1 b.jpg\n5 6 7\n",
+    "points3D": "7 0 0 4 9 9 9 0.5 1 0 2 0\n",
+}
+BROKEN_LINES = {
+    "unknown model": ("cameras", "PINHOLE", "PINHOLA", r"cameras.txt:2: expected"),
+    "parameter count": ("cameras", " 240", "", r"cameras.txt:2: PINHOLE has 4 parameters, but 3"),
+    "NaN parameter": ("cameras", "320", "nan", r"cameras.txt:2: the camera holds a number that is not fin"),
+    "name with a space": ("images", "b.jpg", "b 1.jpg", r"images.txt:3: .*a name with spaces"),
+    "NaN pose": ("images", "2 1 0 0 0 0", "2 1 0 0 0 inf", r"images.txt:3: the pose holds a number that"),
+    "not a number": ("images", "2 1 0 0 0 0", "2 1 0 0 0 x", r"images.txt:3: the pose holds something"),
+    "zero rotation": (
+        "images",
+        "2 1 0",
+        "2 0 0",
+        r"images.txt:3: image 2 has a rotation quaternion of norm 0",
+    ),
+    "name twice": ("images", "b.jpg", "a.jpg", r"images.txt:3: the name a.jpg stands in line 1"),
+    "line missing": ("images", "5 6 7\n", "", r"images.txt:3: the line of its points is missing"),
+    "no triples": ("images", "5 6 7", "5 6", r"images.txt:4: expected triples"),
+    "NaN pixel": ("images", "5 6 7", "nan 6 7", r"images.txt:4: a point holds a number that is not finite"),
+    "NaN point": ("points3D", "0 0 4", "0 nan 4", r"points3D.txt:1: the 3D point holds a number that is not"),
+    "odd track": ("points3D", " 2 0", " 2", r"points3D.txt:1: expected"),
+    "unknown point": ("images", "3 4 -1", "3 4 99", r"refers to an image, a frame or a 3D point that it"),
+    "other point": ("images", "5 6 7", "5 6 8", r"cannot be read as a COLMAP model"),
+    "unknown camera": ("images", "1 b.jpg", "4 b.jpg", r"cannot be read as a COLMAP model"),
+    "image twice": ("images", "2 1 0", "1 1 0", r"cannot be read as a COLMAP model"),
+    "no such pixel": ("points3D", " 2 0", " 2 9", r"cannot be read as a COLMAP model"),
+}
+
+
+def write_text_model(folder: Path, **changed: str) -> Path:
+    folder.mkdir(exist_ok=True)
+    for name, text in {**TEXT_MODEL, **changed}.items():
+        (folder / f"{name}.txt").write_text(text)
+    return folder
+
+
+def test_a_text_model_with_comments_and_windows_line_ends_is_read(tmp_path):
+    changed = {name: text.replace("\n", "\r\n") for name, text in TEXT_MODEL.items()}
+    assert read_model(write_text_model(tmp_path / "m", **changed)).names == ("a.jpg", "b.jpg")
+
+
+@pytest.mark.parametrize("case", BROKEN_LINES)
+def test_a_broken_line_of_a_text_model_is_named(tmp_path, case):
+    name, old, new, message = BROKEN_LINES[case]
+    assert old in TEXT_MODEL[name]
+    changed = new.join(TEXT_MODEL[name].rsplit(old, 1))
+    with pytest.raises(InputError, match=message):
+        read_model(write_text_model(tmp_path / "m", **{name: changed}))
+
+
+def test_a_folder_that_is_no_model_is_refused_with_advice(folder, tmp_path):
+    (folder / "points3D.bin").rename(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match=r"lacks points3D\.bin"):
+        read_model(folder)
+    with pytest.raises(InputError, match="does not exist"):
+        read_model(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="is a file"):
+        read_model(folder / "cameras.bin")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match="holds no COLMAP model; give the folder with"):
+        read_model(tmp_path / "empty")
+
+
+@pytest.mark.parametrize("inner", ["0", "sparse/0"])
+def test_the_folder_that_was_meant_is_suggested(tmp_path, inner):
+    (tmp_path / inner).mkdir(parents=True)
+    write_tiny(tmp_path / inner, tiny_model())
+    with pytest.raises(InputError, match=rf"but {tmp_path / inner} does"):
+        read_model(tmp_path)
+
+
+@pytest.mark.parametrize(("there", "missing"), [("rigs", "frames"), ("frames", "rigs")])
+def test_rigs_and_frames_come_together(folder, there, missing):
+    (folder / f"{missing}.bin").unlink()
+    with pytest.raises(InputError, match=rf"has {there}\.bin but no {missing}\.bin"):
+        read_model(folder)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_a_file_that_may_not_be_read_is_refused(folder):
+    (folder / "images.bin").chmod(0)
+    with pytest.raises(InputError, match=r"images\.bin cannot be read: Permission denied"):
+        read_model(folder)
+
+
+def test_a_folder_in_place_of_a_file_is_refused(folder):
+    (folder / "images.bin").unlink()
+    (folder / "images.bin").mkdir()
+    with pytest.raises(InputError, match=r"images\.bin cannot be read: Is a directory"):
+        read_model(folder)
+
+
+def test_fewer_than_two_posed_images_are_refused(tmp_path):
+    records = tiny_model()
+    records["points3D"], records["images"], records["frames"] = (
+        [],
+        records["images"][:1],
+        records["frames"][:1],
+    )
+    records["images"][0][4] = []
+    with pytest.raises(InputError, match="has 1 images with a pose"):
+        read_model(write_tiny(tmp_path / "one", records))
+    with pytest.raises(InputError, match="has 0 images with a pose"):
+        read_model(pycolmap.Reconstruction())
+
+
+def test_values_that_are_not_finite_are_refused_in_memory(scene):
+    def changed(change):
+        copy = pycolmap.Reconstruction(scene)
+        change(copy)
+        return copy
+
+    def nan_pose(rec):
+        rotation = rec.frame(2).rig_from_world.rotation
+        rec.frame(2).rig_from_world = pycolmap.Rigid3d(rotation, np.array([0.0, NAN, 0.0]))
+
+    def nan_rotation(rec):
+        rec.frame(2).rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(np.full(4, NAN)), np.zeros(3))
+
+    def nan_point(rec):
+        rec.point3D(1).xyz = np.array([NAN, 0.0, 0.0])
+
+    def nan_pixel(rec):
+        rec.image(2).points2D[0].xy = np.array([NAN, 0.0])
+
+    def nan_focal(rec):
+        rec.camera(1).params = np.array([INF, 1.0, 1.0, 0.0])
+
+    def no_focal(rec):
+        rec.camera(1).params = np.array([0.0, 1.0, 1.0, 0.0])
+
+    for change, message in (
+        (nan_pose, "position of image 2 is not finite"),
+        (nan_rotation, "image 2 has no valid rotation"),
+        (nan_point, "3D point 1 is not finite"),
+        (nan_pixel, "image 2 has a point"),
+        (nan_focal, "camera 1 is not finite"),
+        (no_focal, "camera 1 has focal length 0 px"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_model(changed(change))
+
+
+def test_a_rig_of_two_cameras_is_refused_as_not_supported_yet():
+    pycolmap.set_random_seed(2)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 1, 2, 2
+    options.num_points3D = 5
+    with pytest.raises(InputError, match="rig with several sensors, which is not supported yet"):
+        read_model(pycolmap.synthesize_dataset(options))
+
+
+@pytest.mark.parametrize(
+    "frames",
+    {
+        "an image of the second camera": [
+            [1, 1, IDENTITY_POSE, [(0, 1, 1)]],
+            [2, 1, IDENTITY_POSE, [(0, 2, 2)]],
+        ],
+        "two images in a frame": [[1, 1, IDENTITY_POSE, [(0, 1, 1), (0, 2, 2)]]],
+    }.items(),
+    ids=lambda item: item[0],
+)
+def test_a_rig_is_refused_as_soon_as_one_image_is_not_its_frame_alone(tmp_path, frames):
+    records = tiny_model()
+    records["cameras"].append([2, *records["cameras"][0][1:]])
+    records["images"][1][2] = 2
+    records["rigs"] = [[1, [(0, 1), (0, 2)]]]
+    records["frames"] = frames[1]
+    with pytest.raises(InputError, match="rig with several sensors, which is not supported yet"):
+        read_model(write_tiny(tmp_path / "m", records))
+
+
+# --- rays and tracks ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("camera_model", CAMERA_MODELS)
+def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_id(
+        1, pycolmap.CameraModelId.__members__[camera_model], 500.0, 640, 480
+    )
+    info = [name.strip() for name in camera.params_info.split(",")]
+    distortion = {"k", "k1", "k2", "k0", "p1", "p2", "sx1", "s0", "omega"} & set(info)
+    camera.params = [
+        value + (0.01 if name in distortion else 0.0) for name, value in zip(info, camera.params, strict=True)
+    ]
+    reconstruction.add_camera_with_trivial_rig(camera)
+    rng = np.random.default_rng(CAMERA_MODELS.index(camera_model))
+    for i in (1, 2):
+        image = pycolmap.Image(name=f"{i}.jpg", camera_id=1, image_id=i)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(normalized(rng.normal(size=4))), rng.normal(size=3))
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    model = read_model(reconstruction)
+    xy = rng.uniform([20.0, 20.0], [620.0, 460.0], size=(50, 2))
+
+    rays = world_rays(model, 1, xy)
+
+    np.testing.assert_allclose(np.linalg.norm(rays, axis=1), 1.0, atol=8 * EPS)
+    back = np.array([camera.img_from_cam(model.rotations[1] @ ray) for ray in rays])
+    np.testing.assert_allclose(
+        back, xy, atol=1e-6
+    )  # undistortion iterates to about 1e-10 of the focal length
+    assert model.focal_lengths_px[1] == pytest.approx(
+        640 / (2 * np.pi) if camera_model == "EQUIRECTANGULAR" else 500.0
+    )
+    assert world_rays(model, 0, np.zeros((0, 2))).shape == (0, 3)
+
+
+def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], set[tuple[int, int]]]:
+    """Matches between images (by index) from the tracks, one observation pair at a time."""
+    index = {i: k for k, i in enumerate(sorted(scene.images))}
+    matches: dict[tuple[int, int], set[tuple[int, int]]] = {}
+    for point in scene.points3D.values():
+        seen = [(index[e.image_id], e.point2D_idx) for e in point.track.elements]
+        once = sorted(o for o in seen if sum(o[0] == other[0] for other in seen) == 1)
+        for (i, a), (j, b) in itertools.combinations(once, 2):
+            matches.setdefault((i, j), set()).add((a, b))
+    return matches
+
+
+def as_sets(batches) -> dict[tuple[int, int], set[tuple[int, int]]]:
+    """Matches of batches by pair; checks that no match and no pair stands twice."""
+    found = {}
+    for batch in batches:
+        assert batch.offsets[0] == 0
+        assert batch.offsets[-1] == len(batch.keypoints) == len(batch.rays_i) == len(batch.rays_j)
+        for p, (i, j) in enumerate(batch.pairs.tolist()):
+            rows = batch.keypoints[batch.offsets[p] : batch.offsets[p + 1]].tolist()
+            assert i < j
+            assert (i, j) not in found
+            found[i, j] = set(map(tuple, rows))
+            assert len(found[i, j]) == len(rows)
+    return found
+
+
+def thinned(scene: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+    """A copy whose images see different subsets of the points, one of them twice in image 1."""
+    copy = pycolmap.Reconstruction(scene)
+    rng = np.random.default_rng(3)
+    for point_id in sorted(copy.points3D):
+        elements = [(e.image_id, e.point2D_idx) for e in copy.point3D(point_id).track.elements]
+        for k in rng.choice(6, size=int(rng.integers(0, 4)), replace=False):
+            copy.delete_observation(*elements[k])
+    free = next(k for k, p in enumerate(copy.image(1).points2D) if not p.has_point3D())
+    twice = next(p.point3D_id for p in copy.image(1).points2D if p.has_point3D())
+    copy.add_observation(twice, pycolmap.TrackElement(1, free))
+    return copy
+
+
+@pytest.mark.parametrize("min_matches", [1, 6])
+@pytest.mark.parametrize("limit", [1, 20, 10**6])
+def test_track_matches_are_those_of_a_plain_loop_whatever_the_batch_size(scene, min_matches, limit):
+    copy = thinned(scene)
+    expected = {pair: m for pair, m in brute_force_tracks(copy).items() if len(m) >= min_matches}
+    found = as_sets(track_matches(read_model(copy), min_matches, limit))
+    assert found == expected
+    assert list(found) == sorted(found)
+    assert len(expected) == {1: 15, 6: 12}[min_matches]  # so that the limit leaves some out
+
+
+def test_track_matches_carry_the_rays_of_their_keypoints(scene):
+    model = read_model(scene)
+    (batch,) = track_matches(model, 1)
+    for p, (i, j) in enumerate(batch.pairs.tolist()):
+        rows = slice(batch.offsets[p], batch.offsets[p + 1])
+        for side, (image, rays) in enumerate(((i, batch.rays_i), (j, batch.rays_j))):
+            points = scene.image(int(model.image_ids[image])).points2D
+            ids = [points[int(k)].point3D_id for k in batch.keypoints[rows, side]]
+            truth = normalized(np.array([scene.point3D(q).xyz for q in ids]) - model.centers[image])
+            # exact projections; undistorting the pixel iterates to about 1e-10
+            assert angle_between_deg(rays[rows], truth).max() < 1e-6
+
+
+# --- databases ---------------------------------------------------------------------------------------
+
+SCHEMA = """
+CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, model INTEGER, params BLOB);
+CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT UNIQUE, camera_id INTEGER);
+CREATE TABLE keypoints (image_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB);
+CREATE TABLE two_view_geometries (pair_id INTEGER PRIMARY KEY, rows INTEGER, cols INTEGER, data BLOB,
+                                  config INTEGER, F BLOB, E BLOB, H BLOB, qvec BLOB, tvec BLOB);
+"""
+
+
+def pair_id(a: int, b: int) -> int:
+    return MAX_NUM_IMAGES * a + b
+
+
+def write_database(path: Path, scene: pycolmap.Reconstruction, id_of=lambda i: i, cols: int = 6) -> Path:
+    """Write the scene's keypoints, matches and exact relative poses, with ids renamed by `id_of`."""
+    connection = sqlite3.connect(path)
+    connection.executescript(SCHEMA)
+    for i, image in scene.images.items():
+        xy = np.zeros((len(image.points2D), cols), dtype="<f4")
+        xy[:, :2] = [p.xy for p in image.points2D]
+        connection.execute("INSERT INTO images VALUES (?, ?, 1)", (id_of(i), image.name))
+        connection.execute("INSERT INTO keypoints VALUES (?, ?, ?, ?)", (id_of(i), *xy.shape, xy.tobytes()))
+    ids = sorted(scene.images, key=id_of)
+    for a, b in itertools.combinations(ids, 2):
+        of_point = {p.point3D_id: k for k, p in enumerate(scene.image(b).points2D) if p.has_point3D()}
+        rows = [
+            (k, of_point[p.point3D_id])
+            for k, p in enumerate(scene.image(a).points2D)
+            if p.has_point3D() and p.point3D_id in of_point
+        ]
+        pose = scene.image(b).cam_from_world() * scene.image(a).cam_from_world().inverse()
+        add_pair(connection, id_of(a), id_of(b), rows, pose=pose)
+    connection.commit()
+    connection.close()
+    return path
+
+
+def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=None) -> None:
+    """Insert or replace one row of two_view_geometries."""
+    if pose is not None:
+        qvec, tvec = pose.rotation.quat[[3, 0, 1, 2]].tobytes(), pose.translation.tobytes()
+    data = np.array(rows, dtype="<u4").reshape(-1, 2).tobytes()
+    connection.execute(
+        "INSERT OR REPLACE INTO two_view_geometries VALUES (?, ?, 2, ?, ?, NULL, NULL, NULL, ?, ?)",
+        (pair_id(a, b), len(rows), data, config, qvec, tvec),
+    )
+
+
+def edited(path: Path, *statements) -> Path:
+    """Run SQL on a database that a test owns."""
+    connection = sqlite3.connect(path)
+    for statement in statements:
+        if callable(statement):
+            statement(connection)
+        else:
+            connection.execute(*statement) if isinstance(statement, tuple) else connection.execute(statement)
+    connection.commit()
+    connection.close()
+    return path
+
+
+def read_all(path: Path, model):
+    """Read everything a database offers."""
+    with open_database(path, model) as database:
+        return as_sets(database.iter_matches(1)), database.relative_poses()
+
+
+ID_ORDERS = {"same ids": lambda i: i, "reversed ids": lambda i: 100 - i, "mixed ids": lambda i: i * 5 % 7}
+
+
+@pytest.mark.parametrize("order", ID_ORDERS)
+@pytest.mark.parametrize("cols", [2, 4, 6])
+def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols):
+    thin = thinned(scene)
+    model = read_model(thin)
+    path = write_database(tmp_path / "d.db", thin, ID_ORDERS[order], cols)
+    with open_database(path, model) as database:
+        found = as_sets(database.iter_matches(1))
+        assert database.unmatched_names == ()
+        assert database.num_pairs == len(found)
+        assert database.num_matches == sum(map(len, found.values()))
+        for k, i in enumerate(model.image_ids.tolist()):
+            xy = np.array([p.xy for p in thin.image(i).points2D])
+            np.testing.assert_array_equal(database.keypoints(k), xy.astype(np.float32))
+    twice = {(i, j) for i, j in found if i == 0}  # image 1 sees one point twice, which a database may say
+    expected = brute_force_tracks(thin)
+    assert list(found) == sorted(found)
+    assert {p: m for p, m in found.items() if p not in twice} == {
+        p: m for p, m in expected.items() if p not in twice
+    }
+    assert all(found[p] >= expected[p] for p in twice)
+
+
+@pytest.mark.parametrize("order", ID_ORDERS)
+def test_relative_poses_point_from_camera_j_to_camera_i(scene, tmp_path, order):
+    model = read_model(scene)
+    _, poses = read_all(write_database(tmp_path / "d.db", scene, ID_ORDERS[order]), model)
+    assert poses.pairs.tolist() == [list(pair) for pair in itertools.combinations(range(6), 2)]
+    i, j = poses.pairs.T
+    directions = np.einsum("nji,nj->ni", model.rotations[j], poses.translations)  # R_j^T t_ij
+    truth = normalized(model.centers[i] - model.centers[j])
+    np.testing.assert_allclose(directions, truth, atol=256 * EPS)
+    np.testing.assert_allclose(
+        poses.rotations, model.rotations[j] @ model.rotations[i].transpose(0, 2, 1), atol=64 * EPS
+    )
+    assert poses.configs.tolist() == [2] * 15
+    assert poses.num_inliers.tolist() == [12] * 15
+
+
+def test_rays_of_database_matches_are_those_of_its_keypoints(scene, tmp_path):
+    model = read_model(scene)
+    path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
+    for cache_bytes in (0, 10**6):
+        with open_database(path, model, cache_bytes=cache_bytes) as database:
+            (batch,) = database.iter_matches(1)
+            for p, (i, j) in enumerate(batch.pairs.tolist()):
+                rows = slice(batch.offsets[p], batch.offsets[p + 1])
+                kept_i, kept_j = batch.keypoints[rows].T
+                np.testing.assert_array_equal(
+                    batch.rays_i[rows], world_rays(model, i, database.keypoints(i))[kept_i]
+                )
+                np.testing.assert_array_equal(
+                    batch.rays_j[rows], world_rays(model, j, database.keypoints(j))[kept_j]
+                )
+
+
+@pytest.mark.parametrize("limit", [1, 12, 30, 10**6])
+def test_batches_of_any_size_join_to_the_same_matches(scene, tmp_path, limit):
+    model = read_model(scene)
+    with open_database(write_database(tmp_path / "d.db", scene), model) as database:
+        batches = list(database.iter_matches(1, limit))
+        (whole,) = database.iter_matches(1)
+    assert all(len(batch.keypoints) <= max(limit, 12) for batch in batches)
+    assert len(batches) == -(-15 // max(limit // 12, 1))
+    np.testing.assert_array_equal(np.concatenate([batch.pairs for batch in batches]), whole.pairs)
+    np.testing.assert_array_equal(np.concatenate([batch.rays_j for batch in batches]), whole.rays_j)
+
+
+def test_repeated_matches_count_once_and_thin_pairs_are_left_out(scene, tmp_path):
+    def change(connection):
+        add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
+        add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
+
+    path = edited(write_database(tmp_path / "d.db", scene), change)
+    with open_database(path, read_model(scene)) as database:
+        batch = next(database.iter_matches(3))
+    assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
+    assert batch.keypoints[:3].tolist() == [[3, 4], [0, 1], [3, 5]]
+
+
+def test_only_configurations_with_verified_matches_or_poses_are_used(scene, tmp_path):
+    pairs = list(itertools.combinations(range(1, 6), 2))  # ten pairs, one per configuration
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 2.0]))
+
+    def change(connection):
+        connection.execute("DELETE FROM two_view_geometries")
+        for config, (a, b) in enumerate(pairs):
+            add_pair(connection, a, b, [(0, 0), (1, 1)], config=config, pose=pose)
+
+    matches, poses = read_all(edited(write_database(tmp_path / "d.db", scene), change), read_model(scene))
+    config_of = {(a - 1, b - 1): config for config, (a, b) in enumerate(pairs)}
+    assert [config_of[pair] for pair in matches] == [2, 3, 4, 5, 6, 8, 9]
+    assert poses.configs.tolist() == [2, 3, 4, 6, 9]
+    np.testing.assert_array_equal(poses.translations, [[0.0, 0.0, 1.0]] * 5)
+
+
+def test_poses_that_mean_none_are_left_out(scene, tmp_path):
+    def blob(*values):
+        return np.array(values, dtype="<f8").tobytes()
+
+    one, none = blob(1.0, 0.0, 0.0, 0.0), blob(0.0, 0.0, 0.0)
+    step = blob(0.1, 0.0, 0.0)
+    absent = [
+        (None, None), (one, None), (None, step), (one, none), (blob(0, 0, 0, 0), step),
+        (blob(0.6, 0.8, 0, 0), none), (blob(NAN, 0, 0, 1), step), (one, blob(1, INF, 0)),
+        (one, blob(1e200, 1e200, 0)),
+    ]  # fmt: skip
+
+    def change(connection):
+        connection.execute("DELETE FROM two_view_geometries")
+        pairs = itertools.combinations(range(1, 7), 2)
+        for (qvec, tvec), (a, b) in zip([*absent, (one, step)], pairs, strict=False):
+            add_pair(connection, a, b, [(0, 0)], qvec=qvec, tvec=tvec)
+
+    matches, poses = read_all(edited(write_database(tmp_path / "d.db", scene), change), read_model(scene))
+    assert len(matches) == len(absent) + 1
+    assert len(poses.pairs) == 1
+    np.testing.assert_array_equal(poses.translations, [[1.0, 0.0, 0.0]])
+
+
+def test_an_old_database_without_pose_columns_has_no_relative_poses(scene, tmp_path):
+    path = edited(
+        write_database(tmp_path / "d.db", scene),
+        "ALTER TABLE two_view_geometries DROP COLUMN qvec",
+        "ALTER TABLE two_view_geometries DROP COLUMN tvec",
+        "DROP TABLE cameras",
+    )
+    matches, poses = read_all(path, read_model(scene))
+    assert len(matches) == 15
+    assert poses.pairs.shape == (0, 2)
+    assert poses.rotations.shape == (0, 3, 3)
+
+
+def test_a_database_of_pycolmap_is_read(tmp_path):
+    pycolmap.set_random_seed(4)
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_rigs, options.num_frames_per_rig, options.num_points3D = 1, 4, 20
+    options.two_view_geometry_has_relative_pose = True
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        scene = pycolmap.synthesize_dataset(options, database)
+    model = read_model(scene)
+    matches, poses = read_all(tmp_path / "database.db", model)
+    # In its database every pair of keypoints is a match of one point; the points2D carry the same order.
+    assert matches == brute_force_tracks(scene)
+    i, j = poses.pairs.T
+    directions = np.einsum("nji,nj->ni", model.rotations[j], poses.translations)
+    np.testing.assert_allclose(directions, normalized(model.centers[i] - model.centers[j]), atol=256 * EPS)
+
+
+def test_images_that_only_one_side_has_are_named_or_skipped(scene, tmp_path):
+    path = edited(
+        write_database(tmp_path / "d.db", scene),
+        "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)",
+    )
+    model = read_model(scene)
+    with open_database(path, model) as database:
+        assert database.unmatched_names == (model.names[1],)
+        assert database.keypoints(1).shape == (0, 2)
+        assert not any(1 in pair for pair in as_sets(database.iter_matches(1)))
+        assert database.num_pairs == 10
+
+
+def test_a_database_of_another_scene_is_explained_by_one_name_of_each(scene, tmp_path):
+    path = edited(write_database(tmp_path / "d.db", scene), "UPDATE images SET name = 'other/' || name")
+    model = read_model(scene)
+    message = (
+        rf"has 0 of the model's 6 images: the model's {model.names[0]} .*database's other/.*not in the model"
+    )
+    with pytest.raises(InputError, match=message), open_database(path, model):
+        pass
+
+
+# --- databases that are bad --------------------------------------------------------------------------
+
+GEOMETRY = "UPDATE two_view_geometries SET "
+FIRST = f" WHERE pair_id = {pair_id(1, 2)}"
+BROKEN_ROWS = {
+    "short matches": (
+        f"{GEOMETRY} data = x'00' {FIRST}",
+        "pair camera.* and camera.* has matches of wrong le",
+    ),
+    "no matches": (f"{GEOMETRY} data = NULL", "matches of wrong length"),
+    "three columns": (f"{GEOMETRY} cols = 3", "matches of wrong length"),
+    "huge rows": (f"{GEOMETRY} rows = {2**62}", "matches of wrong length"),
+    "rows as text": (f"{GEOMETRY} rows = 'many'", "pair 2147483649 is damaged"),
+    "negative pair": (f"{GEOMETRY} pair_id = -pair_id", "pair -.* is damaged"),
+    "unknown image": (f"{GEOMETRY} pair_id = {pair_id(1, 77)} {FIRST}", "joins the images with ids 1 and 77"),
+    "own image": (f"{GEOMETRY} pair_id = {pair_id(2, 2)} {FIRST}", "joins the images with ids 2 and 2"),
+    "short pose": (f"{GEOMETRY} qvec = x'00'", "a relative pose of wrong length"),
+    "text pose": (f"{GEOMETRY} tvec = 'north'", "a relative pose of wrong length"),
+    "few keypoints": (
+        "UPDATE keypoints SET rows = 3, data = substr(data, 1, 72) WHERE image_id = 2",
+        "has matches of keypoints that do not exist",
+    ),
+    "no keypoints": ("DELETE FROM keypoints", "has matches of keypoints that do not exist"),
+    "short keypoints": ("UPDATE keypoints SET data = substr(data, 2)", "keypoints of image .* are damaged"),
+    "three per keypoint": ("UPDATE keypoints SET cols = 3, rows = rows * 2", "keypoints of image .* are dam"),
+    "NaN keypoint": (
+        "UPDATE keypoints SET data = CAST(x'0000c07f' || substr(data, 5) AS BLOB)",
+        "not finite",
+    ),
+    "no table": ("DROP TABLE keypoints", "has no table keypoints"),
+    "no column": ("ALTER TABLE two_view_geometries DROP COLUMN config", "no column config in its table two_"),
+    "no images": ("DELETE FROM images", "has no images"),
+    "no name": ("UPDATE images SET name = NULL WHERE image_id = 3", "id 3 has no valid id and name"),
+    "bad id": (f"UPDATE images SET image_id = {MAX_NUM_IMAGES} WHERE image_id = 3", "no valid id and name"),
+}
+
+
+@pytest.mark.parametrize("case", BROKEN_ROWS)
+def test_a_broken_row_is_named(scene, tmp_path, case):
+    statement, message = BROKEN_ROWS[case]
+    path = edited(write_database(tmp_path / "d.db", scene), statement)
+    with pytest.raises(InputError, match=message) as caught:
+        read_all(path, read_model(scene))
+    assert str(path) in str(caught.value)
+
+
+def test_files_that_are_no_database_are_refused(scene, tmp_path):
+    model = read_model(scene)
+    (tmp_path / "empty").touch()
+    (tmp_path / "garbage").write_bytes(bytes(range(256)) * 40)
+    edited(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
+    for name, message in (
+        ("missing", "does not exist"),
+        (".", "is a folder"),
+        ("empty", "is empty"),
+        ("garbage", "is not a COLMAP database"),
+        ("other", "is not a COLMAP database: it has no table images"),
+    ):
+        with pytest.raises(InputError, match=message), open_database(tmp_path / name, model):
+            pass
+    assert sorted(os.listdir(tmp_path)) == ["empty", "garbage", "other"]
+
+
+def test_a_truncated_database_is_an_input_error_at_any_length(scene, tmp_path):
+    model = read_model(scene)
+    data = write_database(tmp_path / "d.db", scene).read_bytes()
+    for length in np.linspace(1, len(data) - 1, 60).astype(int).tolist():
+        (tmp_path / "cut.db").write_bytes(data[:length])
+        with pytest.raises(InputError, match=r"cut\.db"):
+            read_all(tmp_path / "cut.db", model)
+
+
+def test_a_locked_database_is_refused_in_seconds(scene, tmp_path):
+    path = write_database(tmp_path / "d.db", scene)
+    writer = sqlite3.connect(path, isolation_level=None)
+    writer.execute("BEGIN EXCLUSIVE")
+    with pytest.raises(InputError, match="locked by another program"), open_database(path, read_model(scene)):
+        pass
+    writer.close()
+
+
+# --- databases are never changed ---------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("journal_mode", ["delete", "wal", "persist", "truncate"])
+def test_reading_changes_no_byte_and_leaves_no_file(scene, tmp_path, journal_mode):
+    path = write_database(tmp_path / "d.db", scene)
+    edited(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
+    before = digest(tmp_path)
+    matches, _ = read_all(path, read_model(scene))
+    assert len(matches) == 15
+    assert digest(tmp_path) == before
+
+
+def test_rows_that_sit_in_a_wal_file_are_read_and_the_file_is_kept(scene, tmp_path):
+    path = write_database(tmp_path / "d.db", scene)
+    writer = sqlite3.connect(path, isolation_level=None)
+    writer.execute("PRAGMA journal_mode = wal")
+    writer.execute("PRAGMA wal_autocheckpoint = 0")
+    writer.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id(1, 2),))
+    before = digest(tmp_path)
+    assert set(before) == {"d.db", "d.db-wal", "d.db-shm"}
+
+    matches, _ = read_all(path, read_model(scene))
+
+    assert (0, 1) not in matches
+    assert len(matches) == 14
+    assert digest(tmp_path) == before
+    writer.close()
+
+
+def test_a_wal_file_left_by_a_crash_is_read_without_its_shm(scene, tmp_path):
+    work, crashed = tmp_path / "work", tmp_path / "crashed"
+    work.mkdir()
+    crashed.mkdir()
+    path = write_database(work / "d.db", scene)
+    writer = sqlite3.connect(path, isolation_level=None)
+    writer.execute("PRAGMA journal_mode = wal")
+    writer.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id(1, 2),))
+    for name in ("d.db", "d.db-wal"):
+        shutil.copyfile(work / name, crashed / name)
+    writer.close()
+    before = digest(crashed)
+
+    assert len(read_all(crashed / "d.db", read_model(scene))[0]) == 14
+    assert digest(crashed) == before
+
+
+def test_a_hot_journal_is_rolled_back_in_a_copy_only(scene, tmp_path):
+    work, crashed = tmp_path / "work", tmp_path / "crashed"
+    work.mkdir()
+    crashed.mkdir()
+    path = write_database(work / "d.db", scene)
+    writer = sqlite3.connect(path, isolation_level=None)
+    writer.execute("PRAGMA cache_size = 1")  # spills the unfinished transaction into the file
+    writer.execute("PRAGMA cache_spill = 1")
+    writer.execute("BEGIN")
+    writer.execute("DELETE FROM two_view_geometries")
+    writer.execute("UPDATE keypoints SET data = zeroblob(50000)")
+    for name in ("d.db", "d.db-journal"):
+        shutil.copyfile(work / name, crashed / name)
+    writer.execute("ROLLBACK")
+    writer.close()
+    assert (crashed / "d.db").read_bytes() != path.read_bytes()
+    before = digest(crashed)
+
+    assert len(read_all(crashed / "d.db", read_model(scene))[0]) == 15
+    assert digest(crashed) == before
+
+
+def test_paths_that_mean_something_in_a_uri_are_read(scene, tmp_path):
+    folder = tmp_path / "50%41 of #1? & Fotos für=alle"
+    folder.mkdir()
+    path = write_database(folder / "d?mode=rwc.db", scene)
+    assert len(read_all(path, read_model(scene))[0]) == 15
+    assert os.listdir(folder) == [path.name]
+
+
+def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, monkeypatch):
+    model = tmp_path / "work" / "sparse" / "0"
+    model.mkdir(parents=True)
+    assert find_database(model) is None
+    for folder in (tmp_path / "work", model.parent, model):
+        (folder / "database.db").touch()
+        assert find_database(model) == folder / "database.db"
+    monkeypatch.chdir(model)
+    (model / "database.db").unlink()
+    assert find_database(Path(".")) == model.parent / "database.db"
+    assert find_database(Path("../../sparse/0")) == model.parent / "database.db"
+
+
+# --- a real scene ------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(not (SHARED / "castle-P30").is_dir(), reason="the shared real scenes are not here")
+def test_a_real_scene_is_read_in_well_under_ten_seconds():
+    folder = SHARED / "castle-P30" / "sparse" / "0"
+    start = time.perf_counter()
+    model = read_model(folder)
+    with open_database(find_database(folder), model) as database:
+        (batch,) = database.iter_matches(1)
+    (own,) = track_matches(model, 15)
+    # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
+    assert time.perf_counter() - start < 10.0
+    assert model.num_images == 30
+    assert len(batch.pairs) == 378
+    assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL
+    assert len(own.pairs) == 273

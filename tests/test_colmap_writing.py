@@ -1,0 +1,704 @@
+"""Seeded models: what is kept, what is triangulated and filtered; folders appear whole or not at all."""
+
+import contextlib
+import os
+import resource
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust, quiet_stderr
+from sfm_shapefit.colmap.database import open_database
+from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.seed import build_seed, write_model
+from sfm_shapefit.colmap.structure import (
+    StructureOptions,
+    colored,
+    correspondence_graph,
+    filtered,
+    triangulate,
+)
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import fit_similarity_l1
+from sfm_shapefit.output import atomic_folder, check_output
+
+SHARED_DATA = Path(__file__).parents[1].parent / "shared" / "data"
+NUM_IMAGES = 8
+RADIUS = 6.0
+
+
+# --- a small scene: cameras on a ring, looking at a ball of points --------------------------------------
+
+
+def looking_at_origin(center):
+    """cam_from_world of a camera at `center`, z axis towards the origin."""
+    forward = -center / np.linalg.norm(center)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])
+
+
+def ring_centers(n=NUM_IMAGES):
+    angle = 2.0 * np.pi * np.arange(n) / n
+    return RADIUS * np.stack([np.cos(angle), np.sin(angle), 0.2 * np.sin(3.0 * angle)], axis=1)
+
+
+def ring_model(noise_px=0.0, num_points=120, seed=0, centers=None):
+    """A model whose point p is keypoint p of every image; ids are not consecutive, two cameras differ."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1.5, 1.5, size=(num_points, 3))
+    colors = rng.integers(20, 255, size=(num_points, 3), dtype=np.uint8)
+    model = pycolmap.Reconstruction()
+    for camera_id, params in ((3, [800.0, 500.0, 400.0, -0.05]), (7, [650.0, 510.0, 390.0, 0.03])):
+        model.add_camera_with_trivial_rig(
+            pycolmap.Camera(camera_id=camera_id, model="SIMPLE_RADIAL", width=1000, height=800, params=params)
+        )
+    for k, center in enumerate(ring_centers() if centers is None else centers):
+        rotation = looking_at_origin(center)
+        camera_id = 3 if k % 3 else 7
+        xy = model.camera(camera_id).img_from_cam((points - center) @ rotation.T)
+        image = pycolmap.Image(
+            name=f"view{k}.jpg",
+            keypoints=xy + noise_px * rng.normal(size=xy.shape),
+            camera_id=camera_id,
+            image_id=10 * k + 5,
+        )
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ center)
+        model.add_image_with_trivial_frame(image, pose)
+    for point, color in zip(points, colors, strict=True):
+        index = model.num_points3D()
+        elements = [pycolmap.TrackElement(10 * k + 5, index) for k in range(NUM_IMAGES)]
+        model.add_point3D(point, pycolmap.Track(elements), color)
+    model.update_point_3d_errors()
+    return model, points
+
+
+def all_matches(num_points=120, n=NUM_IMAGES):
+    """Every keypoint matched between every two images, in two batches."""
+    pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
+    return [batch_of(half, num_points) for half in np.array_split(pairs, 2)]
+
+
+def batch_of(pairs, num_points):
+    keypoints = np.tile(np.stack([np.arange(num_points)] * 2, axis=1), (len(pairs), 1))
+    no_rays = np.zeros((len(keypoints), 3))
+    offsets = num_points * np.arange(len(pairs) + 1)
+    return MatchBatch(pairs=pairs, offsets=offsets, keypoints=keypoints, rays_i=no_rays, rays_j=no_rays)
+
+
+def seeded(reconstruction, centers=None, placed=None):
+    model = read_model(reconstruction)
+    placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
+    seed = build_seed(model, placed, model.centers if centers is None else centers)
+    return seed, correspondence_graph(seed, model.image_ids, all_matches())
+
+
+def dump(reconstruction):
+    """Everything in a reconstruction, as bytes that compare equal only if every bit is."""
+    lines = []
+    for i, camera in sorted(reconstruction.cameras.items()):
+        lines.append((i, camera.model.name, camera.width, camera.height, bytes(np.array(camera.params))))
+    for i, frame in sorted(reconstruction.frames.items()):
+        pose = frame.rig_from_world
+        lines.append((i, frame.rig_id, None if pose is None else bytes(np.array(pose.params))))
+    for i, image in sorted(reconstruction.images.items()):
+        seen = [(bytes(np.array(p.xy)), p.point3D_id) for p in image.points2D]
+        lines.append((i, image.name, image.camera_id, image.frame_id, image.has_pose, seen))
+    for i, point in sorted(reconstruction.points3D.items()):
+        track = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)
+        lines.append((i, bytes(np.array(point.xyz)), bytes(np.array(point.color)), point.error, track))
+    return [*lines, sorted(reconstruction.reg_image_ids()), sorted(reconstruction.rigs)]
+
+
+def centers_of(reconstruction):
+    return np.array([reconstruction.image(i).projection_center() for i in sorted(reconstruction.images)])
+
+
+# --- the seed -------------------------------------------------------------------------------------------
+
+
+def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tmp_path):
+    original, _ = ring_model()
+    moved = 3.0 * ring_centers() + [100.0, -7.0, 0.5]
+    seed, _ = seeded(original, moved)
+    write_model(seed, tmp_path)
+    written = pycolmap.Reconstruction(tmp_path)
+    for i, image in original.images.items():
+        ours = written.image(i)
+        assert ours.name == image.name
+        assert ours.camera_id == image.camera_id
+        assert bytes(ours.cam_from_world().rotation.quat) == bytes(image.cam_from_world().rotation.quat)
+        assert bytes(np.array(ours.camera.params)) == bytes(np.array(image.camera.params))
+    # C = -R^T t undoes t = -R C up to a few roundings of |C| ~ 100 (eps = 2.2e-16)
+    np.testing.assert_allclose(centers_of(written), moved, rtol=0.0, atol=1e-12)
+    assert written.num_points3D() == 0
+
+
+def test_the_input_of_every_stage_stays_as_it_was():
+    original, _ = ring_model(noise_px=0.3)
+    before = dump(original)
+    seed, graph = seeded(original, ring_centers() + 0.01)
+    seed_before = dump(seed)
+    for tracks in (graph, original):
+        structure = triangulate(seed, tracks)
+        structure_before = dump(structure)
+        colored(structure, original)
+        filtered(structure, StructureOptions(max_reprojection_error_px=0.1))
+        assert dump(structure) == structure_before
+        bundle_adjust(seed, tracks)
+    assert dump(seed) == seed_before
+    assert dump(original) == before
+
+
+def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(tmp_path):
+    original, _ = ring_model()
+    placed = np.arange(NUM_IMAGES) != 2
+    centers = np.where(placed[:, None], ring_centers(), np.nan)
+    seed, graph = seeded(original, centers, placed)
+    structure = triangulate(seed, graph)
+    write_model(structure, tmp_path)
+    written = read_model(tmp_path)
+    assert written.names == tuple(f"view{k}.jpg" for k in range(NUM_IMAGES) if k != 2)
+    assert structure.num_points3D() == 120
+    assert all(p.track.length() == NUM_IMAGES - 1 for p in structure.points3D.values())
+    assert triangulate(seed, original).num_points3D() == 120
+
+
+def test_images_that_had_no_pose_stay_without_one(tmp_path):
+    original, _ = ring_model()
+    original.deregister_frame(original.image(25).frame_id)
+    model = read_model(original)
+    seed = build_seed(model, np.ones(NUM_IMAGES - 1, dtype=bool), model.centers)
+    write_model(seed, tmp_path)
+    assert 25 not in pycolmap.Reconstruction(tmp_path).reg_image_ids()
+    assert seed.num_reg_images() == NUM_IMAGES - 1
+
+
+@pytest.mark.parametrize("as_mapping", [True, False])
+def test_keypoints_of_the_database_replace_the_models_where_there_are_any(as_mapping):
+    original, _ = ring_model()
+    model = read_model(original)
+    xy = np.arange(10.0).reshape(5, 2)
+    table = {0: xy, 3: xy + 0.5}
+    keypoints = table if as_mapping else (lambda index: table.get(index, np.zeros((0, 2))))
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
+    np.testing.assert_array_equal([p.xy for p in seed.image(5).points2D], xy)
+    np.testing.assert_array_equal([p.xy for p in seed.image(35).points2D], xy + 0.5)
+    for image_id in (15, 25):
+        own = [p.xy for p in original.image(image_id).points2D]
+        np.testing.assert_array_equal([p.xy for p in seed.image(image_id).points2D], own)
+
+
+def test_a_placed_image_without_finite_centre_is_refused_by_name():
+    model = read_model(ring_model()[0])
+    centers = model.centers.copy()
+    centers[4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
+        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
+
+
+# --- triangulation --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_exact_data_give_every_point_back_with_its_colour(source):
+    original, points = ring_model()
+    seed, graph = seeded(original)
+    structure = colored(triangulate(seed, graph if source == "matches" else original), original)
+    assert structure.num_points3D() == len(points)
+    for point in structure.points3D.values():
+        truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
+        # undistortion is iterated to ~1e-10 px; a pixel spans 6 / 650 = 0.01 units
+        np.testing.assert_allclose(point.xyz, truth.xyz, rtol=0.0, atol=1e-9)
+        np.testing.assert_array_equal(point.color, truth.color)
+        assert point.track.length() == NUM_IMAGES
+        assert point.error == pytest.approx(0.0, abs=1e-6)
+
+
+def test_points_follow_the_new_positions_and_not_the_old_ones():
+    original, points = ring_model()
+    seed, graph = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
+    for tracks in (graph, original):
+        structure = triangulate(seed, tracks)
+        xyz = {p.track.elements[0].point2D_idx: p.xyz for p in structure.points3D.values()}
+        found = np.array([xyz[k] for k in range(len(points))])
+        np.testing.assert_allclose(found, 2.0 * points + [1.0, 2.0, 3.0], rtol=0.0, atol=2e-9)
+
+
+def test_the_models_own_tracks_keep_the_ids_of_their_points():
+    original, _ = ring_model(noise_px=0.3)
+    for point_id in (3, 50):
+        original.delete_point3D(point_id)
+    structure = triangulate(seeded(original)[0], original)
+    assert set(structure.point3D_ids()) == set(original.point3D_ids())
+    for point_id, point in structure.points3D.items():
+        assert {e.point2D_idx for e in point.track.elements} == {point_id - 1}
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_twice_the_same_gives_the_same_bits(source):
+    # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
+    original, _ = ring_model(noise_px=3.0)
+
+    def run():
+        seed, graph = seeded(original, ring_centers() + 0.01)
+        tracks = graph if source == "matches" else original
+        structure = colored(triangulate(seed, tracks), original)
+        return dump(structure), dump(bundle_adjust(seed, tracks).reconstruction)
+
+    first = run()
+    pycolmap.set_random_seed(12345)  # the global generator must have no part in it
+    assert run() == first
+
+
+def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
+    # baselines of at most 0.12 units at 60 units: 0.11 degrees
+    original, _ = ring_model(centers=0.01 * ring_centers() + [60.0, 0.0, 0.0])
+    seed, graph = seeded(original)
+    for tracks in (graph, original):
+        assert triangulate(seed, tracks).num_points3D() == 0
+        options = StructureOptions(min_triangulation_angle_deg=0.05)
+        assert triangulate(seed, tracks, options).num_points3D() == 120
+
+
+def reprojection_errors_px(structure):
+    return [
+        float(np.linalg.norm(image.project_point(point.xyz) - image.point2D(e.point2D_idx).xy))
+        for point in structure.points3D.values()
+        for e in point.track.elements
+        for image in (structure.image(e.image_id),)
+    ]
+
+
+def test_wrong_matches_make_no_point_that_misses_its_observations():
+    original, _ = ring_model(noise_px=0.3)
+    model = read_model(original)
+    rng = np.random.default_rng(1)
+    batches = all_matches()
+    for batch in batches:
+        wrong = rng.random(len(batch.keypoints)) < 0.3
+        batch.keypoints[wrong, 1] = rng.integers(0, 120, size=wrong.sum())
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
+    structure = triangulate(seed, correspondence_graph(seed, model.image_ids, batches))
+    assert structure.num_points3D() >= 120
+    assert max(reprojection_errors_px(structure)) <= 4.0
+
+
+def test_matches_that_only_two_images_share_are_left_out_unless_asked_for():
+    original, _ = ring_model()
+    model = read_model(original)
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
+    graph = correspondence_graph(seed, model.image_ids, [batch_of(np.array([[0, 1]]), 120)])
+    assert triangulate(seed, graph).num_points3D() == 0
+    both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
+    assert both.num_points3D() == 120
+
+
+def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_its_images():
+    original, _ = ring_model()
+    model = read_model(original)
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
+    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
+        correspondence_graph(seed, model.image_ids, [batch_of(np.array([[0, 3]]), 121)])
+
+
+def test_tracks_of_a_model_with_other_keypoints_are_refused():
+    original, _ = ring_model()
+    model = read_model(original)
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, {0: np.ones((5, 2))})
+    with pytest.raises(ValueError, match="image 5 has other points2D"):
+        triangulate(seed, original)
+
+
+def test_colours_come_only_from_images_with_the_same_keypoints():
+    original, _ = ring_model()
+    model = read_model(original)
+    moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in model.image_ids.tolist()]
+    for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
+        keypoints = {k: moved[k] for k in changed}
+        seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
+        graph = correspondence_graph(seed, model.image_ids, all_matches())
+        structure = colored(triangulate(seed, graph), original)
+        assert structure.num_points3D() == 120
+        assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
+
+
+# --- filters --------------------------------------------------------------------------------------------
+
+
+def with_one_more_point(xyz, image_ids, offset_px=0.0):
+    """The exact model plus one point with exact observations (the projection formula also behind cameras)."""
+    original, _ = ring_model()
+    model = read_model(original)
+    extra = {}
+    for index, image_id in enumerate(model.image_ids.tolist()):
+        x = original.image(image_id).cam_from_world() * np.asarray(xyz, dtype=float)
+        camera = original.image(image_id).camera
+        f, cx, cy = camera.params[:3]
+        xy = np.array([cx, cy]) + f * x[:2] / x[2]
+        if x[2] > 0.0:
+            xy = camera.img_from_cam(x)
+        own = np.array([p.xy for p in original.image(image_id).points2D])
+        extra[index] = np.vstack([own, xy + np.array([offset_px * (image_id == image_ids[0]), 0.0])])
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, extra)
+    for point in original.points3D.values():
+        seed.add_point3D(point.xyz, pycolmap.Track(point.track.elements))
+    elements = [pycolmap.TrackElement(i, 120) for i in image_ids]
+    return seed, seed.add_point3D(np.asarray(xyz, dtype=float), pycolmap.Track(elements))
+
+
+@pytest.mark.parametrize(
+    ("xyz", "image_ids", "why"),
+    [
+        ([25.0, 0.0, 0.0], [5, 15], "behind cameras 0 and 1"),
+        ([-4000.0, 0.0, 0.0], [5, 15, 75], "0.1 degrees of triangulation angle"),
+        ([np.nan, 0.0, 0.0], [5, 15], "not a number"),
+        ([np.inf, 0.0, 0.0], [5, 15], "infinite"),
+    ],
+)
+def test_a_point_is_removed_that_is(xyz, image_ids, why):
+    seed, point_id = with_one_more_point(xyz, image_ids)
+    kept = filtered(seed)
+    assert not kept.exists_point3D(point_id), why
+    assert kept.num_points3D() == 120
+
+
+def test_a_point_far_away_stays_if_the_angle_asked_for_is_smaller_than_its_own():
+    # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
+    seed, point_id = with_one_more_point([-4000.0, 0.0, 0.0], [15, 75])
+    for angle_deg, stays in ((0.10, True), (0.14, False)):
+        kept = filtered(seed, StructureOptions(min_triangulation_angle_deg=angle_deg))
+        assert kept.exists_point3D(point_id) == stays
+
+
+@pytest.mark.parametrize(("offset_px", "length"), [(3.9, 4), (4.1, 3)])
+def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offset_px, length):
+    seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45, 65], offset_px)
+    point = filtered(seed).points3D[point_id]
+    assert point.track.length() == length
+    assert point.error == pytest.approx(offset_px / 4 if length == 4 else 0.0, abs=1e-6)
+
+
+def test_tracks_shorter_than_asked_for_are_removed():
+    seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45])
+    assert filtered(seed, StructureOptions(min_track_length=3)).exists_point3D(point_id)
+    kept = filtered(seed, StructureOptions(min_track_length=4))
+    assert not kept.exists_point3D(point_id)
+    assert kept.num_points3D() == 120
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("max_reprojection_error_px", 0.0),
+        ("max_reprojection_error_px", float("nan")),
+        ("min_triangulation_angle_deg", 90.0),
+        ("min_track_length", 1),
+    ],
+)
+def test_structure_options_out_of_range_are_refused_by_name(name, value):
+    with pytest.raises(ValueError, match=rf"StructureOptions\.{name} must"):
+        StructureOptions(**{name: value})
+
+
+# --- bundle adjustment ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source):
+    original, points = ring_model()
+    disturbed = ring_centers() + np.random.default_rng(3).normal(scale=0.03 * RADIUS, size=(NUM_IMAGES, 3))
+    seed, graph = seeded(original, disturbed)
+    adjusted = bundle_adjust(seed, graph if source == "matches" else original)
+    centers = centers_of(adjusted.reconstruction)
+    aligned = fit_similarity_l1(centers, ring_centers()).apply(centers)
+    # the solver stops when the cost falls by less than 1e-6 of itself; 0.18 units of disturbance before
+    assert np.linalg.norm(aligned - ring_centers(), axis=1).max() < 1e-4
+    assert adjusted.converged
+    assert adjusted.final_error_px < 0.01 < adjusted.initial_error_px
+    assert adjusted.num_points == len(points) == adjusted.reconstruction.num_points3D()
+    assert adjusted.num_observations == len(points) * NUM_IMAGES
+    for i, camera in original.cameras.items():
+        assert bytes(np.array(adjusted.reconstruction.camera(i).params)) == bytes(np.array(camera.params))
+
+
+def test_intrinsics_are_refined_when_asked_for():
+    original, _ = ring_model()
+    for camera in original.cameras.values():
+        camera.params = np.array(camera.params) * [1.01, 1.0, 1.0, 1.0]
+    seed, graph = seeded(original)
+    fixed = bundle_adjust(seed, graph)
+    free = bundle_adjust(seed, graph, options=AdjustmentOptions(refine_intrinsics=True))
+    assert free.final_error_px < 0.1 * fixed.final_error_px
+    assert free.reconstruction.camera(3).params[0] == pytest.approx(800.0, rel=1e-3)
+    assert fixed.reconstruction.camera(3).params[0] == 808.0
+
+
+def test_adjusted_points_satisfy_the_same_filters():
+    original, _ = ring_model(noise_px=1.0)
+    seed, graph = seeded(original)
+    adjusted = bundle_adjust(seed, graph, StructureOptions(max_reprojection_error_px=1.5))
+    assert 1.0 < max(reprojection_errors_px(adjusted.reconstruction)) <= 1.5
+
+
+def test_too_few_iterations_are_reported_as_not_converged():
+    original, _ = ring_model(noise_px=0.5)
+    seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
+    adjusted = bundle_adjust(seed, graph, options=AdjustmentOptions(max_iterations=1))
+    assert not adjusted.converged
+    assert adjusted.iterations == 3
+
+
+def test_adjustment_without_any_point_says_what_to_do():
+    original, _ = ring_model()
+    seed, graph = seeded(original, np.zeros((NUM_IMAGES, 3)))
+    with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
+        bundle_adjust(seed, graph)
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wanted(capfd, monkeypatch, quiet):
+    make_adjuster = pycolmap.create_default_ceres_bundle_adjuster
+
+    def talkative(*arguments):
+        os.write(2, b"W20260101 cholmod: matrix not positive definite")
+        return make_adjuster(*arguments)
+
+    monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
+    seed, graph = seeded(ring_model(noise_px=0.5)[0])
+    bundle_adjust(seed, graph, options=AdjustmentOptions(quiet=quiet))
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert ("not positive definite" in said.err) != quiet
+
+
+def test_stderr_is_quiet_only_inside_the_block_and_only_if_enabled(capfd):
+    with contextlib.suppress(KeyError), quiet_stderr():
+        os.write(2, b"lost")
+        raise KeyError
+    with quiet_stderr(enabled=False):
+        os.write(2, b"seen ")
+    os.write(2, b"after")
+    assert capfd.readouterr().err == "seen after"
+
+
+@pytest.mark.parametrize("name", ["max_iterations", "num_threads"])
+def test_adjustment_options_out_of_range_are_refused_by_name(name):
+    with pytest.raises(ValueError, match=rf"AdjustmentOptions\.{name} must be > 0"):
+        AdjustmentOptions(**{name: 0})
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
+def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
+    folder = SHARED_DATA / name
+    if not folder.exists():
+        pytest.skip(f"{folder} is not there")
+    model = read_model(folder / "sparse" / "0")
+    truth = pycolmap.Reconstruction(folder / "gt")
+    true_centers = np.array([truth.find_image_with_name(name).projection_center() for name in model.names])
+    everything = np.ones(model.num_images, dtype=bool)
+    with open_database(folder / "database.db", model) as database:
+        seed = build_seed(model, everything, model.centers, database.keypoints)
+        graph = correspondence_graph(seed, model.image_ids, database.iter_matches(15))
+    centers = centers_of(bundle_adjust(seed, graph).reconstruction)
+    error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
+    # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
+    assert error_m.mean() <= 1.15 * to_reach_m
+
+
+# --- the files ------------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):
+    original, _ = ring_model()
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(
+        resource.RLIMIT_FSIZE, (4096, hard)
+    )  # a longer file cannot be written, as on a full disk
+    try:
+        with (
+            pytest.raises(InputError, match="check the free space"),
+            atomic_folder(tmp_path / "out") as partial,
+        ):
+            write_model(original, partial)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.skipif(shutil.which("colmap") is None, reason="the colmap binary is not on PATH")
+@pytest.mark.parametrize("unplaced", [None, 2])
+def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
+    original, _ = ring_model(noise_px=0.3)
+    placed = np.arange(NUM_IMAGES) != unplaced
+    seed, graph = seeded(original, ring_centers() + 0.01, placed)
+    with atomic_folder(tmp_path / "out") as partial:
+        write_model(colored(triangulate(seed, graph), original), partial)
+    (tmp_path / "adjusted").mkdir()
+
+    analysis = colmap("model_analyzer", "--path", tmp_path / "out")
+    assert f"Registered images: {placed.sum()}" in analysis
+    assert "Points: 120" in analysis
+    colmap("bundle_adjuster", "--input_path", tmp_path / "out", "--output_path", tmp_path / "adjusted")
+    adjusted = colmap("model_analyzer", "--path", tmp_path / "adjusted")
+    assert f"Registered images: {placed.sum()}" in adjusted
+    # 0.3 px of noise per coordinate: a mean error of 0.3 sqrt(pi / 2) = 0.38 px before degrees of freedom
+    error_px = float(adjusted.split("Mean reprojection error: ")[1].split("px")[0])
+    assert 0.25 < error_px < 0.4
+
+
+def colmap(*arguments):
+    """Run the binary without a display and return all it said."""
+    done = subprocess.run(
+        ["colmap", *map(str, arguments)],
+        env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout + done.stderr
+
+
+# --- folders that appear whole or not at all ------------------------------------------------------------
+
+
+def earlier_output(path):
+    path.mkdir()
+    (path / "locate.json").write_text("{}")
+    (path / "old.bin").write_bytes(b"old")
+    return path
+
+
+def write_and_raise(out, error, overwrite=False):
+    with atomic_folder(out, overwrite=overwrite) as partial:
+        (partial / "locate.json").write_text("new")
+        raise error
+
+
+def test_a_folder_appears_when_the_block_ends_and_not_before(tmp_path):
+    out = tmp_path / "new" / "parents" / "out"
+    with atomic_folder(out) as partial:
+        (partial / "sub").mkdir()
+        (partial / "sub" / "file").write_text("x")
+        assert partial.parent == out.parent
+        assert not out.exists()
+    assert (out / "sub" / "file").read_text() == "x"
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path):
+    (tmp_path / "plain").mkdir()
+    with atomic_folder(tmp_path / "out"):
+        pass
+    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == stat.S_IMODE(
+        (tmp_path / "plain").stat().st_mode
+    )
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
+def test_an_exception_leaves_nothing_behind_not_even_new_parents(tmp_path, error):
+    with pytest.raises(error):
+        write_and_raise(tmp_path / "a" / "b" / "out", error)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_refused_and_kept(tmp_path):
+    out = earlier_output(tmp_path / "out")
+    with pytest.raises(InputError, match="exists already; choose another folder or allow overwriting"):
+        check_output(out)
+    with pytest.raises(InputError, match="exists already"), atomic_folder(out):
+        pytest.fail("the block must not run")
+    assert (out / "old.bin").read_bytes() == b"old"
+
+
+def test_overwriting_replaces_an_earlier_output_completely(tmp_path):
+    out = earlier_output(tmp_path / "out")
+    with atomic_folder(out, overwrite=True) as partial:
+        (partial / "locate.json").write_text("new")
+        assert (out / "old.bin").exists()
+    assert [p.name for p in out.iterdir()] == ["locate.json"]
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_overwriting_that_fails_keeps_the_earlier_output(tmp_path):
+    out = earlier_output(tmp_path / "out")
+    with pytest.raises(KeyboardInterrupt):
+        write_and_raise(out, KeyboardInterrupt, overwrite=True)
+    assert (out / "old.bin").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_earlier_output_is_put_back_if_the_new_one_cannot_be_moved_in(tmp_path, monkeypatch):
+    out = earlier_output(tmp_path / "out")
+    rename = Path.rename
+
+    def failing(self, target):
+        if self.suffix == ".partial":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(InputError, match="cannot be written"), atomic_folder(out, overwrite=True):
+        pass
+    assert (out / "old.bin").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_overwriting_refuses_what_is_no_earlier_output_but_takes_an_empty_folder(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    with atomic_folder(photos, overwrite=True) as partial:
+        (partial / "dear.jpg").write_bytes(b"x")
+    with (
+        pytest.raises(InputError, match=r"holds files but no locate\.json"),
+        atomic_folder(photos, overwrite=True),
+    ):
+        pytest.fail("the block must not run")
+    assert (photos / "dear.jpg").exists()
+
+
+def test_a_folder_that_came_into_being_meanwhile_is_kept(tmp_path):
+    with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "out"):
+        earlier_output(tmp_path / "out")
+    assert (tmp_path / "out" / "old.bin").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("spelling", ["model", "model/../model", ".", "link", "project"])
+def test_the_input_is_never_overwritten_however_it_is_spelled(tmp_path, spelling):
+    model = earlier_output(tmp_path / "model")
+    (tmp_path / "link").symlink_to(model)
+    (tmp_path / "locate.json").write_text("{}")
+    (tmp_path / "project").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="is or contains the input"):
+        check_output(tmp_path / spelling, overwrite=True, protect=[model])
+    check_output(model / "out", protect=[model])
+    check_output(tmp_path / "model2", protect=[model])
+
+
+def test_paths_that_cannot_hold_a_folder_are_refused_in_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for name, sentence in (("file", "is a file"), ("file/out", "is not a folder"), ("link", "symbolic link")):
+        for overwrite in (False, True):
+            with pytest.raises(InputError, match=sentence) as caught:
+                check_output(tmp_path / name, overwrite=overwrite)
+            assert "\n" not in str(caught.value)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(InputError, match="is not writable"):
+        check_output(tmp_path / "out")
+
+
+def test_an_error_of_the_file_system_becomes_one_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"out cannot be written \(No space left on device\)"):
+        write_and_raise(tmp_path / "out", OSError(28, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []
