@@ -35,9 +35,9 @@ def draw_courtyard(found: LocateResult, path: Path) -> None:
     images = [found.reconstruction.image(i) for i in found.model.image_ids.tolist()]
     centers = np.array([image.projection_center() for image in images])
     forward = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
-    piece = found.pieces[0]
-    edges = found.graph.edges[piece.edges]
-    directions = found.graph.directions[piece.edges]
+    placement, inliers = found.placement, found.placement.assessment.inliers
+    edges = placement.graph.edges[placement.edges]
+    directions = placement.graph.directions[placement.edges]
 
     for (i, j), v in zip(edges, directions, strict=True):
         for start, end in ((centers[i], centers[i] - STUB_M * v), (centers[j], centers[j] + STUB_M * v)):
@@ -46,17 +46,19 @@ def draw_courtyard(found: LocateResult, path: Path) -> None:
 
     points = np.array([point.xyz for point in found.reconstruction.points3D.values()])
     solved.scatter(points[:, 0], points[:, 1], s=1.5, color=POINT, linewidths=0)
-    order = np.argsort(~found.assessment.inliers, kind="stable")
+    order = np.argsort(~inliers, kind="stable")
     for e in order:
         i, j = edges[e]
-        color = INLIER if found.assessment.inliers[e] else OUTLIER
+        color = INLIER if inliers[e] else OUTLIER
         ends = np.stack([centers[i], centers[j]])
         solved.plot(ends[:, 0], ends[:, 1], color=color, lw=0.7, alpha=0.55 if color == INLIER else 0.9)
-    rejected = int(np.sum(~found.assessment.inliers))
+    rejected = int(np.sum(~inliers))
     for color, label in ((INLIER, "agrees with the solution"), (OUTLIER, "contradicts it")):
         solved.plot([], [], color=color, label=label)
     solved.legend(loc="lower center", bbox_to_anchor=(0.5, 0.08), ncols=2, fontsize=8)
-    solved.set_title(f"found: {len(piece.cameras)} cameras, {rejected} pairs rejected, {len(points)} points")
+    solved.set_title(
+        f"found: {len(placement.cameras)} cameras, {rejected} pairs rejected, {len(points)} points"
+    )
 
     for axes in (given, solved):
         axes.quiver(*centers[:, :2].T, *forward[:, :2].T, color=CAMERA, width=0.006, scale=22, zorder=5)

@@ -23,12 +23,14 @@ import typer
 from sfm_shapefit.colmap.workspace import WorkspaceOptions
 from sfm_shapefit.errors import ShapeFitError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.synthetic import SceneOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.evaluation import Evaluation
     from sfm_shapefit.pipeline import Progress
-    from sfm_shapefit.results import LocateResult
+    from sfm_shapefit.results import GraphResult, LocateResult
+    from sfm_shapefit.solver.options import SolverResult
 
 Options = TypeVar("Options")
 Command = TypeVar("Command", bound=Callable[..., None])
@@ -248,25 +250,24 @@ def locate_command(
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:
-            _print_table(f"{found.graph.num_cameras} images of {source}", _locate_table(found, target))
+            _print_table(f"{len(found.model.names)} images of {source}", _locate_table(found, target))
 
 
 def _locate_table(found: "LocateResult", out: Path) -> Text:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results import camera_rows, summary
+    from sfm_shapefit.results import summary
 
     facts = summary(found)
-    left_out = [f"{row.name}: {row.reason}" for row in camera_rows(found) if not row.placed]
+    left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     pairs = ", ".join(
         f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count
     )
-    solve = found.solve
     return [
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", _shortened(left_out))] if left_out else []),
         ("pairs", f"{facts['num_pairs']}: {pairs}"),
-        ("objective", f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({solve.method})"),
+        ("objective", _objective_line(found.solve)),
         ("scale", found.gauge.statement),
         ("points", f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"),
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
@@ -281,6 +282,71 @@ def _adjustment_line(found: "LocateResult") -> str:
     state = "converged" if found.adjusted.converged else "stopped at its limit"
     before, after = found.adjusted.initial_error_px, found.adjusted.final_error_px
     return f"{state} after {found.adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
+
+
+# --- solve -----------------------------------------------------------------------------------------
+
+
+@app.command("solve")
+@_takes(SolverOptions)
+def solve_command(
+    graph: Annotated[
+        Path | None, typer.Argument(metavar="GRAPH", help="Text file: i j vx vy vz [weight] per line.")
+    ] = None,
+    out: OutArgument = None,
+    *,
+    overwrite: Overwrite = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    **given: Any,
+) -> None:
+    """Place the nodes of a bare view GRAPH of directions, in any dimension; write tables to OUT."""
+    source = _one_path(graph, None, "GRAPH")
+    target = _one_path(out, None, "OUT")
+    with _reported():
+        from sfm_shapefit.output import check_output
+
+        options = _options(SolverOptions, given)
+        check_output(target, overwrite=overwrite, protect=[source])
+
+        from sfm_shapefit.pipeline import solve_graph_file
+        from sfm_shapefit.report import dumps
+        from sfm_shapefit.results import graph_summary, write_graph_result
+
+        found = solve_graph_file(source, options)
+        write_graph_result(found, target, overwrite=overwrite)
+        if as_json:
+            print(dumps(graph_summary(found)))  # noqa: T201
+        elif not quiet:
+            _print_table(
+                f"{found.placement.graph.num_cameras} nodes of {source}", _solve_table(found, target)
+            )
+
+
+def _solve_table(found: "GraphResult", out: Path) -> Text:
+    """Return what was placed, what was not and why, and how certain it is."""
+    from sfm_shapefit.results import quality_warnings
+
+    placement = found.placement
+    left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
+    return [
+        ("dimension", str(placement.graph.dimension)),
+        ("placed", f"{len(placement.cameras)} of {placement.graph.num_cameras} nodes"),
+        *([("not placed", _shortened(left_out))] if left_out else []),
+        (
+            "pairs",
+            f"{placement.graph.num_edges}, of which {len(placement.rejected_pairs)} contradict the solution",
+        ),
+        ("objective", _objective_line(placement.solve)),
+        *[("warning", warning) for warning in quality_warnings(placement)],
+        ("time", f"{sum(found.timings_s.values()):.1f} s"),
+        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv"),
+    ]
+
+
+def _objective_line(solve: "SolverResult") -> str:
+    chosen = f"{solve.method}: {solve.method_reason}"
+    return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
 
 
 # --- evaluate --------------------------------------------------------------------------------------

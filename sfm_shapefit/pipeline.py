@@ -22,13 +22,12 @@ from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_g
 from sfm_shapefit.directions import PairDirections, concatenate, estimate_directions, from_relative_poses
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.evaluation import Evaluation, evaluate_poses
+from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
-from sfm_shapefit.results import Inputs, LocateResult
-from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
-from sfm_shapefit.robust import Assessment, assess
-from sfm_shapefit.solver.options import SolverResult, Status
-from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.placement import Placement, place
+from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
+from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -71,19 +70,14 @@ def locate(
                 matches = resources.enter_context(open_database(inputs.database, model))
         with clock("directions"):
             directions = _measure_directions(model, matches, inputs.source, options, clock)
-        with clock("rigidity"):
-            graph = _view_graph(model, directions)
-            pieces = _checked_pieces(graph)
-            piece, cameras = graph.restricted_to(pieces[0].edges)
         with clock("solve"):
-            solved = solve(piece, options.for_solver())
-            covariance = directions.covariance[directions.usable()[pieces[0].edges]]
-            assessment = assess(piece, solved.locations, covariance)
-            gauge = choose_gauge(solved.locations, model.centers[cameras], options.scale)
+            graph = _view_graph(model, directions)
+            placement = place(graph, options.for_solver(), directions.covariance[directions.usable()])
+            locations = placement.solve.locations
+            gauge = choose_gauge(locations, model.centers[placement.cameras], options.scale)
         with clock("structure"):
-            centers = gauge.similarity.apply(solved.locations)
-            rejected = cameras[piece.edges[~assessment.inliers]]
-            seed, tracks = _seed_and_tracks(model, matches, cameras, centers, rejected, clock)
+            centers = gauge.similarity.apply(locations)
+            seed, tracks = _seed_and_tracks(model, matches, placement, centers, clock)
             seeded = triangulate(seed, tracks, options.for_structure())
         adjusted = None
         if options.bundle_adjust:
@@ -96,14 +90,11 @@ def locate(
         options=options,
         model=model,
         directions=directions,
-        graph=graph,
-        pieces=pieces,
-        solve=solved,
-        assessment=assessment,
+        placement=placement,
         gauge=gauge,
         adjusted=adjusted,
         timings_s=clock.seconds,
-        warnings=_warnings(matches, solved, assessment),
+        warnings=tuple(_warnings(matches, placement)),
     )
 
 
@@ -203,35 +194,23 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def _checked_pieces(graph: ViewGraph) -> list[RigidPiece]:
-    """Return the rigid pieces of the graph, if the largest is more than a pair of many cameras."""
-    pieces = rigid_pieces(graph)
-    if len(pieces[0].cameras) < min(3, graph.num_cameras):
-        raise UnsolvableError(
-            f"the {graph.num_edges} usable directions tie no three cameras to one another; "
-            "match more pairs, above all pairs that close triangles"
-        )
-    return pieces
-
-
 def _seed_and_tracks(
     model: PosedModel,
     matches: MatchDatabase | None,
-    cameras: IntArray,
+    placement: Placement,
     centers: FloatArray,
-    rejected: IntArray,
     clock: _Clock,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
     """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
     placed = np.zeros(model.num_images, dtype=np.bool_)
-    placed[cameras] = True
+    placed[placement.cameras] = True
     all_centers = np.full((model.num_images, 3), np.nan)
-    all_centers[cameras] = centers
+    all_centers[placement.cameras] = centers
     if matches is None:
         return build_seed(model, placed, all_centers), model.reconstruction
     seed = build_seed(model, placed, all_centers, matches.keypoints)
-    batches = _counted(_without_pairs(matches.iter_matches(1), rejected), matches.num_pairs, clock)
-    return seed, correspondence_graph(seed, model.image_ids, batches)
+    batches = _without_pairs(matches.iter_matches(1), placement.rejected_pairs)
+    return seed, correspondence_graph(seed, model.image_ids, _counted(batches, matches.num_pairs, clock))
 
 
 def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
@@ -261,18 +240,32 @@ def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterat
         clock.advance(done, total)
 
 
-def _warnings(matches: MatchDatabase | None, solved: SolverResult, assessment: Assessment) -> tuple[str, ...]:
-    """Return what the user should know beyond the tables."""
-    found: list[str] = []
-    if solved.status is not Status.CONVERGED:
-        found.append(f"the solve is not certified to the tolerance: {solved.status.value}")
+def _warnings(matches: MatchDatabase | None, placement: Placement) -> Iterator[str]:
+    """Yield what the user should know beyond the tables."""
+    yield from quality_warnings(placement)
     if matches is not None and matches.unmatched_names:
         names = matches.unmatched_names
-        found.append(f"{len(names)} images of the model are not in the database, {names[0]} for one")
-    share = 1.0 - float(assessment.inliers.mean())
-    if share > 0.5:
-        found.append(f"{share:.0%} of the pairs contradict the solution; do not trust it without a look")
-    return tuple(found)
+        yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
+
+
+def solve_graph_file(path: Path | str, options: SolverOptions | None = None) -> GraphResult:
+    """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
+
+    Args:
+        path: a text file, see `formats.read_graph`.
+        options: settings of the solver; defaults if None.
+
+    Raises:
+        InputError: if the file is malformed; the message names the line.
+        UnsolvableError: if the directions determine nothing.
+    """
+    options = options or SolverOptions()
+    clock = _Clock(lambda _stage, _done, _total: None)
+    with clock("read"):
+        graph = read_graph(path)
+    with clock("solve"):
+        placement = place(graph, options)
+    return GraphResult(path=Path(path), options=options, placement=placement, timings_s=clock.seconds)
 
 
 def evaluate(

@@ -21,7 +21,7 @@ SCHEMA_VERSION = 1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraRow:
-    """One image of the input, placed or not; NaN and None are empty fields."""
+    """One image of the input, or node of a bare graph, placed or not; NaN and None are empty fields."""
 
     name: str
     placed: bool = False
@@ -29,33 +29,27 @@ class CameraRow:
     """Why it is not placed."""
     piece: int | None = None
     """The parallel-rigid piece it belongs to, 0 the solved one; None outside every piece of 3 cameras."""
-    x: float = math.nan
-    y: float = math.nan
-    z: float = math.nan
-    """Centre in the output's units."""
+    center: tuple[float, ...] = ()
+    """Centre in the output's units, d numbers; empty when not placed. Columns x, y, z."""
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
     """Share of its pairs that agree with the solution, in [0, 1]."""
-    sigma_x: float = math.nan
-    sigma_y: float = math.nan
-    sigma_z: float = math.nan
-    """Standard deviation of the solved centre in the output's units, with centroid and scale held fixed;
-    empty also where the agreeing pairs do not hold the camera."""
+    sigma: tuple[float, ...] = ()
+    """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
+    Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PairRow:
-    """One image pair that was looked at; NaN is an empty field."""
+    """One pair that was looked at; NaN is an empty field."""
 
     name1: str
     name2: str
-    vx: float = math.nan
-    vy: float = math.nan
-    vz: float = math.nan
-    """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2)."""
+    direction: tuple[float, ...] = ()
+    """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2). Columns vx, vy, vz."""
     support: int = 0
-    """Number of inlier matches."""
+    """Number of inlier matches; 0 for a bare graph, which does not say."""
     weight: float = math.nan
     """Weight in the program."""
     residual_deg: float = math.nan
@@ -79,10 +73,33 @@ class PieceRow:
     """Names of the cameras that it shares with other pieces."""
 
 
-def write_csv(rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, path: Path) -> None:
-    """Write rows of one type as CSV; the header stands even where there is no row."""
-    names = [field.name for field in fields(row_type)]
-    write_records([asdict(row) for row in rows], path, names)
+def write_rows(
+    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
+) -> None:
+    """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
+    axes = axis_names(dimension)
+    per_axis = {
+        "center": axes,
+        "sigma": [f"sigma_{axis}" for axis in axes],
+        "direction": [f"v{axis}" for axis in axes],
+    }
+    names = [name for field in fields(row_type) for name in per_axis.get(field.name, [field.name])]
+
+    def record(row: CameraRow | PairRow) -> dict[str, object]:
+        values: dict[str, object] = {}
+        for name, value in asdict(row).items():
+            if name in per_axis:
+                values |= dict(zip(per_axis[name], value or [None] * dimension, strict=True))
+            else:
+                values[name] = value
+        return values
+
+    write_records([record(row) for row in rows], path, names)
+
+
+def axis_names(dimension: int) -> list[str]:
+    """Return x, y, z up to three dimensions, and x1, x2, ... beyond."""
+    return list("xyz"[:dimension]) if dimension <= len("xyz") else [f"x{k + 1}" for k in range(dimension)]
 
 
 def write_records(

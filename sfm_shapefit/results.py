@@ -1,7 +1,7 @@
 """What `locate` returns, and its files: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit import __version__
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.seed import write_model
@@ -17,24 +18,27 @@ from sfm_shapefit.directions import DirectionStatus, PairDirections
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.output import MARKER, atomic_folder
+from sfm_shapefit.placement import Placement
 from sfm_shapefit.report import (
     SCHEMA_VERSION,
     CameraRow,
     PairRow,
     PieceRow,
     solve_summary,
-    write_csv,
     write_json,
+    write_rows,
 )
 from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
-from sfm_shapefit.robust import Assessment, Verdict
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.robust import Verdict
+from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
     import pycolmap
 
 _SMALLEST_PIECE = 3  # cameras; two cameras of one pair are no piece worth a line
+_ALARMING_SHARE = 0.5  # of pairs that contradict the solution
+_SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,14 +67,9 @@ class LocateResult:
     """The input as read; camera k below is its image k."""
     directions: PairDirections
     """All pairs that were looked at, with their support."""
-    graph: ViewGraph
-    """All cameras and the usable directions; edge e is row `directions.usable()[e]`."""
-    pieces: list[RigidPiece]
-    """Parallel-rigid pieces of `graph`, largest first."""
-    solve: SolverResult
-    """The solve of piece 0; its row e is edge `pieces[0].edges[e]` of `graph`."""
-    assessment: Assessment
-    """Evidence for the pairs and cameras of piece 0, in the solver's units."""
+    placement: Placement
+    """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
+    largest rigid piece solved, and the evidence for it, in the solver's units."""
     gauge: Gauge
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
@@ -80,80 +79,148 @@ class LocateResult:
     warnings: tuple[str, ...]
     """What the user should know, a sentence each."""
 
+    @property
+    def solve(self) -> SolverResult:
+        """The certified solve of the largest rigid piece."""
+        return self.placement.solve
 
-def camera_rows(found: LocateResult) -> list[CameraRow]:
-    """Return one row per image of the input: the posed ones by id, then those without a rotation."""
-    placed = {camera: k for k, camera in enumerate(found.pieces[0].cameras.tolist())}
-    homes = _home_pieces(found)
-    reasons = left_out_reasons(found.graph, found.pieces)
-    degrees = found.graph.degrees()
-    sigmas = found.assessment.sigmas * found.gauge.similarity.scale
-    rows = []
-    for camera, image_id in enumerate(found.model.image_ids.tolist()):
-        row = CameraRow(name=found.model.names[camera], piece=homes[camera], degree=int(degrees[camera]))
-        if camera not in placed:
-            rows.append(replace(row, reason=_reason(found, camera, reasons[camera])))
-            continue
-        k = placed[camera]
-        x, y, z = found.reconstruction.image(image_id).projection_center().tolist()
-        trust, (sigma_x, sigma_y, sigma_z) = float(found.assessment.trust[k]), sigmas[k].tolist()
-        row = replace(row, placed=True, x=x, y=y, z=z, trust=trust)
-        rows.append(replace(row, sigma_x=sigma_x, sigma_y=sigma_y, sigma_z=sigma_z))
-    unposed = sorted(set(_all_names(found)) - set(found.model.names))
-    return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+    @property
+    def pieces(self) -> list[RigidPiece]:
+        """The parallel-rigid pieces of the view graph, largest first."""
+        return self.placement.pieces
 
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per image of the input: the posed ones by id, then those without a rotation."""
+        placed_ids = self.model.image_ids[self.placement.cameras].tolist()
+        images = [self.reconstruction.image(image_id) for image_id in placed_ids]
+        centers = np.array([image.projection_center() for image in images])
+        rows = camera_rows(self.placement, centers, self.gauge.similarity.scale)
+        alone = np.flatnonzero(self.placement.graph.degrees() == 0).tolist()
+        for camera in alone:
+            rows[camera] = replace(rows[camera], reason=_why_no_direction(self.directions, camera))
+        unposed = sorted(set(_all_names(self)) - set(self.model.names))
+        return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
-def pair_rows(found: LocateResult) -> list[PairRow]:
-    """Return one row per pair that was looked at, usable or not, in the order of pairs."""
-    names, looked_at = found.model.names, found.directions
-    usable = looked_at.usable()
-    solved_row = np.full(len(looked_at.pairs), -1, dtype=np.int64)
-    solved_row[usable[found.pieces[0].edges]] = np.arange(len(found.pieces[0].edges))
-    weights = found.graph.weights[found.pieces[0].edges]
-    dual_norms = np.linalg.norm(found.solve.dual, axis=1) / weights
-    rows = []
-    for p, (i, j) in enumerate(looked_at.pairs.tolist()):
-        vx, vy, vz = looked_at.directions[p].tolist()
-        row = PairRow(
-            name1=names[i], name2=names[j], vx=vx, vy=vy, vz=vz, support=int(looked_at.num_inliers[p])
-        )
-        e = int(solved_row[p])
-        if e >= 0:
-            verdict = Verdict.INLIER if found.assessment.inliers[e] else Verdict.OUTLIER
-            rows.append(
-                replace(
-                    row,
-                    weight=float(weights[e]),
-                    residual_deg=float(found.assessment.residuals_deg[e]),
-                    dual_norm=float(dual_norms[e]),
-                    verdict=verdict.value,
-                )
+    @property
+    def pairs(self) -> list[PairRow]:
+        """One row per pair that was looked at, usable or not, in the order of pairs."""
+        usable = iter(pair_rows(self.placement, self.directions.num_inliers[self.directions.usable()]))
+        names = self.model.names
+        return [
+            next(usable)
+            if status is DirectionStatus.USABLE
+            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
+            for (i, j), status, support in zip(
+                self.directions.pairs.tolist(),
+                self.directions.status,
+                self.directions.num_inliers.tolist(),
+                strict=True,
             )
-        elif looked_at.status[p] is DirectionStatus.USABLE:
-            rows.append(replace(row, reason="a camera of the pair is not placed"))
-        else:
-            rows.append(replace(row, reason=looked_at.status[p].value))
+        ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphResult:
+    """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
+
+    path: Path
+    """The graph's file."""
+    options: SolverOptions
+    placement: Placement
+    timings_s: dict[str, float]
+    """Wall-clock seconds per stage."""
+
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per node."""
+        return camera_rows(self.placement, self.placement.solve.locations, 1.0)
+
+    @property
+    def pairs(self) -> list[PairRow]:
+        """One row per edge."""
+        return pair_rows(self.placement, np.zeros(self.placement.graph.num_edges, dtype=np.int64))
+
+
+def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+    """Return one row per camera of a placed graph.
+
+    Args:
+        placement: the graph and its solution.
+        centers: (k, d) centres of the placed cameras in the output's units.
+        scale: the output's units in one unit of the solver.
+    """
+    graph = placement.graph
+    row_of = {camera: k for k, camera in enumerate(placement.cameras.tolist())}
+    homes = _home_pieces(placement)
+    reasons = left_out_reasons(graph, placement.pieces)
+    sigmas = scale * placement.assessment.sigmas
+    rows = []
+    for camera, degree in enumerate(graph.degrees().tolist()):
+        row = CameraRow(name=_name(graph, camera), piece=homes[camera], degree=degree)
+        k = row_of.get(camera)
+        if k is None:
+            rows.append(replace(row, reason=reasons[camera]))
+            continue
+        rows.append(
+            replace(
+                row,
+                placed=True,
+                center=tuple(centers[k].tolist()),
+                trust=float(placement.assessment.trust[k]),
+                sigma=tuple(sigmas[k].tolist()),
+            )
+        )
     return rows
 
 
-def piece_rows(found: LocateResult) -> list[PieceRow]:
+def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
+    """Return one row per edge of a placed graph; `support` (m,) is their number of inlier matches."""
+    graph, assessment = placement.graph, placement.assessment
+    row_of = {edge: e for e, edge in enumerate(placement.edges.tolist())}
+    dual_norms = np.linalg.norm(placement.solve.dual, axis=1) / graph.weights[placement.edges]
+    rows = []
+    for edge, (i, j) in enumerate(graph.edges.tolist()):
+        row = PairRow(
+            name1=_name(graph, i),
+            name2=_name(graph, j),
+            direction=tuple(graph.directions[edge].tolist()),
+            support=int(support[edge]),
+            weight=float(graph.weights[edge]),
+        )
+        e = row_of.get(edge)
+        if e is None:
+            rows.append(replace(row, reason="outside the piece that is solved"))
+            continue
+        verdict = Verdict.INLIER if assessment.inliers[e] else Verdict.OUTLIER
+        rows.append(
+            replace(
+                row,
+                residual_deg=float(assessment.residuals_deg[e]),
+                dual_norm=float(dual_norms[e]),
+                verdict=verdict.value,
+            )
+        )
+    return rows
+
+
+def piece_rows(placement: Placement, scale: str) -> list[PieceRow]:
     """Return one row per parallel-rigid piece of three cameras or more, and for the solved one."""
-    names = found.model.names
     return [
         PieceRow(
             num_cameras=len(piece.cameras),
-            scale=found.gauge.statement if k == 0 else "free, not solved",
-            hinges=[names[hinge] for hinge in piece.hinges.tolist()],
+            scale=scale if k == 0 else "free, not solved",
+            hinges=[_name(placement.graph, hinge) for hinge in piece.hinges.tolist()],
         )
-        for k, piece in enumerate(found.pieces)
+        for k, piece in enumerate(placement.pieces)
         if k == 0 or len(piece.cameras) >= _SMALLEST_PIECE
     ]
 
 
 def summary(found: LocateResult) -> dict[str, Any]:
     """Return what stands in locate.json: plain values, schema version first."""
-    num_outliers = int(np.sum(~found.assessment.inliers))
-    num_unusable = len(found.directions.pairs) - len(found.directions.usable())
+    placement = found.placement
+    num_unusable = len(found.directions.pairs) - placement.graph.num_edges
     return {
         "schema_version": SCHEMA_VERSION,
         "inputs": {
@@ -163,23 +230,52 @@ def summary(found: LocateResult) -> dict[str, Any]:
         },
         "options": asdict(found.options),
         "num_images": len(_all_names(found)),
-        "num_placed": len(found.pieces[0].cameras),
+        "num_placed": len(placement.cameras),
         "num_pairs": len(found.directions.pairs),
-        "num_pairs_rejected": num_unusable + num_outliers,
+        "num_pairs_rejected": num_unusable + len(placement.rejected_pairs),
         "pairs": {status.name.lower(): count for status, count in found.directions.counts().items()}
-        | {"outlier": num_outliers},
+        | {"outlier": len(placement.rejected_pairs)},
         "num_points": found.reconstruction.num_points3D(),
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
-        "residual_level_deg": found.assessment.level_deg,
+        "residual_level_deg": placement.assessment.level_deg,
         "scale": found.gauge.statement,
-        "pieces": [asdict(row) for row in piece_rows(found)],
+        "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
         "solve": solve_summary(found.solve),
         "bundle_adjustment": found.adjusted and _adjustment_summary(found.adjusted),
         "timings_s": found.timings_s,
         "warnings": list(found.warnings),
-        "versions": {"sfm_shapefit": __version__}
-        | {name: version(name) for name in ("pycolmap", "numpy", "scipy", "clarabel")},
+        "versions": _versions(),
     }
+
+
+def graph_summary(found: GraphResult) -> dict[str, Any]:
+    """Return what stands in the locate.json of a bare graph."""
+    placement = found.placement
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "inputs": {"graph": str(found.path)},
+        "options": asdict(found.options),
+        "dimension": placement.graph.dimension,
+        "num_images": placement.graph.num_cameras,
+        "num_placed": len(placement.cameras),
+        "num_pairs": placement.graph.num_edges,
+        "num_pairs_rejected": len(placement.rejected_pairs),
+        "residual_level_deg": placement.assessment.level_deg,
+        "pieces": [asdict(row) for row in piece_rows(placement, _SOLVER_SCALE)],
+        "solve": solve_summary(placement.solve),
+        "timings_s": found.timings_s,
+        "warnings": list(quality_warnings(placement)),
+        "versions": _versions(),
+    }
+
+
+def quality_warnings(placement: Placement) -> Iterator[str]:
+    """Yield what the user should know about a solution, a sentence each."""
+    if placement.solve.status is not Status.CONVERGED:
+        yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
+    share = len(placement.rejected_pairs) / len(placement.edges)
+    if share > _ALARMING_SHARE:
+        yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
 
 
 def write_result(
@@ -199,9 +295,29 @@ def write_result(
     inputs = [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     with atomic_folder(out, overwrite=overwrite, protect=[*inputs, *protect]) as folder:
         write_model(found.reconstruction, folder)
-        write_csv(camera_rows(found), CameraRow, folder / "cameras.csv")
-        write_csv(pair_rows(found), PairRow, folder / "pairs.csv")
-        write_json(summary(found), folder / MARKER)
+        _write_tables(found, summary(found), folder)
+
+
+def write_graph_result(found: GraphResult, out: Path | str, *, overwrite: bool = False) -> None:
+    """Write the tables of a bare graph like `write_result`; there is no model."""
+    with atomic_folder(out, overwrite=overwrite, protect=[found.path]) as folder:
+        _write_tables(found, graph_summary(found), folder)
+
+
+def _write_tables(found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path) -> None:
+    dimension = found.placement.graph.dimension
+    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    write_json(facts, folder / MARKER)
+
+
+def _versions() -> dict[str, str]:
+    others = ("pycolmap", "numpy", "scipy", "clarabel")
+    return {"sfm_shapefit": __version__} | {name: version(name) for name in others}
+
+
+def _name(graph: ViewGraph, camera: int) -> str:
+    return str(camera) if graph.names is None else graph.names[camera]
 
 
 def _all_names(found: LocateResult) -> list[str]:
@@ -209,26 +325,23 @@ def _all_names(found: LocateResult) -> list[str]:
     return [image.name for image in found.model.reconstruction.images.values()]
 
 
-def _home_pieces(found: LocateResult) -> list[int | None]:
+def _home_pieces(placement: Placement) -> list[int | None]:
     """Return the first piece of three cameras or more that holds each camera, or the solved one."""
-    homes: list[int | None] = [None] * found.graph.num_cameras
-    for k, piece in reversed(list(enumerate(found.pieces))):
+    homes: list[int | None] = [None] * placement.graph.num_cameras
+    for k, piece in reversed(list(enumerate(placement.pieces))):
         if k == 0 or len(piece.cameras) >= _SMALLEST_PIECE:
             for camera in piece.cameras.tolist():
                 homes[camera] = k
     return homes
 
 
-def _reason(found: LocateResult, camera: int, fallback: str) -> str:
-    """Return why a camera is not placed; for one without usable pairs, what became of its pairs."""
-    if found.graph.degrees()[camera] > 0:
-        return fallback
-    own = (found.directions.pairs == camera).any(axis=1)
-    if not own.any():
+def _why_no_direction(directions: PairDirections, camera: int) -> str:
+    """Say what became of the pairs of a camera none of whose pairs has a usable direction."""
+    own = np.flatnonzero((directions.pairs == camera).any(axis=1)).tolist()
+    if not own:
         return "no matches with any posed image"
-    causes = Counter(found.directions.status[p].value for p in np.flatnonzero(own).tolist())
-    cause, count = causes.most_common(1)[0]
-    return f"no usable direction in {int(own.sum())} pairs, most often ({count}): {cause}"
+    cause, count = Counter(directions.status[p].value for p in own).most_common(1)[0]
+    return f"no usable direction in {len(own)} pairs, most often ({count}): {cause}"
 
 
 def _adjustment_summary(adjusted: Adjusted) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, csc_array, eye_array
 from scipy.sparse.linalg import splu
+from scipy.special import chdtri
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
@@ -23,14 +24,11 @@ from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import adjoint, along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
-_MEDIAN_OF_RAYLEIGH = 1.1774  # median length of a 2-vector of unit normal components
-_OUTLIER_CHI2 = 25.0  # 5 sigma: one in 270,000 of normal residuals
+_OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
 _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _DENSE_UNKNOWNS = 1500
-_RIDGE = (
-    1e-12  # of the largest diagonal entry: keeps a camera that nothing holds finite, and far above any limit
-)
+_RIDGE = 1e-12  # of the largest diagonal entry: a camera that nothing holds becomes infinite, not singular
 _SAMPLES = 200  # standard deviations from 200 samples are right to 5 %
 
 
@@ -56,31 +54,36 @@ class Assessment:
     trust: FloatArray
     """(n,) share of the camera's pairs that agree with the solution."""
     sigmas: FloatArray
-    """(n, 3) standard deviation of each location in the units of `locations`, with centroid and scale
+    """(n, d) standard deviation of each location in the units of `locations`, with centroid and scale
     held fixed; infinite for cameras outside the largest rigid piece of the inlier pairs."""
 
 
-def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray) -> Assessment:
+def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray | None = None) -> Assessment:
     """Judge pairs and cameras by a solution.
 
     Args:
-        graph: the solved view graph, d = 3.
-        locations: (n, 3) its locations.
-        covariance: (m, 2, 2) covariance of each direction in `tangent_bases(graph.directions)`, rad^2;
-            NaN where it is unknown.
+        graph: the solved view graph.
+        locations: (n, d) its locations.
+        covariance: (m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`,
+            rad^2; NaN where it is unknown, None where all are.
     """
+    freedom = graph.dimension - 1
+    own = 0.0 if covariance is None else np.nan_to_num(covariance)
     baselines = differences(locations, graph.edges)
     residuals_deg = angle_between_deg(graph.directions, normalized(baselines))
     residuals_deg = np.where(np.isnan(residuals_deg), 180.0, residuals_deg)  # coincident cameras
-    level = max(np.radians(np.median(residuals_deg)) / _MEDIAN_OF_RAYLEIGH, _MIN_LEVEL_RAD)
-    information = np.linalg.inv(np.nan_to_num(covariance) + level**2 * np.eye(2))
+    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
+    level = max(np.radians(np.median(residuals_deg)) / median_length, _MIN_LEVEL_RAD)
+    information = np.linalg.inv(
+        own + level**2 * np.broadcast_to(np.eye(freedom), (graph.num_edges, freedom, freedom))
+    )
 
     bases = tangent_bases(graph.directions)
     tangential = np.einsum("edk,ed->ek", bases, normalized(baselines))
     tangential = normalized(tangential) * np.radians(residuals_deg)[:, None]  # angle, also beyond 90 deg
     chi2 = np.einsum("ek,ekl,el->e", *(np.nan_to_num(tangential), information, np.nan_to_num(tangential)))
     behind = along(baselines, graph.directions) <= 0.0
-    inliers: BoolArray = (chi2 <= _OUTLIER_CHI2) & ~behind
+    inliers: BoolArray = (chi2 <= chdtri(freedom, _OUTLIER_PROBABILITY)) & ~behind
 
     agreeing = np.bincount(graph.edges[inliers].ravel(), minlength=graph.num_cameras)
     return Assessment(
@@ -95,12 +98,12 @@ def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray) -> A
 def _location_sigmas(
     graph: ViewGraph, locations: FloatArray, inliers: BoolArray, information: FloatArray
 ) -> FloatArray:
-    """Return the standard deviations of the locations from the (m, 3, 3) information of the directions.
+    """Return the standard deviations of the locations from the (m, d, d) information of the directions.
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
     """
     sigmas = np.full(locations.shape, np.inf)
-    pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], 3)
+    pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], graph.dimension)
     rows = np.flatnonzero(inliers)[pieces == 0]
     held, edges = np.unique(graph.edges[rows], return_inverse=True)
     if len(held) < _SMALLEST_RIGID:
@@ -110,52 +113,52 @@ def _location_sigmas(
     blocks = information[rows] / np.maximum(lengths, 1e-12 * lengths.max())[:, None, None] ** 2
     variances_of = _dense_variances if t.size <= _DENSE_UNKNOWNS else _sampled_variances
     variances = variances_of(len(held), edges, blocks, _gauge_directions(t))
-    found = np.sqrt(np.maximum(variances, 0.0)).reshape(-1, 3)
+    found = np.sqrt(np.maximum(variances, 0.0)).reshape(t.shape)
     is_loose = (found > np.ptp(t, axis=0).max()).any(axis=1)
     sigmas[held] = np.where(is_loose[:, None], np.inf, found)
     return sigmas
 
 
 def _gauge_directions(locations: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (3n, 4) of what the program fixes: three shifts and the scale."""
-    n = len(locations)
-    centred = locations - locations.mean(axis=0)
-    basis = np.column_stack([np.tile(np.eye(3), (n, 1)) / np.sqrt(n), centred.ravel()])
-    basis[:, 3] /= np.linalg.norm(basis[:, 3])
-    return basis
+    """Return an orthonormal basis (n d, d + 1) of what the program fixes: the shifts and the scale."""
+    n, d = locations.shape
+    centred = (locations - locations.mean(axis=0)).ravel()
+    return np.column_stack([np.tile(np.eye(d), (n, 1)) / np.sqrt(n), centred / np.linalg.norm(centred)])
 
 
 def _block_laplacian(n: int, edges: IntArray, blocks: FloatArray) -> csc_array:
-    """Return H = D^T diag(blocks) D, shape (3n, 3n)."""
+    """Return H = D^T diag(blocks) D, shape (n d, n d)."""
     i, j = edges.T
+    d = blocks.shape[1]
     corners = ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0))
-    axis_a, axis_b = (axis.ravel() for axis in np.indices((3, 3)))
-    rows = np.concatenate([(3 * a[:, None] + axis_a).ravel() for a, _, _ in corners])
-    columns = np.concatenate([(3 * b[:, None] + axis_b).ravel() for _, b, _ in corners])
+    axis_a, axis_b = (axis.ravel() for axis in np.indices((d, d)))
+    rows = np.concatenate([(d * a[:, None] + axis_a).ravel() for a, _, _ in corners])
+    columns = np.concatenate([(d * b[:, None] + axis_b).ravel() for _, b, _ in corners])
     values = np.concatenate([(sign * blocks).ravel() for _, _, sign in corners])
-    return coo_array((values, (rows, columns)), shape=(3 * n, 3 * n)).tocsc()
+    return coo_array((values, (rows, columns)), shape=(d * n, d * n)).tocsc()
 
 
 def _dense_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
-    """Return the diagonal of the inverse of H on the complement of the gauge, shape (3n,)."""
+    """Return the diagonal of the inverse of H on the complement of the gauge, shape (n d,)."""
     hessian = _block_laplacian(n, edges, blocks).toarray()
     size = float(hessian.diagonal().max())
-    hessian += size * gauge @ gauge.T + _RIDGE * size * np.eye(3 * n)
+    hessian += size * gauge @ gauge.T + _RIDGE * size * np.eye(len(hessian))
     inverse = np.linalg.inv(hessian)
     return np.asarray(np.diagonal(inverse) - np.sum(gauge**2, axis=1) / size)
 
 
 def _sampled_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
-    """Estimate the same diagonal from samples H^-1 b with b of covariance H, shape (3n,)."""
+    """Estimate the same diagonal from samples H^-1 b with b of covariance H, shape (n d,)."""
     hessian = _block_laplacian(n, edges, blocks)
     ridge = _RIDGE * float(hessian.diagonal().max())
-    factor = splu((hessian + ridge * eye_array(3 * n, format="csc")).tocsc(), permc_spec="MMD_AT_PLUS_A")
+    regular = (hessian + ridge * eye_array(hessian.shape[0], format="csc")).tocsc()
+    factor = splu(regular, permc_spec="MMD_AT_PLUS_A")
     values, vectors = np.linalg.eigh(blocks)
     roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
     rng = np.random.default_rng(0)
-    total = np.zeros(3 * n)
+    total = np.zeros(len(gauge))
     for _ in range(_SAMPLES):
-        noise = np.einsum("eab,eb->ea", roots, rng.standard_normal((len(edges), 3)))
+        noise = np.einsum("eab,eb->ea", roots, rng.standard_normal(blocks.shape[:2]))
         sample = factor.solve(adjoint(noise, edges, n).ravel())
         sample -= gauge @ (gauge.T @ sample)
         total += sample**2

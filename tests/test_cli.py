@@ -237,7 +237,7 @@ def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(results, "write_csv", interrupted)
+    monkeypatch.setattr(results, "write_rows", interrupted)
     assert "interrupted" in refused(run("locate", RING_MODEL, tmp_path / "out"), 130)
     assert list(tmp_path.iterdir()) == []
 

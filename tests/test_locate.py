@@ -10,7 +10,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.check import check_model_files
-from sfm_shapefit.results import camera_rows, pair_rows, summary, write_result
+from sfm_shapefit.results import summary, write_result
 from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
 
 
@@ -39,7 +39,7 @@ def test_the_courtyard_is_placed_in_spite_of_a_quarter_of_wrong_pairs(courtyard)
 
 
 def test_the_pairs_that_contradict_the_solution_are_the_wrong_ones(courtyard):
-    outliers = {(row.name1, row.name2) for row in pair_rows(courtyard) if row.verdict == "outlier"}
+    outliers = {(row.name1, row.name2) for row in courtyard.pairs if row.verdict == "outlier"}
     assert outliers == true_corruption()
 
 
@@ -114,7 +114,7 @@ def test_relative_poses_serve_when_asked_for(tmp_path):
 
 def test_the_same_input_gives_the_same_bits(courtyard):
     again = sfm_shapefit.locate(COURTYARD / "sparse" / "0", options=LocateOptions(threads=2))
-    assert camera_rows(again) == camera_rows(courtyard)
+    assert again.cameras == courtyard.cameras
     ours, theirs = courtyard.reconstruction.points3D, again.reconstruction.points3D
     assert sorted(ours) == sorted(theirs)
     assert all((ours[i].xyz == theirs[i].xyz).all() for i in ours)
@@ -143,7 +143,7 @@ def test_a_camera_that_hangs_by_one_pair_is_left_out_by_name(tmp_path):
     scene = copied(RING, tmp_path)
     keep_pairs(scene / "database.db", lambda i, j: 1 not in (i, j) or (i, j) == (1, 2))
     found = sfm_shapefit.locate(scene / "sparse" / "0")
-    rows = {row.name: row for row in camera_rows(found)}
+    rows = {row.name: row for row in found.cameras}
     assert [name for name, row in rows.items() if not row.placed] == ["0001.jpg"]
     assert rows["0001.jpg"].reason == "pendant: joined by a single pair to 0002.jpg"
     assert found.reconstruction.num_reg_images() == 7
@@ -165,7 +165,7 @@ def test_two_groups_joined_at_one_camera_are_two_pieces(tmp_path):
     facts = summary(found)
     assert [piece["num_cameras"] for piece in facts["pieces"]] == [5, 4]
     assert [piece["hinges"] for piece in facts["pieces"]] == [["0004.jpg"], ["0004.jpg"]]
-    reasons = {row.reason for row in camera_rows(found) if not row.placed}
+    reasons = {row.reason for row in found.cameras if not row.placed}
     assert reasons == {"another rigid piece, hinged at 0004.jpg"}
 
 
@@ -236,8 +236,8 @@ def test_standard_deviations_are_in_the_outputs_units(courtyard):
     doubled.transform(pycolmap.Sim3d(2.0, pycolmap.Rotation3d(), np.zeros(3)))
     once = sfm_shapefit.locate(COURTYARD / "truth", COURTYARD / "database.db")
     twice = sfm_shapefit.locate(doubled, COURTYARD / "database.db")
-    for small, large in zip(camera_rows(once), camera_rows(twice), strict=True):
-        assert large.sigma_x == pytest.approx(2.0 * small.sigma_x, rel=1e-6)
+    for small, large in zip(once.cameras, twice.cameras, strict=True):
+        assert large.sigma == pytest.approx([2.0 * value for value in small.sigma], rel=1e-6)
 
 
 def test_images_missing_from_the_database_are_warned_about(tmp_path):
@@ -246,7 +246,7 @@ def test_images_missing_from_the_database_are_warned_about(tmp_path):
     model.image(3).name = "elsewhere.jpg"
     found = sfm_shapefit.locate(model, scene / "database.db")
     assert any("elsewhere.jpg" in warning for warning in found.warnings)
-    row = next(row for row in camera_rows(found) if row.name == "elsewhere.jpg")
+    row = next(row for row in found.cameras if row.name == "elsewhere.jpg")
     assert row.reason == "no matches with any posed image"
 
 
@@ -254,9 +254,9 @@ def test_images_without_a_rotation_are_listed():
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     model.deregister_frame(model.image(5).frame_id)
     found = sfm_shapefit.locate(model, RING / "database.db")
-    row = next(row for row in camera_rows(found) if row.name == "0005.jpg")
+    row = next(row for row in found.cameras if row.name == "0005.jpg")
     assert row.reason == "the input has no rotation for it"
-    assert len(camera_rows(found)) == 8
+    assert len(found.cameras) == 8
 
 
 def test_options_out_of_range_are_refused_by_name():

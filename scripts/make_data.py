@@ -1,0 +1,106 @@
+"""Write the bundled scenes: `python scripts/make_data.py --out data_synthetic`.
+
+Each scene is replaced whole; the same versions of numpy and OpenCV give the same arrays.
+"""
+
+import argparse
+import shutil
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
+from sfm_shapefit.synthetic import SceneOptions, make_scene
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BundledScene:
+    """How a bundled scene is made, and what it is for."""
+
+    purpose: str
+    scene: SceneOptions
+    workspace: WorkspaceOptions
+
+
+SCENES = {
+    "courtyard": BundledScene(
+        purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
+        " a way that looks right, and 5 % of the matches of every pair are wrong. `sparse/0` knows the"
+        " rotations only: all centres are at the origin and there are no points. `truth` is the exact model.",
+        scene=SceneOptions(
+            shape="courtyard",
+            num_images=25,
+            num_points=1500,
+            pixel_noise_px=0.5,
+            wrong_match_fraction=0.05,
+            corrupted_pair_fraction=0.25,
+            max_pairs_per_image=24,
+            focal_length_px=720.0,
+            seed=4,
+        ),
+        workspace=WorkspaceOptions(model="rotations"),
+    ),
+    "ring8": BundledScene(
+        purpose="Eight cameras around a ball, without noise and without corruption: the answer is exact to"
+        " the rounding of the database's 32-bit keypoints. `sparse/0` is the exact model.",
+        scene=SceneOptions(
+            shape="ring", num_images=8, num_points=1000, pixel_noise_px=0.0, min_matches=15, seed=8
+        ),
+        workspace=WorkspaceOptions(),
+    ),
+    "facade9": BundledScene(
+        purpose="Nine cameras in a grid before a facade, 0.5 px noise. There is no database: the tracks of"
+        " the exact model in `sparse/0` are the only source of directions.",
+        scene=SceneOptions(shape="facade", num_images=9, num_points=400, pixel_noise_px=0.5, seed=9),
+        workspace=WorkspaceOptions(database=False),
+    ),
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the scenes")
+    out = parser.parse_args().out
+    for name in SCENES:
+        write_scene(name, out / name)
+        size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
+        print(f"{out / name}: {size_kb:.0f} kB")
+
+
+def write_scene(name: str, folder: Path) -> None:
+    """Write one bundled scene with its SOURCE.md, in place of what stands there."""
+    if folder.exists():
+        shutil.rmtree(folder)
+    write_workspace(make_scene(SCENES[name].scene), folder, SCENES[name].workspace)
+    (folder / "SOURCE.md").write_text(source_text(name), encoding="utf-8")
+
+
+def source_text(name: str) -> str:
+    """Return what SOURCE.md says: what the scene is, and the commands that make it."""
+    bundled = SCENES[name]
+    flags = _changed_flags(bundled.scene) + _changed_flags(bundled.workspace)
+    return (
+        f"# {name}\n\n{bundled.purpose}\n\n"
+        f"Synthetic, seed {bundled.scene.seed}. Made, with the other scenes, by\n\n"
+        f"    python scripts/make_data.py --out data_synthetic\n\nand alone by\n\n"
+        f"    sfm-shapefit synth {name} {' '.join(flags)}\n"
+    )
+
+
+def _changed_flags(options: SceneOptions | WorkspaceOptions) -> list[str]:
+    """Return the command-line flags of the options that differ from their defaults."""
+    default = type(options)()
+    flags = []
+    for field in fields(options):
+        value = getattr(options, field.name)
+        flag = field.name.replace("_", "-")
+        if value == getattr(default, field.name):
+            continue
+        if isinstance(value, bool):
+            flags.append(f"--{flag}" if value else f"--no-{flag}")
+        else:
+            flags.append(f"--{flag} {value}")
+    return flags
+
+
+if __name__ == "__main__":
+    main()

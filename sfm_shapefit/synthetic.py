@@ -1,0 +1,795 @@
+"""Synthetic input whose truth is known: photographed scenes, and bare graphs of directions.
+
+A scene is made in the order in which a real one comes about:
+
+    surfaces and cameras (`SceneOptions.shape`)
+      -> keypoints:  x = K R (X - C) for the points in front of the camera, in view and facing it, plus noise
+      -> pairs:      the images that share most points, with their shared points as matches
+      -> corruption: whole pairs that show a false baseline, and random matches inside every list
+
+A corrupted pair is wrong the way a repeated facade makes it wrong: its list satisfies the epipolar
+constraint of the true relative rotation and of a baseline that does not exist, so nothing inside the pair
+gives it away. Its second image gets keypoints of its own for that, which belong to no point.
+
+The bare graphs are those of Hand, Lee and Voroninski (2015), section 4: each direction is replaced by a
+uniformly random unit vector with probability q, and is else the true one plus noise, normalised.
+
+Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner.
+World axes: z is up; one unit is a metre. This module is the one door to OpenCV, which is imported when a
+scene is projected and not before.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import coo_array, csr_array
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import angle_between_deg, normalized
+
+Shape = Literal["ring", "facade", "drive", "cloud", "courtyard"]
+ByteArray = npt.NDArray[np.uint8]
+Seed = int | np.random.Generator
+
+_NEAREST_DEPTH_M = 0.3  # nothing is photographed closer than this
+_FARTHEST_M = 40.0  # surface texture is too small to be detected beyond
+_LARGEST_VIEW_ANGLE_DEG = 80.0  # between a surface's normal and the line of sight; also the occlusion rule
+_SMALLEST_FALSE_ANGLE_DEG = 10.0  # a corrupted pair's direction is off by at least this
+_MOST_FALSE_MATCHES = 200  # of a corrupted pair: keeps the number of extra keypoints low
+_RELATIVE_POSE_DIRECTION_FACTOR = 3.0  # direction error over rotation error of a two-view estimate, roughly
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SceneOptions:
+    """What to photograph, and how badly. Every field is a flag of `sfm-shapefit synth`."""
+
+    shape: Shape = "ring"
+    """"ring": cameras around an object; "facade": a grid of cameras before a wall; "drive": forward along a
+    street; "cloud": random cameras around random points; "courtyard": around the inside of four facades."""
+    num_images: int = 25
+    """Number of images, all by one camera."""
+    num_points: int = 2000
+    """Number of surface points; those seen by fewer than two images stay out of the model."""
+    pixel_noise_px: float = 0.5
+    """Standard deviation of each keypoint coordinate."""
+    wrong_match_fraction: float = 0.0
+    """Fraction of each pair's matches that join random keypoints of the list."""
+    corrupted_pair_fraction: float = 0.0
+    """Fraction of the pairs whose whole list agrees on a false baseline."""
+    rotation_noise_deg: float = 0.0
+    """Standard deviation, about each axis, of the error of the rotations that the model states."""
+    max_pairs_per_image: int = 20
+    """Each image is paired with that many others, those it shares most points with; a pair is kept if
+    either of its images asks for it."""
+    min_matches: int = 30
+    """Images that share fewer points than this are no pair."""
+    max_keypoints_per_image: int = 1000
+    """The points that appear largest (nearest and most frontal) are kept."""
+    image_width: int = 1200
+    """In pixels."""
+    image_height: int = 900
+    """In pixels."""
+    focal_length_px: float = 1000.0
+    """One for both axes; the principal point is the centre of the image."""
+    seed: int = 0
+    """Decides every random draw."""
+
+    def __post_init__(self) -> None:
+        if self.shape not in get_args(Shape):
+            raise ValueError(f"SceneOptions.shape must be one of {get_args(Shape)}, got {self.shape!r}")
+        for name, least in _SMALLEST_INTEGERS.items():
+            if getattr(self, name) < least:
+                raise ValueError(f"SceneOptions.{name} must be >= {least}, got {getattr(self, name)}")
+        for name in ("pixel_noise_px", "rotation_noise_deg"):
+            if not 0.0 <= getattr(self, name) < np.inf:
+                raise ValueError(f"SceneOptions.{name} must be finite and >= 0, got {getattr(self, name)}")
+        for name in ("wrong_match_fraction", "corrupted_pair_fraction"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"SceneOptions.{name} must lie in [0, 1], got {getattr(self, name)}")
+        if not 0.0 < self.focal_length_px < np.inf:
+            raise ValueError(f"SceneOptions.focal_length_px must be positive, got {self.focal_length_px}")
+
+    @property
+    def calibration(self) -> FloatArray:
+        """The (3, 3) calibration matrix K of every image."""
+        f, x, y = self.focal_length_px, self.image_width / 2.0, self.image_height / 2.0
+        return np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
+
+
+_SMALLEST_INTEGERS = {
+    "num_images": 2,
+    "num_points": 1,
+    "max_pairs_per_image": 1,
+    "min_matches": 8,
+    "max_keypoints_per_image": 8,
+    "image_width": 16,
+    "image_height": 16,
+    "seed": 0,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """A photographed scene: n images, p points, m pairs, M matches, and what is false among them."""
+
+    options: SceneOptions
+    """What made it."""
+    calibration: FloatArray
+    """(3, 3) K, in pixels."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world, true."""
+    centers: FloatArray
+    """(n, 3) camera centres, true."""
+    stated_rotations: FloatArray
+    """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
+    points: FloatArray
+    """(p, 3) surface points."""
+    colors: ByteArray
+    """(p, 3) red, green, blue of each point."""
+    keypoints: tuple[FloatArray, ...]
+    """Per image (k, 2): x, y in pixels. Keypoints of no point come last."""
+    keypoint_points: tuple[IntArray, ...]
+    """Per image (k,): the point of each keypoint, or -1 for the keypoints of corrupted pairs."""
+    pairs: IntArray
+    """(m, 2) image indices (i, j), i < j, in lexicographic order."""
+    match_offsets: IntArray
+    """(m + 1,) the matches of pair e are the rows match_offsets[e]:match_offsets[e + 1]."""
+    matches: IntArray
+    """(M, 2) keypoint index in image i and in image j."""
+    match_is_wrong: BoolArray
+    """(M,) True where random keypoints of the list were joined."""
+    pair_is_corrupted: BoolArray
+    """(m,) True where the whole list agrees on a false baseline."""
+    relative_rotations: FloatArray
+    """(m, 3, 3) rotation of cam_j_from_cam_i as two-view geometry would estimate it."""
+    relative_translations: FloatArray
+    """(m, 3) unit translation of cam_j_from_cam_i, of the false baseline where the pair is corrupted."""
+
+    @property
+    def num_images(self) -> int:
+        """Number of images, n."""
+        return len(self.centers)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number of pairs, m."""
+        return len(self.pairs)
+
+    def matches_of(self, pair: int) -> IntArray:
+        """Return the (k, 2) matches of one pair."""
+        return self.matches[self.match_offsets[pair] : self.match_offsets[pair + 1]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Layout:
+    """Surfaces and cameras, before any photograph."""
+
+    centers: FloatArray
+    rotations: FloatArray
+    points: FloatArray
+    normals: FloatArray
+    colors: ByteArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _FalseList:
+    """The matches of a corrupted pair: one image really shows the points, the other never did."""
+
+    displaced: int
+    """0 or 1: which image of the pair was displaced."""
+    keypoints: IntArray
+    """(k,) keypoints of the other image."""
+    xy: FloatArray
+    """(k, 2) the new keypoints of the displaced image."""
+    center: FloatArray
+    """(3,) where the displaced image would have to be."""
+
+
+def make_scene(options: SceneOptions) -> Scene:
+    """Lay out, photograph, pair and corrupt a scene.
+
+    Raises:
+        InputError: if no two images share `min_matches` points, or if fewer pairs can be corrupted
+            than asked for.
+    """
+    rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
+    layout_rng, pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
+    layout = _LAYOUTS[options.shape](options.num_images, options.num_points, layout_rng)
+    images = [_photograph(layout, image, options, pixel_rng) for image in range(options.num_images)]
+    keypoint_points = [ids for ids, _ in images]
+    keypoints = [xy for _, xy in images]
+    pairs = _pairs(keypoint_points, options)
+
+    false_lists = _false_lists(layout, keypoint_points, pairs, options, corruption_rng)
+    lists = _match_lists(keypoints, keypoint_points, pairs, false_lists)
+    scrambled = [_scrambled(rows, options.wrong_match_fraction, match_rng) for rows in lists]
+    ray_noise_rad = options.pixel_noise_px / options.focal_length_px
+    relative_rotations, relative_translations = _relative_poses(
+        layout, pairs, false_lists, ray_noise_rad, pose_rng
+    )
+    return Scene(
+        options=options,
+        calibration=options.calibration,
+        rotations=layout.rotations,
+        centers=layout.centers,
+        stated_rotations=_turned(layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng),
+        points=layout.points,
+        colors=layout.colors,
+        keypoints=tuple(keypoints),
+        keypoint_points=tuple(keypoint_points),
+        pairs=pairs,
+        match_offsets=np.cumsum([0] + [len(rows) for rows in lists], dtype=np.int64),
+        matches=np.concatenate([rows for rows, _ in scrambled]),
+        match_is_wrong=np.concatenate([wrong for _, wrong in scrambled]),
+        pair_is_corrupted=np.isin(np.arange(len(pairs)), list(false_lists)),
+        relative_rotations=relative_rotations,
+        relative_translations=relative_translations,
+    )
+
+
+def project_points(
+    points: FloatArray, cam_from_world: FloatArray, center: FloatArray, calibration: FloatArray
+) -> FloatArray:
+    """Return the (k, 2) pixels of (k, 3) points in a camera without distortion, by OpenCV.
+
+    Args:
+        points: (k, 3) in world axes.
+        cam_from_world: (3, 3) rotation.
+        center: (3,) camera centre in world axes.
+        calibration: (3, 3) K.
+
+    Raises:
+        ValueError: if a point is not in front of the camera; OpenCV would project it without a word.
+    """
+    import cv2
+
+    offsets = points - center
+    behind = ~(offsets @ cam_from_world[2] > 0.0)
+    if behind.any():
+        raise ValueError(f"point {int(np.argmax(behind))} is not in front of the camera; remove it first")
+    if len(points) == 0:
+        return np.empty((0, 2))
+    rotation_vector, _ = cv2.Rodrigues(cam_from_world)
+    xy, _ = cv2.projectPoints(offsets, rotation_vector, np.zeros(3), calibration, None)
+    return np.asarray(xy, dtype=np.float64).reshape(-1, 2)
+
+
+# --- keypoints -------------------------------------------------------------------------------------------
+
+
+def _photograph(
+    layout: _Layout, image: int, options: SceneOptions, rng: np.random.Generator
+) -> tuple[IntArray, FloatArray]:
+    """Return the points that an image shows, ascending, and their noisy pixels, all inside the image.
+
+    A point shows when it is in front, near enough, inside the image, and faces the camera. Every surface
+    here is convex towards its cameras, so that facing also decides occlusion.
+    """
+    center, cam_from_world = layout.centers[image], layout.rotations[image]
+    ids = np.flatnonzero(_in_view_from(layout.points, center[None], cam_from_world, options)[0])
+    sight = layout.points[ids] - center
+    squared_distance = np.einsum("pa,pa->p", sight, sight)
+    frontality = -np.einsum("pa,pa->p", sight, layout.normals[ids]) / np.sqrt(squared_distance)
+    apparent_size = frontality / squared_distance
+    faces = frontality > np.cos(np.radians(_LARGEST_VIEW_ANGLE_DEG))
+    ids, apparent_size = ids[faces], apparent_size[faces]
+    ids = np.sort(ids[np.argsort(-apparent_size, kind="stable")[: options.max_keypoints_per_image]])
+
+    xy = project_points(layout.points[ids], cam_from_world, center, options.calibration)
+    xy = xy + options.pixel_noise_px * rng.standard_normal(xy.shape)
+    inside = _inside_image(xy, options)
+    return ids[inside].astype(np.int64), xy[inside]
+
+
+def _in_view_from(
+    points: FloatArray,
+    centers: FloatArray,
+    cam_from_world: FloatArray,
+    options: SceneOptions,
+) -> BoolArray:
+    """Return (c, k): which of the points a camera at each of the centres would show, whatever they face."""
+    img_from_world = options.calibration @ cam_from_world
+    homogeneous = (points @ img_from_world.T)[None, :, :] - (centers @ img_from_world.T)[:, None, :]
+    depth = homogeneous[:, :, 2]
+    in_front = (depth > _NEAREST_DEPTH_M) & (depth < _FARTHEST_M)
+    xy = homogeneous[:, :, :2] / np.where(in_front, depth, 1.0)[:, :, None]
+    margin_px = 4.0 * options.pixel_noise_px  # so that noise hardly ever costs a keypoint
+    in_view: BoolArray = in_front & _inside_image(xy, options, margin_px)
+    return in_view
+
+
+def _inside_image(xy: FloatArray, options: SceneOptions, margin_px: float = 0.0) -> BoolArray:
+    """Return which of the pixels (..., 2) lie inside the image, `margin_px` away from its border."""
+    x, y = xy[..., 0], xy[..., 1]
+    in_width = (x >= margin_px) & (x <= options.image_width - margin_px)
+    inside: BoolArray = in_width & (y >= margin_px) & (y <= options.image_height - margin_px)
+    return inside
+
+
+# --- pairs and matches -----------------------------------------------------------------------------------
+
+
+def _pairs(keypoint_points: list[IntArray], options: SceneOptions) -> IntArray:
+    """Return the pairs (m, 2) of images that share most points, i < j, in lexicographic order."""
+    image = np.repeat(np.arange(len(keypoint_points)), [len(ids) for ids in keypoint_points])
+    point = np.concatenate(keypoint_points)
+    shape = (len(keypoint_points), options.num_points)
+    shows = csr_array((np.ones(len(image), dtype=np.int64), (image, point)), shape=shape)
+    shared = coo_array(shows @ shows.T)
+    i, j, count = shared.row, shared.col, shared.data
+    eligible = (i != j) & (count >= options.min_matches)
+    i, j, count = i[eligible], j[eligible], count[eligible]
+    if len(i) == 0:
+        raise InputError(
+            f"no two images of this scene share {options.min_matches} points; raise num_points or num_images"
+        )
+    order = np.lexsort((j, -count, i))
+    i, j = i[order], j[order]
+    rank = np.arange(len(i)) - np.searchsorted(i, i)
+    wanted = rank < options.max_pairs_per_image
+    chosen = np.stack([i[wanted], j[wanted]], axis=1).astype(np.int64)
+    return np.unique(np.sort(chosen, axis=1), axis=0)
+
+
+def _match_lists(
+    keypoints: list[FloatArray],
+    keypoint_points: list[IntArray],
+    pairs: IntArray,
+    false_lists: dict[int, _FalseList],
+) -> list[IntArray]:
+    """Return the (k, 2) matches of each pair, and append to the images the keypoints of the false lists."""
+    real_points = list(keypoint_points)
+    appended = [[xy] for xy in keypoints]
+    count = [len(xy) for xy in keypoints]
+    lists = []
+    for e, pair in enumerate(pairs):
+        if e not in false_lists:
+            lists.append(_shared_keypoints(real_points[pair[0]], real_points[pair[1]]))
+            continue
+        false = false_lists[e]
+        image = pair[false.displaced]
+        new_keypoints = count[image] + np.arange(len(false.xy))
+        appended[image].append(false.xy)
+        count[image] += len(false.xy)
+        columns = [false.keypoints, new_keypoints]
+        lists.append(np.stack(columns if false.displaced == 1 else columns[::-1], axis=1))
+    for image, parts in enumerate(appended):
+        keypoints[image] = np.concatenate(parts)
+        no_point = np.full(count[image] - len(real_points[image]), -1, dtype=np.int64)
+        keypoint_points[image] = np.concatenate([real_points[image], no_point])
+    return lists
+
+
+def _shared_keypoints(points_i: IntArray, points_j: IntArray) -> IntArray:
+    """Return the (k, 2) keypoints of two images that show the same point."""
+    _, in_i, in_j = np.intersect1d(points_i, points_j, assume_unique=True, return_indices=True)
+    return np.stack([in_i, in_j], axis=1).astype(np.int64)
+
+
+def _scrambled(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
+    """Return the matches with `fraction` of them joining random keypoints of the list, and which those are.
+
+    The chosen rows pass their second keypoints on in a random cycle: each of them becomes wrong, and no
+    keypoint is used twice. A cycle takes two rows, so a single wrong match is rounded to none.
+    """
+    wrong = np.zeros(len(matches), dtype=np.bool_)
+    rows = rng.permutation(len(matches))[: round(fraction * len(matches))]
+    if len(rows) < 2:
+        return matches, wrong
+    changed = matches.copy()
+    changed[rows, 1] = np.roll(matches[rows, 1], 1)
+    wrong[rows] = True
+    return changed, wrong
+
+
+# --- corrupted pairs -------------------------------------------------------------------------------------
+
+
+def _false_lists(
+    layout: _Layout,
+    keypoint_points: list[IntArray],
+    pairs: IntArray,
+    options: SceneOptions,
+    rng: np.random.Generator,
+) -> dict[int, _FalseList]:
+    """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs.
+
+    Raises:
+        InputError: if not enough pairs have a false baseline from which their points would be in view.
+    """
+    asked = round(options.corrupted_pair_fraction * len(pairs))
+    found: dict[int, _FalseList] = {}
+    for e in rng.permutation(len(pairs)):
+        if len(found) == asked:
+            break
+        false = _false_list(layout, keypoint_points, pairs[e], options, rng)
+        if false is not None:
+            found[int(e)] = false
+    if len(found) < asked:
+        raise InputError(
+            f"only {len(found)} of the {asked} pairs to corrupt have a false baseline that keeps"
+            f" {options.min_matches} points in view; lower corrupted_pair_fraction or raise num_points"
+        )
+    return found
+
+
+def _false_list(
+    layout: _Layout,
+    keypoint_points: list[IntArray],
+    pair: IntArray,
+    options: SceneOptions,
+    rng: np.random.Generator,
+) -> _FalseList | None:
+    """Return what one camera would show of the other image's points from a false centre, if any fits.
+
+    Its rotation is kept. Centres are tried in the order of `_false_centers`; the first that is wrong by
+    enough and keeps enough points in view is taken. The list is as long as the true one, at most.
+    """
+    side = int(rng.integers(2))
+    displaced, other = pair[side], pair[1 - side]
+    shared = len(_shared_keypoints(keypoint_points[other], keypoint_points[displaced]))
+    chosen = np.sort(rng.permutation(len(keypoint_points[other]))[: 2 * _MOST_FALSE_MATCHES])
+    points = layout.points[keypoint_points[other][chosen]]
+    centers = _false_centers(layout.centers[other], layout.centers[displaced], rng)
+
+    in_view = _in_view_from(points, centers, layout.rotations[displaced], options)
+    angle_deg = angle_between_deg(
+        normalized(layout.centers[other] - centers),
+        normalized(layout.centers[other] - layout.centers[displaced]),
+    )
+    fits = (in_view.sum(axis=1) >= options.min_matches) & (angle_deg >= _SMALLEST_FALSE_ANGLE_DEG)
+    if not fits.any():
+        return None
+    first = int(np.argmax(fits))
+    rows = np.flatnonzero(in_view[first])[: min(shared, _MOST_FALSE_MATCHES)]
+    exact = project_points(points[rows], layout.rotations[displaced], centers[first], options.calibration)
+    noisy = exact + options.pixel_noise_px * rng.standard_normal(exact.shape)
+    kept = _inside_image(noisy, options)
+    return _FalseList(displaced=side, keypoints=chosen[rows][kept], xy=noisy[kept], center=centers[first])
+
+
+def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return candidate centres (c, 3), c <= 40, of a camera that never was, beside the one at `center`.
+
+    First 16 at the true distance in uniformly random directions, the corruption of the paper; then 24
+    around the true centre, ever nearer to it, for pairs whose view axes leave less freedom. None is so
+    near to the other camera that its direction would be ill determined.
+    """
+    baseline = float(np.linalg.norm(center - true_center))
+    unit = normalized(rng.standard_normal((40, 3)))
+    anywhere = center + baseline * unit[:16]
+    nearby = true_center + baseline * np.linspace(1.0, 0.25, 24)[:, None] * unit[16:]
+    candidates = np.concatenate([anywhere, nearby])
+    far_enough = np.linalg.norm(candidates - center, axis=1) >= 0.5 * baseline
+    kept: FloatArray = candidates[far_enough]
+    return kept
+
+
+def _relative_poses(
+    layout: _Layout,
+    pairs: IntArray,
+    false_lists: dict[int, _FalseList],
+    ray_noise_rad: float,
+    rng: np.random.Generator,
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotation (m, 3, 3) and unit translation (m, 3) of cam_j_from_cam_i for each pair.
+
+    Two-view estimates err by about the noise of one ray in rotation and a few times that in direction;
+    errors of that size are added, and none when the keypoints are exact.
+    """
+    centers = layout.centers[pairs]
+    for e, false in false_lists.items():
+        centers[e, false.displaced] = false.center
+    rotation_i, rotation_j = layout.rotations[pairs].swapaxes(0, 1)
+    rotation = _turned(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
+    translation = normalized(np.einsum("eab,eb->ea", rotation_j, centers[:, 0] - centers[:, 1]))
+    noise = _RELATIVE_POSE_DIRECTION_FACTOR * ray_noise_rad * rng.standard_normal(translation.shape)
+    return rotation, normalized(translation + noise)
+
+
+def _turned(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:
+    """Return the rotations (n, 3, 3) after small random turns, N(0, sigma^2) about each camera axis."""
+    from scipy.spatial.transform import Rotation
+
+    if sigma_rad == 0.0:
+        return rotations
+    turns = Rotation.from_rotvec(sigma_rad * rng.standard_normal((len(rotations), 3))).as_matrix()
+    turned: FloatArray = turns @ rotations
+    return turned
+
+
+# --- layouts: cameras and surfaces -----------------------------------------------------------------------
+
+
+def _ring(n: int, p: int, rng: np.random.Generator) -> _Layout:
+    """Cameras on a circle of 4 m around a ball of 1.4 m, all looking at it."""
+    angle = 2.0 * np.pi * (np.arange(n) + rng.uniform(-0.2, 0.2, n)) / n
+    radius = rng.uniform(3.8, 4.4, n)
+    centers = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(0.0, 1.5, n)], axis=1)
+    target = rng.uniform(-0.15, 0.15, (n, 3))
+    outward = normalized(rng.standard_normal((p, 3)))
+    longitude = np.arctan2(outward[:, 1], outward[:, 0])
+    return _Layout(
+        centers=centers,
+        rotations=_looking_along(target - centers),
+        points=outward * rng.uniform(1.35, 1.45, (p, 1)),
+        normals=outward,
+        colors=_checkered(4.0 * longitude, 6.0 * outward[:, 2], (214, 96, 77), (247, 224, 190), rng),
+    )
+
+
+def _facade(n: int, p: int, rng: np.random.Generator) -> _Layout:
+    """A grid of cameras, 2 m apart, 10 m before a wall with 1 m of relief."""
+    columns = int(np.ceil(np.sqrt(n)))
+    column, row = np.arange(n) % columns, np.arange(n) // columns
+    centers = np.stack([2.0 * column, np.full(n, -10.0), 2.0 * row + 3.0], axis=1)
+    centers += rng.uniform(-0.4, 0.4, (n, 3))
+    forward = np.array([0.0, 1.0, 0.0]) + 0.1 * rng.standard_normal((n, 3))
+    along = rng.uniform(-4.0, 2.0 * columns + 2.0, p)
+    height = rng.uniform(0.0, 2.0 * float(row.max()) + 7.0, p)
+    return _Layout(
+        centers=centers,
+        rotations=_looking_along(forward),
+        points=np.stack([along, rng.uniform(-0.5, 0.5, p), height], axis=1),
+        normals=_tilted(np.broadcast_to([0.0, -1.0, 0.0], (p, 3)), rng),
+        colors=_checkered(along / 1.5, height / 1.5, (205, 170, 125), (92, 107, 130), rng),
+    )
+
+
+def _drive(n: int, p: int, rng: np.random.Generator) -> _Layout:
+    """Cameras every 1.5 m on a winding street, looking ahead; facades 7 m left and right, and the ground."""
+    at = 1.5 * np.arange(n)
+    road, ahead, left = _road(at)
+    centers = road + 0.1 * rng.standard_normal((n, 1)) * left
+    centers[:, 2] = 1.5 + 0.05 * rng.standard_normal(n)
+
+    along = rng.uniform(0.0, at[-1] + _FARTHEST_M, p)
+    side = rng.choice([-1.0, 0.0, 1.0], size=p, p=[0.4, 0.2, 0.4])
+    on_ground = side == 0.0
+    lateral = np.where(on_ground, rng.uniform(-6.5, 6.5, p), side * rng.uniform(6.5, 7.5, p))
+    height = np.where(on_ground, 0.0, rng.uniform(0.0, 8.0, p))
+    foot, _, across = _road(along)
+    points = foot + lateral[:, None] * across
+    points[:, 2] = height
+    normals = np.where(on_ground[:, None], [0.0, 0.0, 1.0], -side[:, None] * across)
+    walls = _checkered(along / 2.0, height / 1.5, (188, 143, 110), (84, 96, 112), rng)
+    asphalt = _checkered(along / 3.0, lateral / 3.0, (96, 96, 96), (120, 120, 118), rng)
+    return _Layout(
+        centers=centers,
+        rotations=_looking_along(ahead + 0.02 * rng.standard_normal((n, 3))),
+        points=points,
+        normals=_tilted(normals, rng),
+        colors=np.where(on_ground[:, None], asphalt, walls),
+    )
+
+
+def _road(along_m: npt.NDArray[np.floating]) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return position, unit tangent and unit left normal (k, 3) of the street y = 18 sin(x / 60) at x."""
+    slope = 0.3 * np.cos(along_m / 60.0)
+    zero = np.zeros_like(along_m)
+    position = np.stack([along_m, 18.0 * np.sin(along_m / 60.0), zero], axis=1)
+    ahead = normalized(np.stack([np.ones_like(along_m), slope, zero], axis=1))
+    return position, ahead, np.stack([-ahead[:, 1], ahead[:, 0], zero], axis=1)
+
+
+def _cloud(n: int, p: int, rng: np.random.Generator) -> _Layout:
+    """Cameras 4 to 7 m around a Gaussian cloud, with random roll; each point faces a random way."""
+    centers = rng.uniform(4.0, 7.0, (n, 1)) * normalized(rng.standard_normal((n, 3)))
+    target = 0.3 * rng.standard_normal((n, 3))
+    points = rng.standard_normal((p, 3))
+    return _Layout(
+        centers=centers,
+        rotations=_looking_along(target - centers, up=rng.standard_normal((n, 3))),
+        points=points,
+        normals=normalized(rng.standard_normal((p, 3))),
+        colors=_checkered(points[:, 0], points[:, 1] + points[:, 2], (67, 147, 195), (244, 165, 130), rng),
+    )
+
+
+def _courtyard(n: int, p: int, rng: np.random.Generator) -> _Layout:
+    """Cameras around the inside of a yard, 24 by 18 m, looking across at four facades and the ground."""
+    half = np.array([12.0, 9.0])
+    angle = 2.0 * np.pi * (np.arange(n) + rng.uniform(-0.3, 0.3, n)) / n
+    ring = half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    centers = np.column_stack([0.5 * ring + rng.uniform(-0.5, 0.5, (n, 2)), rng.uniform(1.2, 3.5, n)])
+    yaw = 0.25 * rng.standard_normal((n, 1))
+    across = -np.cos(yaw) * ring + np.sin(yaw) * np.stack([ring[:, 1], -ring[:, 0]], axis=1)
+    forward = np.column_stack([across, rng.uniform(-1.0, 2.0, n)])
+
+    wall = rng.choice(5, size=p, p=[0.21, 0.21, 0.17, 0.17, 0.24])  # north, south, east, west, ground
+    normals = np.array([[0, -1, 0], [0, 1, 0], [-1, 0, 0], [1, 0, 0], [0, 0, 1]], dtype=np.float64)[wall]
+    flat = rng.uniform([-half[0], -half[1], 0.0], [half[0], half[1], 8.0], (p, 3))
+    surface = np.array([half[1], half[1], half[0], half[0], 0.0])[wall]
+    relief = np.where(wall == 4, 0.1, 1.0) * rng.uniform(-0.4, 0.4, p)
+    depth = np.sum(flat * normals, axis=1)
+    points = flat + (-surface + relief - depth)[:, None] * normals
+    along = np.where(wall < 2, flat[:, 0], flat[:, 1])
+    bricks = _checkered(along / 1.5, flat[:, 2] / 1.5, (178, 102, 78), (226, 205, 170), rng)
+    paving = _checkered(flat[:, 0] / 2.0, flat[:, 1] / 2.0, (128, 128, 120), (150, 150, 140), rng)
+    return _Layout(
+        centers=centers,
+        rotations=_looking_along(forward),
+        points=points,
+        normals=_tilted(normals, rng),
+        colors=np.where((wall == 4)[:, None], paving, bricks),
+    )
+
+
+_LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], _Layout]] = {
+    "ring": _ring,
+    "facade": _facade,
+    "drive": _drive,
+    "cloud": _cloud,
+    "courtyard": _courtyard,
+}
+
+
+def _looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:
+    """Return cam_from_world (n, 3, 3) of cameras that look along `forward` (n, 3), `up` upwards.
+
+    Up is z if None. The rows are the camera's axes in the world: x to the right, y down, z ahead.
+    """
+    ahead = normalized(forward)
+    upward = np.broadcast_to([0.0, 0.0, 1.0], ahead.shape) if up is None else up
+    right = normalized(np.cross(ahead, upward))
+    return np.stack([right, np.cross(ahead, right), ahead], axis=1)
+
+
+def _tilted(normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+    """Return unit normals (p, 3) tilted at random by about 15 degrees: masonry is not a mirror."""
+    return normalized(normals + 0.2 * rng.standard_normal(normals.shape))
+
+
+def _checkered(
+    u: FloatArray,
+    v: FloatArray,
+    light: tuple[int, int, int],
+    dark: tuple[int, int, int],
+    rng: np.random.Generator,
+) -> ByteArray:
+    """Return colours (p, 3) of a board with unit fields at texture coordinates u, v, with some grain."""
+    odd = (np.floor(u) + np.floor(v)) % 2.0 == 1.0
+    grain = rng.integers(-8, 9, size=(len(u), 1))
+    return np.asarray(np.clip(np.where(odd[:, None], dark, light) + grain, 0, 255), dtype=np.uint8)
+
+
+# --- bare graphs of directions ---------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphProblem:
+    """Directions between unknown locations, with the answer."""
+
+    locations: FloatArray
+    """(n, d) the truth."""
+    edges: IntArray
+    """(m, 2) pairs (i, j), i < j, in lexicographic order."""
+    directions: FloatArray
+    """(m, d) measured unit directions of t_i - t_j."""
+    corrupted: BoolArray
+    """(m,) True where the direction is a random one."""
+
+
+def random_graph_problem(
+    n: int, p: float = 0.5, d: int = 3, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return the random model of the paper: locations N(0, I_d), an Erdos-Renyi graph G(n, p).
+
+    Args:
+        n: number of locations.
+        p: probability of each pair.
+        d: dimension, at least 2.
+        sigma: size of the noise of the directions that are not corrupted.
+        q: probability that a direction is replaced by a uniformly random unit vector.
+        seed: an integer, or a Generator to draw from.
+
+    Source: Hand, Lee, Voroninski (2015), section 4.
+    """
+    rng = np.random.default_rng(seed)
+    locations = rng.standard_normal((n, d))
+    i, j = np.triu_indices(n, k=1)
+    present = rng.random(len(i)) < p
+    edges = np.stack([i[present], j[present]], axis=1).astype(np.int64)
+    return _measured(locations, edges, sigma, q, rng)
+
+
+def box_graph_problem(
+    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
+
+    The model of an area mapped from a drone. About degree / 1.25 neighbours are taken, because the union of
+    the neighbourhoods is larger than each of them.
+    """
+    rng = np.random.default_rng(seed)
+    locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
+    neighbours = _nearest(locations, round(degree / 1.25))
+    camera = np.repeat(np.arange(n), neighbours.shape[1])
+    return _measured(locations, _unique_pairs(camera, neighbours.ravel()), sigma, q, rng)
+
+
+def trajectory_graph_problem(
+    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
+
+    The model of a video. A loop closure joins a random camera and one of its 60 nearest in space.
+    """
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(0.15 * rng.standard_normal(n))
+    steps = np.stack([np.cos(heading), np.sin(heading), 0.2 * rng.standard_normal(n)], axis=1)
+    locations = np.cumsum(steps, axis=0) + 0.3 * rng.standard_normal((n, 3))
+    reach = min(max(round(degree / 2.0), 1), n - 1)
+    i = np.concatenate([np.arange(n - step) for step in range(1, reach + 1)])
+    j = np.concatenate([np.arange(step, n) for step in range(1, reach + 1)])
+    nearest = _nearest(locations, 60)
+    closing = rng.integers(n, size=len(i) // 50)
+    closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
+    edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
+    return _measured(locations, edges, sigma, q, rng)
+
+
+def community_graph_problem(
+    n: int, degree: float = 30.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
+
+    Locations are N(0, I) around centres N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
+    (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
+    that the mean degree stays somewhat below `degree`.
+    """
+    rng = np.random.default_rng(seed)
+    num_clusters = max(round(n / 400), 1)
+    cluster_centers = rng.standard_normal((num_clusters, 3)) * [10.0, 10.0, 1.0]
+    cluster = np.sort(rng.integers(num_clusters, size=n))
+    locations = cluster_centers[cluster] + rng.standard_normal((n, 3))
+
+    num_drawn = round(n * degree / 2.0)
+    cumulative = np.cumsum(np.minimum((1.0 - rng.random(n)) ** -0.5, 50.0))
+    first = np.searchsorted(cluster, np.arange(num_clusters + 1))  # cameras of a cluster are consecutive
+    bounds = np.concatenate([[0.0], cumulative])[first]
+
+    i = np.searchsorted(cumulative, rng.random(num_drawn) * cumulative[-1], side="right")
+    target = cluster[i]
+    if num_clusters > 1:
+        near = _nearest(cluster_centers, 3)
+        leaves = rng.random(num_drawn) < 0.07
+        target = np.where(leaves, near[target, rng.integers(near.shape[1], size=num_drawn)], target)
+    drawn = bounds[target] + rng.random(num_drawn) * (bounds[target + 1] - bounds[target])
+    j = np.searchsorted(cumulative, drawn, side="right")
+    backbone = [(np.arange(n - step), np.arange(step, n)) for step in range(1, min(5, n))]
+    i = np.concatenate([i, *(a for a, _ in backbone)])
+    j = np.concatenate([j, *(b for _, b in backbone)])
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng)
+
+
+def _measured(
+    locations: FloatArray, edges: IntArray, sigma: float, q: float, rng: np.random.Generator
+) -> GraphProblem:
+    """Return the directions of `edges` with the noise and the corruption of the paper."""
+    true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
+    noisy = normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
+    random = normalized(rng.standard_normal(true.shape))
+    corrupted = rng.random(len(edges)) < q
+    directions = np.where(corrupted[:, None], random, noisy)
+    return GraphProblem(locations=locations, edges=edges, directions=directions, corrupted=corrupted)
+
+
+def _nearest(locations: FloatArray, k: int) -> IntArray:
+    """Return (n, k) the k nearest other locations of each; all others where there are fewer."""
+    from scipy.spatial import KDTree
+
+    k = min(max(k, 1), len(locations) - 1)
+    nearest = np.asarray(KDTree(locations).query(locations, k=k + 1)[1], dtype=np.int64)
+    return nearest[:, 1:]  # the first is the location itself
+
+
+def _unique_pairs(i: npt.NDArray[np.integer], j: npt.NDArray[np.integer]) -> IntArray:
+    """Return the unordered pairs (m, 2) of different cameras, each once, in lexicographic order."""
+    pairs = np.sort(np.stack([i, j], axis=1).astype(np.int64), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
