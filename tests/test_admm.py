@@ -285,8 +285,10 @@ def plain_step(graph, least, x, t, rho, relaxation):
         CHANGE: np.sum(rho[:, None] * (x_next - x) ** 2),
         INTERIOR: np.sum(np.linalg.norm(rho[:, None] * u, axis=1) < graph.weights * (1.0 - 1e-9)),
     }
+    y, y_next = x - clip(x), x_next - u
+    residuals = np.sum(rho[:, None] * (baselines - y_next) ** 2), np.sum(rho[:, None] * (y_next - y) ** 2)
     pull = adjoint(rho[:, None] * (x_next - 2.0 * u - baselines), graph.edges, graph.num_cameras)
-    return x_next, pull, [sums[k] for k in range(5)]
+    return x_next, pull, [sums[k] for k in range(5)], residuals
 
 
 @pytest.mark.parametrize("least", [-np.inf, 1.0])
@@ -300,11 +302,12 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
     order = passes.data.order
     ours = np.empty_like(x)
     pull, sums = passes.step(x[order], ours, t, rho[order], 1.7)
-    x_next, expected_pull, expected_sums = plain_step(graph, least, x, t, rho, 1.7)
+    x_next, expected_pull, expected_sums, residuals = plain_step(graph, least, x, t, rho, 1.7)
     np.testing.assert_allclose(ours, x_next[order], atol=1e-12)
     np.testing.assert_allclose(pull, expected_pull, atol=1e-11)
     np.testing.assert_allclose(sums, expected_sums, rtol=1e-12, atol=1e-11)
     np.testing.assert_allclose(passes.pull(ours, t, rho[order]), expected_pull, atol=1e-11)
+    np.testing.assert_allclose(passes.imbalance(x[order], ours, t, rho[order]), residuals, rtol=1e-12)
 
 
 def test_new_penalties_keep_the_split_point_and_the_dual():

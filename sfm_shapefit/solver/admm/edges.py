@@ -146,6 +146,23 @@ class EdgePasses:
         self.over_chunks(lambda _k, a, b: run(a, b, data.ends, data.directions, data.least, t, out))
         return out
 
+    def imbalance(
+        self, x_before: FloatArray, x: FloatArray, t: FloatArray, rho: FloatArray
+    ) -> tuple[float, float]:
+        """Return sum rho ||D t - y||^2 and sum rho ||y - y_before||^2: the primal and the dual residual."""
+        data, run = self.data, _imbalance(self.data.directions.shape[1])
+        totals = np.zeros((len(data.bounds) - 1, 2))
+
+        def chunk(k: int, first: int, last: int) -> None:
+            run(
+                first, last, data.ends, data.directions, data.weights, data.least, rho, t,
+                x_before, x, totals[k],
+            )  # fmt: skip
+
+        self.over_chunks(chunk)
+        primal, dual = totals.sum(axis=0)
+        return float(primal), float(dual)
+
     def change_penalties(self, x: FloatArray, rho: FloatArray, rho_next: FloatArray) -> None:
         """Rewrite x in place so that y and the dual rho u stay what they are under the new penalties."""
         data, run = self.data, _change_penalties(self.data.directions.shape[1])
@@ -314,6 +331,34 @@ def _residuals(d: int) -> Any:
             out[e] = np.sqrt(square)
 
     return residuals
+
+
+@cache
+def _imbalance(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def imbalance(
+        first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+        rho: Any, t: Any, x_before: Any, x: Any, totals: Any,
+    ) -> None:  # fmt: skip
+        primal, dual = 0.0, 0.0
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            a0, shrink0 = clip_factor(x_before, v, e, least, w[e] / rho[e])
+            a1, shrink1 = clip_factor(x, v, e, least, w[e] / rho[e])
+            p, q = 0.0, 0.0
+            for k in range(d):
+                y0 = x_before[e, k] - shrink0 * (x_before[e, k] - a0 * v[e, k])
+                y1 = x[e, k] - shrink1 * (x[e, k] - a1 * v[e, k])
+                p += (t[i, k] - t[j, k] - y1) ** 2
+                q += (y1 - y0) ** 2
+            primal += rho[e] * p
+            dual += rho[e] * q
+        totals[0] += primal
+        totals[1] += dual
+
+    return imbalance
 
 
 @cache

@@ -229,12 +229,7 @@ class Iteration:
 
     def _balance(self, state: State, before: FloatArray) -> float:
         """Return the norm of the primal residual, D T - y, over that of the dual one, rho (y - y before)."""
-        passes, rho = self.passes, state.rho
-        y = state.x - passes.dual(state.x, rho) / rho[:, None]
-        y_before = before - passes.dual(before, rho) / rho[:, None]
-        i, j = passes.data.ends.T
-        primal = np.einsum("e,ed,ed", rho, *2 * [state.t[i] - state.t[j] - y])
-        dual = np.einsum("e,ed,ed", rho, *2 * [y - y_before])
+        primal, dual = self.passes.imbalance(before, state.x, state.t, state.rho)
         if not (primal > 0.0 and dual > 0.0):
             return _BALANCE
         return float(np.sqrt(np.clip(primal / dual, 1e-2, 1e2)))
@@ -264,4 +259,5 @@ def _cancelled(on_iteration: OnIteration | None, iteration: int, objective: floa
     """Report an iteration; True if the caller asks to stop."""
     if on_iteration is None:
         return False
-    return on_iteration(IterationInfo(iteration, objective, None)) is False
+    answer = on_iteration(IterationInfo(iteration, objective, None))
+    return answer is not None and not answer  # a numpy False cancels too
