@@ -30,6 +30,8 @@ from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 Ordering = Literal["auto", "metis", "dissection", "minimum-degree"]
 
 _MINIMUM_DEGREE_LIMIT = 400_000  # edges; above, minimum degree takes longer than it can save
+_MINIMUM_DEGREE_FLOPS = 100_000  # operations per edge of the dissection; above, the graph is an expander, on
+# which minimum degree takes many seconds to find as much fill
 _LEAF = 48  # nodes; smaller parts are not cut further
 _SMOOTHING = 6  # averaging sweeps over the integer graph distances, to make cuts straight
 _PASSES = 6  # refinement passes over a separator
@@ -58,10 +60,11 @@ def best_order(
         candidates.append(metis_order(graph))
     if method == "dissection" or (method == "auto" and not use_metis):
         candidates.append(dissection_order(graph, coordinates))
-    small = len(graph.neighbours) <= 2 * _MINIMUM_DEGREE_LIMIT
-    if method == "minimum-degree" or (method == "auto" and small):
-        candidates.append(minimum_degree_order(graph))
     trees = [elimination_tree(graph, order) for order in candidates]
+    edges = len(graph.neighbours) // 2
+    small = edges <= _MINIMUM_DEGREE_LIMIT and all(t.flops <= _MINIMUM_DEGREE_FLOPS * edges for t in trees)
+    if method == "minimum-degree" or (method == "auto" and small):
+        trees.append(elimination_tree(graph, minimum_degree_order(graph)))
     return min(trees, key=lambda tree: tree.flops)  # the first of equals
 
 

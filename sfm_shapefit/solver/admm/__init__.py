@@ -1,0 +1,25 @@
+"""Splitting for large view graphs: ShapeFit and LUD by ADMM with the scalar graph Laplacian.
+
+edges      the proximal step, fused into one pass over the edges
+anderson   acceleration of the iteration
+linear     the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
+engine     the iteration that both programs share
+shapefit   solve_admm
+lud        solve_lud
+"""
+
+from sfm_shapefit.solver.admm.engine import Stop
+from sfm_shapefit.solver.admm.linear import IterativeSolver, LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
+from sfm_shapefit.solver.admm.shapefit import AdmmResult, solve_admm
+
+__all__ = [
+    "AdmmResult",
+    "IterativeSolver",
+    "LaplacianFactor",
+    "LudResult",
+    "Stop",
+    "laplacian_factor",
+    "solve_admm",
+    "solve_lud",
+]

@@ -1,0 +1,378 @@
+"""One pass over the edges: the proximal step of ADMM, fused with everything that reads the same memory.
+
+Both programs are a sum of w_e times the distance of the baseline t_i - t_j to a set of multiples of v_e,
+
+    ShapeFit   { a v_e : a real }    r = x - <x, v> v
+    LUD        { a v_e : a >= 1 }    r = x - max(<x, v>, 1) v
+
+so one formula, r = x - max(<x, v>, least) v with least = -inf or 1, serves both. The state of an edge is
+one vector x. With radius w_e / rho_e and clip(r) = r shortened to at most the radius, it stands for
+
+    y = x - clip(r)    the copy of t_i - t_j (proximal point of x)
+    u = clip(r)        the scaled multiplier; rho u, the dual of the edge, lies in the ball of radius w_e
+
+A pass is cut into a fixed number of chunks of edges, each with its own node sums, which are added in
+the order of the chunks: the result does not depend on the number of threads, to the last bit.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.arrays import FloatArray, IntArray, frozen
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.viewgraph import ViewGraph
+
+_CHUNKS = 4
+_EDGES_WORTH_A_THREAD = 20_000  # below, handing work to a thread costs more than the work
+
+OBJECTIVE, PAIRING, ALONG, CHANGE, INTERIOR = range(5)
+"""Columns of the sums of a pass: w ||r(D T)||, <rho u, D T>, <rho u, v>, rho ||x' - x||^2, and the
+number of edges whose dual lies inside its ball."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EdgeData:
+    """The edges in the order of the passes (ascending first node, so that memory is read in order)."""
+
+    num_nodes: int
+    ends: npt.NDArray[np.int32]
+    """(m, 2) nodes (i, j)."""
+    directions: FloatArray
+    """(m, d) unit v_e."""
+    weights: FloatArray
+    """(m,) positive w_e."""
+    least: float
+    """Least multiple of v_e that costs nothing: -inf for ShapeFit, 1 for LUD."""
+    order: IntArray
+    """(m,) index of each edge in the graph it came from."""
+    bounds: tuple[int, ...]
+    """Chunk k is the edges bounds[k]:bounds[k + 1]."""
+
+
+def edge_data(graph: ViewGraph, least: float) -> EdgeData:
+    """Return the edges of a graph, sorted and cut into chunks."""
+    order = np.lexsort((graph.edges[:, 1], graph.edges[:, 0]))
+    m = graph.num_edges
+    chunks = _CHUNKS if m >= _EDGES_WORTH_A_THREAD else 1
+    return EdgeData(
+        num_nodes=graph.num_cameras,
+        ends=frozen(graph.edges[order].astype(np.int32)),
+        directions=frozen(graph.directions[order]),
+        weights=frozen(graph.weights[order]),
+        least=least,
+        order=frozen(order.astype(np.int64)),
+        bounds=tuple(m * k // chunks for k in range(chunks + 1)),
+    )
+
+
+class EdgePasses:
+    """The passes over one set of edges, with their buffers and threads. Close it after use."""
+
+    def __init__(self, data: EdgeData, threads: int) -> None:
+        """Allocate the node sums of each chunk; `threads` >= 1."""
+        self.data = data
+        chunks, d = len(data.bounds) - 1, data.directions.shape[1]
+        self._sums = np.zeros((chunks, data.num_nodes, d))
+        self._totals = np.zeros((chunks, 5))
+        self._pool = ThreadPoolExecutor(min(threads, chunks)) if min(threads, chunks) > 1 else None
+
+    def close(self) -> None:
+        """End the threads."""
+        if self._pool is not None:
+            self._pool.shutdown()
+
+    def step(
+        self, x: FloatArray, x_next: FloatArray, t: FloatArray, rho: FloatArray, relaxation: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Take one proximal step: x_next = relaxation D t + (1 - relaxation) y + u.
+
+        Args:
+            x: (m, d) state before.
+            x_next: (m, d) state after, written; may be `x` itself.
+            t: (n, d) locations.
+            rho: (m,) penalties.
+            relaxation: in (0, 2).
+
+        Returns:
+            D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
+        """
+        data, run = self.data, _step(self.data.directions.shape[1])
+
+        def chunk(k: int, first: int, last: int) -> None:
+            run(
+                first, last, data.ends, data.directions, data.weights, data.least,
+                rho, relaxation, t, x, x_next, self._sums[k], self._totals[k],
+            )  # fmt: skip
+
+        self._totals[...] = 0.0
+        pull = self._accumulate(chunk)
+        return pull, self._totals.sum(axis=0)
+
+    def pull(self, x: FloatArray, t: FloatArray, rho: FloatArray) -> FloatArray:
+        """Return D^T rho (y - u - D t), (n, d): the right-hand side of the correction of t."""
+        data, run = self.data, _pull(self.data.directions.shape[1])
+
+        def chunk(k: int, first: int, last: int) -> None:
+            run(first, last, data.ends, data.directions, data.weights, data.least, rho, t, x, self._sums[k])
+
+        return self._accumulate(chunk)
+
+    def laplacian(self, x: FloatArray, rho: FloatArray) -> FloatArray:
+        """Return D^T rho D x, (n, d)."""
+        run = _laplacian(x.shape[1])
+
+        def chunk(k: int, first: int, last: int) -> None:
+            run(first, last, self.data.ends, rho, x, self._sums[k])
+
+        return self._accumulate(chunk)
+
+    def dual(self, x: FloatArray, rho: FloatArray) -> FloatArray:
+        """Return rho u, (m, d), in the edge order of the passes."""
+        out = np.empty_like(x)
+        data, run = self.data, _dual(self.data.directions.shape[1])
+        self.over_chunks(lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, x, out))
+        return out
+
+    def residuals(self, t: FloatArray) -> FloatArray:
+        """Return ||r(t_i - t_j)|| for every edge, (m,)."""
+        data, run = self.data, _residuals(self.data.directions.shape[1])
+        out = np.empty(len(data.ends))
+        self.over_chunks(lambda _k, a, b: run(a, b, data.ends, data.directions, data.least, t, out))
+        return out
+
+    def imbalance(
+        self, x_before: FloatArray, x: FloatArray, t: FloatArray, rho: FloatArray
+    ) -> tuple[float, float]:
+        """Return sum rho ||D t - y||^2 and sum rho ||y - y_before||^2: the primal and the dual residual."""
+        data, run = self.data, _imbalance(self.data.directions.shape[1])
+        totals = np.zeros((len(data.bounds) - 1, 2))
+
+        def chunk(k: int, first: int, last: int) -> None:
+            run(
+                first, last, data.ends, data.directions, data.weights, data.least, rho, t,
+                x_before, x, totals[k],
+            )  # fmt: skip
+
+        self.over_chunks(chunk)
+        primal, dual = totals.sum(axis=0)
+        return float(primal), float(dual)
+
+    def change_penalties(self, x: FloatArray, rho: FloatArray, rho_next: FloatArray) -> None:
+        """Rewrite x in place so that y and the dual rho u stay what they are under the new penalties."""
+        data, run = self.data, _change_penalties(self.data.directions.shape[1])
+        self.over_chunks(
+            lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, rho_next, x)
+        )
+
+    def _accumulate(self, chunk: Callable[[int, int, int], None]) -> FloatArray:
+        """Run a pass that adds to node sums, from zero, and return their total in chunk order."""
+
+        def cleared(k: int, first: int, last: int) -> None:
+            self._sums[k] = 0.0
+            chunk(k, first, last)
+
+        self.over_chunks(cleared)
+        total: FloatArray = self._sums[0].copy()
+        for part in self._sums[1:]:
+            total += part
+        return total
+
+    def over_chunks(self, run: Callable[[int, int, int], None]) -> None:
+        """Call run(k, first, last) for every chunk of edges."""
+        bounds = self.data.bounds
+        jobs = [(k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)]
+        if self._pool is None:
+            for job in jobs:
+                run(*job)
+        else:
+            for done in [self._pool.submit(run, *job) for job in jobs]:
+                done.result()
+
+
+# The kernels are made per dimension: with d a constant the loops over coordinates unroll.
+
+
+@cache
+def _clip_factor(d: int) -> Any:
+    """Return f(x, v, e, least, radius) -> (a, shrink): r = x - a v, clip(r) = shrink * r."""
+
+    @kernel()
+    def clip_factor(x: Any, v: Any, e: int, least: float, radius: float) -> Any:
+        a = 0.0
+        for k in range(d):
+            a += x[e, k] * v[e, k]
+        a = max(a, least)
+        square = 0.0
+        for k in range(d):
+            r = x[e, k] - a * v[e, k]
+            square += r * r
+        return a, radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
+
+    return clip_factor
+
+
+@cache
+def _step(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def step(
+        first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+        rho: Any, relaxation: float, t: Any, x: Any, x_next: Any, sums: Any, totals: Any,
+    ) -> None:  # fmt: skip
+        objective, pairing, along, change, interior = 0.0, 0.0, 0.0, 0.0, 0.0
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            radius = w[e] / rho[e]
+            a, shrink = clip_factor(x, v, e, least, radius)
+            moved, length = 0.0, 0.0
+            for k in range(d):
+                baseline = t[i, k] - t[j, k]
+                u = shrink * (x[e, k] - a * v[e, k])
+                g = relaxation * (baseline - x[e, k] + u)
+                moved += g * g
+                length += baseline * v[e, k]
+                x_next[e, k] = x[e, k] + g
+            a, shrink = clip_factor(x_next, v, e, least, radius)
+            length = max(length, least)
+            square, paired, projected = 0.0, 0.0, 0.0
+            for k in range(d):
+                baseline = t[i, k] - t[j, k]
+                r = baseline - length * v[e, k]
+                square += r * r
+                u = shrink * (x_next[e, k] - a * v[e, k])
+                paired += u * baseline
+                projected += u * v[e, k]
+                p = rho[e] * (x_next[e, k] - 2.0 * u - baseline)
+                sums[i, k] += p
+                sums[j, k] -= p
+            objective += w[e] * np.sqrt(square)
+            pairing += rho[e] * paired
+            along += rho[e] * projected
+            change += rho[e] * moved
+            interior += 1.0 if shrink == 1.0 else 0.0
+        totals[0] += objective
+        totals[1] += pairing
+        totals[2] += along
+        totals[3] += change
+        totals[4] += interior
+
+    return step
+
+
+@cache
+def _pull(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def pull(
+        first: int, last: int, ends: Any, v: Any, w: Any, least: float, rho: Any, t: Any, x: Any, sums: Any
+    ) -> None:
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
+            for k in range(d):
+                u = shrink * (x[e, k] - a * v[e, k])
+                p = rho[e] * (x[e, k] - 2.0 * u - (t[i, k] - t[j, k]))
+                sums[i, k] += p
+                sums[j, k] -= p
+
+    return pull
+
+
+@cache
+def _laplacian(d: int) -> Any:
+    @kernel()
+    def laplacian(first: int, last: int, ends: Any, rho: Any, x: Any, sums: Any) -> None:
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            for k in range(d):
+                p = rho[e] * (x[i, k] - x[j, k])
+                sums[i, k] += p
+                sums[j, k] -= p
+
+    return laplacian
+
+
+@cache
+def _dual(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def dual(first: int, last: int, v: Any, w: Any, least: float, rho: Any, x: Any, out: Any) -> None:
+        for e in range(first, last):
+            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
+            for k in range(d):
+                out[e, k] = rho[e] * shrink * (x[e, k] - a * v[e, k])
+
+    return dual
+
+
+@cache
+def _residuals(d: int) -> Any:
+    @kernel()
+    def residuals(first: int, last: int, ends: Any, v: Any, least: float, t: Any, out: Any) -> None:
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            a = 0.0
+            for k in range(d):
+                a += (t[i, k] - t[j, k]) * v[e, k]
+            a = max(a, least)
+            square = 0.0
+            for k in range(d):
+                r = t[i, k] - t[j, k] - a * v[e, k]
+                square += r * r
+            out[e] = np.sqrt(square)
+
+    return residuals
+
+
+@cache
+def _imbalance(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def imbalance(
+        first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+        rho: Any, t: Any, x_before: Any, x: Any, totals: Any,
+    ) -> None:  # fmt: skip
+        primal, dual = 0.0, 0.0
+        for e in range(first, last):
+            i, j = ends[e, 0], ends[e, 1]
+            a0, shrink0 = clip_factor(x_before, v, e, least, w[e] / rho[e])
+            a1, shrink1 = clip_factor(x, v, e, least, w[e] / rho[e])
+            p, q = 0.0, 0.0
+            for k in range(d):
+                y0 = x_before[e, k] - shrink0 * (x_before[e, k] - a0 * v[e, k])
+                y1 = x[e, k] - shrink1 * (x[e, k] - a1 * v[e, k])
+                p += (t[i, k] - t[j, k] - y1) ** 2
+                q += (y1 - y0) ** 2
+            primal += rho[e] * p
+            dual += rho[e] * q
+        totals[0] += primal
+        totals[1] += dual
+
+    return imbalance
+
+
+@cache
+def _change_penalties(d: int) -> Any:
+    clip_factor = _clip_factor(d)
+
+    @kernel()
+    def change_penalties(
+        first: int, last: int, v: Any, w: Any, least: float, rho: Any, rho_next: Any, x: Any
+    ) -> None:
+        for e in range(first, last):
+            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
+            factor = (rho[e] / rho_next[e] - 1.0) * shrink
+            for k in range(d):
+                x[e, k] += factor * (x[e, k] - a * v[e, k])
+
+    return change_penalties

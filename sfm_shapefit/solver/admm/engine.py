@@ -1,0 +1,263 @@
+"""The iteration that ShapeFit and LUD share: alternating directions with a factored graph Laplacian.
+
+    minimise  sum_e phi_e(y_e)    subject to  y = D T,  and for ShapeFit  <c, T> = kappa
+
+with the edge state x of `edges` (y and the scaled multiplier u in one vector) and a penalty rho_e per
+edge. With L = D^T diag(rho) D one iteration is
+
+    solve    L delta = D^T rho (y - u - D T) + lambda c           T <- T + delta
+    scale    T <- T + beta h,  lambda <- lambda + beta            L h = c,  beta so that <c, T> = kappa
+    pass     x <- relaxation D T + (1 - relaxation) y + u         and the sums over edges
+
+At a fixed point delta = 0 and beta = 0, however inexact the solves are, so D^T (rho u) = lambda c: rho u
+and lambda are the dual of the program. It lies in its ball at every iteration.
+
+Penalties w_e / r_e, with r_e the residual of the edge, make the augmented term the local curvature of
+w ||r||. They are renewed a few times, with a lower floor on r_e each time as the residuals become
+trustworthy, and scaled by the balance of the primal and the dual residual.
+
+Sources: Boyd et al., "Distributed optimization and statistical learning via the alternating direction
+method of multipliers" (2011), sections 3.4.1 and 3.4.3.
+"""
+
+import enum
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.solver.admm.anderson import Anderson
+from sfm_shapefit.solver.admm.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
+from sfm_shapefit.solver.admm.linear import LaplacianFactor
+from sfm_shapefit.solver.options import IterationInfo, OnIteration
+
+_PENALTY = 0.5  # rho_e = _PENALTY w_e / max(r_e, floor mean(r))
+_FLOORS = (0.1, 0.03, 0.01)  # of the successive renewals; the last one stays
+_ANDERSON_FLOOR = 0.3  # accelerated, on every renewal: even penalties leave more to the acceleration
+_BALANCE = 1.0  # primal over dual residual at which the scale of the penalties is left alone
+_ANDERSON_MEMORY = 6
+_ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other's way
+_ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which acceleration can pay, and the
+_ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
+_ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
+_STEP_FACTOR = 10.0
+_STALL_WINDOW = 150
+
+
+class Stop(enum.Enum):
+    """Why the iteration ended; the value is the sentence shown to the user."""
+
+    ACCURATE = "the estimated relative accuracy was reached"
+    MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+    STALLED = (
+        "the splitting stalled; if its linear solves were iterative, allow more memory for the factor, "
+        "else use the Newton solver"
+    )
+    CANCELLED = "cancelled by on_iteration"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How the iteration runs."""
+
+    tol: float
+    max_iterations: int
+    relaxation: float
+    renewals: tuple[int, ...]
+    """Iterations after which the penalties are renewed; none leaves them constant."""
+    penalty: float
+    """rho_e at the start is penalty * w_e / mean residual of the first solution."""
+    accelerate: bool
+    """Allow Anderson acceleration where the data call for it."""
+
+
+@dataclass(slots=True, eq=False)
+class State:
+    """The iterate. Arrays over edges are in the order of the passes."""
+
+    x: FloatArray
+    t: FloatArray
+    rho: FloatArray
+    multiplier: float = 0.0
+    scale: float = 1.0
+    """Factor on the penalties from balancing."""
+    pull: FloatArray = field(default_factory=lambda: np.empty(0))
+    """D^T rho (y - u - D T)."""
+    unit: FloatArray = field(default_factory=lambda: np.empty(0))
+    """h with L h = c."""
+    sums: FloatArray = field(default_factory=lambda: np.zeros(5))
+    spare: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Room for the next x while acceleration needs the old one."""
+    previous: float = np.inf
+    """Squared step of the iteration before."""
+    interior: float = np.inf
+    """Fraction of edges inside their ball at the last renewal."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
+    """Where the iteration ended."""
+
+    state: State
+    iterations: int
+    stop: Stop
+
+
+class Iteration:
+    """One run: the program, its factor and passes, and the steps between them."""
+
+    def __init__(
+        self,
+        passes: EdgePasses,
+        factor: LaplacianFactor,
+        settings: Settings,
+        c: FloatArray | None,
+        kappa: float,
+    ) -> None:
+        """Set up the program <c, T> = kappa over the edges of `passes`; no such constraint if c is None."""
+        self.passes = passes
+        self.factor = factor
+        self.settings = settings
+        self.c = c
+        self.kappa = kappa
+        self._factored = 1.0  # the factor is that of the Laplacian of rho / _factored
+
+    def run(self, on_iteration: OnIteration | None) -> Outcome:
+        """Iterate from the least-squares locations until a reason to stop."""
+        state = self._start()
+        settings, anderson = self.settings, None
+        best, best_at = np.inf, 0
+        for k in range(1, settings.max_iterations + 1):
+            if k > 1:
+                self._move(state)
+            renew = k in settings.renewals
+            before = state.x.copy() if renew else None
+            anderson = self._pass(state, anderson)
+            if _cancelled(on_iteration, k, self.objective(state)):
+                return Outcome(state=state, iterations=k, stop=Stop.CANCELLED)
+            error = self._error(state)
+            if error <= settings.tol:
+                return Outcome(state=state, iterations=k, stop=Stop.ACCURATE)
+            if error < 0.5 * best:
+                best, best_at = error, k
+            elif k - best_at > max(_STALL_WINDOW, k // 2):
+                return Outcome(state=state, iterations=k, stop=Stop.STALLED)
+            if before is not None:
+                anderson = self._accelerator(state, anderson)
+                self._renew(state, before, self._floor(settings.renewals.index(k), anderson))
+        return Outcome(state=state, iterations=settings.max_iterations, stop=Stop.MAX_ITERATIONS)
+
+    def objective(self, state: State) -> float:
+        """Return the objective at the locations of the last pass, relative to kappa."""
+        return float(state.sums[OBJECTIVE]) / self.kappa
+
+    def _start(self) -> State:
+        """Return the state at unit lengths, y = v and u = 0, with the least-squares locations of y."""
+        data = self.passes.data
+        state = State(
+            x=data.directions.copy(),
+            t=np.zeros((data.num_nodes, data.directions.shape[1])),
+            rho=data.weights.copy(),
+        )
+        self._factor(state)
+        state.pull = self.passes.pull(state.x, state.t, state.rho)
+        self._move(state)
+        self._factored = self.settings.penalty / _mean(self.passes.residuals(state.t), data.weights)
+        state.rho *= self._factored
+        state.unit /= self._factored
+        state.multiplier *= self._factored
+        return state
+
+    def _factor(self, state: State) -> None:
+        """Factor the Laplacian of the penalties and solve for the direction of the constraint."""
+        in_graph_order = np.empty_like(state.rho)
+        in_graph_order[self.passes.data.order] = state.rho
+        self.factor.refactor(in_graph_order)
+        self._factored = 1.0
+        if self.c is not None:
+            state.unit = self.factor.solve(self.c)
+
+    def _move(self, state: State) -> None:
+        """Move the locations to the minimum of the augmented term on the constraint."""
+        if self.c is None:
+            state.t += self.factor.solve(state.pull) / self._factored
+            return
+        state.t += self.factor.solve(state.pull + state.multiplier * self.c) / self._factored
+        missing = self.kappa - float(np.vdot(self.c, state.t))
+        beta = missing / float(np.vdot(self.c, state.unit))
+        state.t += beta * state.unit
+        state.multiplier += beta
+
+    def _pass(self, state: State, anderson: Anderson | None) -> Anderson | None:
+        """Take the proximal step, accelerated if there is a history; return the history to go on with."""
+        relaxation = self.settings.relaxation if anderson is None else _ANDERSON_RELAXATION
+        if anderson is not None and state.spare.shape != state.x.shape:
+            state.spare = np.empty_like(state.x)
+        target = state.x if anderson is None else state.spare
+        state.pull, state.sums = self.passes.step(state.x, target, state.t, state.rho, relaxation)
+        change, previous = float(state.sums[CHANGE]), state.previous
+        state.previous = change
+        if anderson is None:
+            return None
+        if change > _ANDERSON_GIVE_UP**2 * previous:
+            anderson.restart()
+        state.x, state.spare = anderson.advance(state.x, target, state.rho), state.x
+        state.pull = self.passes.pull(state.x, state.t, state.rho)
+        return anderson
+
+    def _error(self, state: State) -> float:
+        """Return the estimate of the relative error of the objective."""
+        objective, pairing, along, change = state.sums[:4]
+        dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
+        return float(max(abs(objective - dual_value), _STEP_FACTOR * change) / objective)
+
+    def _floor(self, renewal: int, anderson: Anderson | None) -> float:
+        """Return the least residual that penalties take seriously, relative to the mean residual."""
+        return _FLOORS[min(renewal, len(_FLOORS) - 1)] if anderson is None else _ANDERSON_FLOOR
+
+    def _renew(self, state: State, before: FloatArray, floor: float) -> None:
+        """Replace the penalties by w / residual and factor anew; y and the dual rho u stay."""
+        passes = self.passes
+        state.scale *= np.sqrt(self._balance(state, before) / _BALANCE)
+        residuals = passes.residuals(state.t)
+        least = floor * _mean(residuals, passes.data.weights)
+        rho = state.scale * _PENALTY * passes.data.weights / np.maximum(residuals, least)
+        passes.change_penalties(state.x, state.rho, rho)
+        state.rho, state.previous = rho, np.inf
+        self._factor(state)
+        state.pull = passes.pull(state.x, state.t, state.rho)
+
+    def _balance(self, state: State, before: FloatArray) -> float:
+        """Return the norm of the primal residual, D T - y, over that of the dual one, rho (y - y before)."""
+        primal, dual = self.passes.imbalance(before, state.x, state.t, state.rho)
+        if not (primal > 0.0 and dual > 0.0):
+            return _BALANCE
+        return float(np.sqrt(np.clip(primal / dual, 1e-2, 1e2)))
+
+    def _accelerator(self, state: State, anderson: Anderson | None) -> Anderson | None:
+        """Return an empty history if so many edges fit exactly that acceleration pays, else None.
+
+        With noise, the edges inside their ball become few as the iteration converges; without, they
+        stay. The first renewal only takes note, for noise has not had time to show.
+        """
+        before, state.interior = state.interior, float(state.sums[INTERIOR]) / len(state.x)
+        pays = state.interior >= max(_ANDERSON_INTERIOR, _ANDERSON_KEPT * before)
+        if not (self.settings.accelerate and pays):
+            return None
+        if anderson is None:
+            return Anderson(self.passes, state.x.shape, _ANDERSON_MEMORY)
+        anderson.restart()
+        return anderson
+
+
+def _mean(residuals: FloatArray, weights: FloatArray) -> float:
+    """Return the weighted mean residual, kept away from 0 (the mean edge has length about 1)."""
+    return max(float(np.average(residuals, weights=weights)), 1e-6)
+
+
+def _cancelled(on_iteration: OnIteration | None, iteration: int, objective: float) -> bool:
+    """Report an iteration; True if the caller asks to stop."""
+    if on_iteration is None:
+        return False
+    answer = on_iteration(IterationInfo(iteration, objective, None))
+    return answer is not None and not answer  # a numpy False cancels too

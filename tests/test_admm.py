@@ -1,0 +1,323 @@
+"""Splitting for ShapeFit and LUD: agreement with the conic reference, exactness, and how it ends."""
+
+import numpy as np
+import pytest
+from graph_families import comm, er, geo, seq
+
+from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, solve_admm, solve_lud
+from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
+from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def view_graph(edges, t, *, sigma, q, seed, weights=None):
+    """Directions with noise sigma, each replaced by a random one with probability q."""
+    rng = np.random.default_rng(seed)
+    v = t[edges[:, 0]] - t[edges[:, 1]]
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    random = rng.normal(size=v.shape)
+    random /= np.linalg.norm(random, axis=1, keepdims=True)
+    wrong = rng.uniform(size=(len(edges), 1)) < q
+    mixed = np.where(wrong, random, v + sigma * random)
+    return ViewGraph(len(t), edges, mixed / np.linalg.norm(mixed, axis=1, keepdims=True), weights)
+
+
+def small_problem(seed, d, *, sigma=0.05, q=0.2, n=24):
+    """A dense weighted random problem and its true locations."""
+    rng = np.random.default_rng(seed)
+    t = rng.normal(size=(n, d))
+    i, j = np.triu_indices(n, 1)
+    kept = rng.uniform(size=len(i)) < 0.7
+    edges = np.stack([i[kept], j[kept]], axis=1)
+    return view_graph(
+        edges, t, sigma=sigma, q=q, seed=seed, weights=rng.uniform(0.3, 3.0, size=len(edges))
+    ), t
+
+
+def shape(locations):
+    """Locations with centroid 0 and norm 1."""
+    centred = locations - locations.mean(axis=0)
+    return centred / np.linalg.norm(centred)
+
+
+@pytest.mark.parametrize("d", [3, 5])
+def test_noisy_weighted_problems_have_the_optimum_of_the_conic_reference(d):
+    graph, _ = small_problem(d, d)
+    result = solve_admm(graph, 1e-12, 2000)
+    reference, _, _ = solve_conic(graph, 1e-10, 200)
+    assert result.stop is Stop.ACCURATE
+    assert objective(graph, result.locations) == pytest.approx(objective(graph, reference), rel=1e-8)
+    # The conic answer is the looser one: a gap of 1e-10 allows sqrt(1e-10) where the optimum is smooth.
+    np.testing.assert_allclose(shape(result.locations), shape(reference), atol=1e-5)
+
+
+@pytest.mark.parametrize("d", [3, 5])
+def test_the_dual_that_comes_with_the_answer_certifies_it(d):
+    graph, _ = small_problem(10 + d, d)
+    result = solve_admm(graph, 1e-13, 3000)
+    certificate = certify(graph, result.locations, result.dual)
+    # Repairing the equality costs the square root of the objective's accuracy: sqrt(1e-13) = 3e-7.
+    assert certificate.gap <= 1e-6 * certificate.objective
+    assert certificate.equality_residual < 1e-12
+
+
+def test_in_the_plane_the_noisy_optimum_is_approached_and_the_limit_is_not_hidden():
+    # With d = 2 the objective is polyhedral and splitting slows down near a vertex: 1e-4 after 300 steps.
+    graph, _ = small_problem(2, 2)
+    reference = objective(graph, solve_conic(graph, 1e-10, 200)[0])
+    rough, strict = solve_admm(graph, 1e-3, 1000), solve_admm(graph, 1e-10, 600)
+    assert rough.stop is Stop.ACCURATE
+    assert objective(graph, rough.locations) <= reference * (1.0 + 5e-3)
+    assert strict.stop in (Stop.STALLED, Stop.MAX_ITERATIONS)
+    assert reference * (1.0 - 1e-9) <= objective(graph, strict.locations) <= reference * (1.0 + 1e-3)
+
+
+def test_the_dual_lies_in_its_ball_however_early_the_iteration_ends():
+    graph, _ = small_problem(1, 3)
+    for iterations in (1, 3, 12):
+        dual = solve_admm(graph, 1e-12, iterations).dual
+        assert (np.linalg.norm(dual, axis=1) <= graph.weights * (1.0 + 1e-12)).all()
+        np.testing.assert_allclose(along(dual, graph.directions), 0.0, atol=1e-13)
+
+
+def test_the_locations_meet_the_scale_constraint():
+    graph, _ = small_problem(2, 3)
+    result = solve_admm(graph, 1e-3, 100)
+    length = float(np.sum(scale_functional(graph) * result.locations))
+    assert length == pytest.approx(graph.weights.sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_noise_free_problems_are_exact_in_any_dimension(d):
+    graph, t = small_problem(60 + d, d, sigma=0.0, q=0.1)
+    result = solve_admm(graph, 1e-14, 1000)
+    assert np.linalg.norm(shape(result.locations) - shape(t)) < 1e-12
+
+
+@pytest.mark.parametrize("family", ["geo", "er"])
+def test_noise_free_problems_are_solved_to_the_last_digits_in_spite_of_corruption(family):
+    edges, t = geo(400, 40, 3) if family == "geo" else er(300, 60, 3)
+    graph = view_graph(edges, t, sigma=0.0, q=0.2, seed=3)
+    result = solve_admm(graph, 1e-14, 400)
+    assert np.linalg.norm(shape(result.locations) - shape(t)) < 1e-12
+
+
+def test_acceleration_saves_more_than_half_of_the_iterations_without_noise(monkeypatch):
+    edges, t = geo(400, 40, 3)
+    graph = view_graph(edges, t, sigma=0.0, q=0.2, seed=3)
+    accelerated = solve_admm(graph, 1e-8, 2000).iterations
+    monkeypatch.setattr("sfm_shapefit.solver.admm.engine._ANDERSON_INTERIOR", 2.0)
+    assert accelerated < 0.5 * solve_admm(graph, 1e-8, 2000).iterations
+
+
+def test_the_number_of_iterations_does_not_grow_with_the_number_of_cameras():
+    counts = []
+    for n in (1000, 4000):
+        edges, t = geo(n, 40, 1)
+        graph = view_graph(edges, t, sigma=0.01, q=0.2, seed=1)
+        result = solve_admm(graph, 1e-6, 500)
+        assert result.stop is Stop.ACCURATE
+        counts.append(result.iterations)
+    assert max(counts) <= 1.3 * min(counts)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.01])
+def test_two_threads_give_the_bits_of_one(sigma):
+    edges, t = geo(1500, 40, 2)
+    graph = view_graph(edges, t, sigma=sigma, q=0.2, seed=2)
+    assert graph.num_edges > 20_000  # enough for several chunks of edges
+    one, two = (solve_admm(graph, 1e-4, 30, threads=k) for k in (1, 2))
+    assert np.array_equal(one.locations, two.locations)
+    assert np.array_equal(one.dual, two.dual)
+    lud_one, lud_two = (solve_lud(graph, 10, certified=False, threads=k) for k in (1, 2))
+    assert np.array_equal(lud_one.locations, lud_two.locations)
+
+
+def test_the_order_and_orientation_of_the_edges_do_not_matter():
+    graph, _ = small_problem(4, 3)
+    shuffle = np.random.default_rng(0).permutation(graph.num_edges)
+    other = ViewGraph(
+        graph.num_cameras, graph.edges[shuffle][:, ::-1], -graph.directions[shuffle], graph.weights[shuffle]
+    )
+    first, second = solve_admm(graph, 1e-12, 2000), solve_admm(other, 1e-12, 2000)
+    np.testing.assert_allclose(first.locations, second.locations, atol=1e-6)
+    np.testing.assert_allclose(first.dual[shuffle], -second.dual, atol=1e-5)
+
+
+def test_a_common_factor_on_the_weights_changes_no_location():
+    graph, _ = small_problem(5, 3)
+    scaled = ViewGraph(graph.num_cameras, graph.edges, graph.directions, 1000.0 * graph.weights)
+    first, second = solve_admm(graph, 1e-10, 2000), solve_admm(scaled, 1e-10, 2000)
+    assert first.iterations == second.iterations
+    np.testing.assert_allclose(first.locations, second.locations, atol=1e-8)
+
+
+def test_a_factor_that_would_not_fit_is_replaced_by_conjugate_gradients_with_the_same_answer():
+    edges, t = comm(600, 40, 1)
+    graph = view_graph(edges, t, sigma=0.01, q=0.2, seed=1)
+    iterative = laplacian_factor(graph, memory_bytes=1000)
+    assert isinstance(iterative, IterativeSolver)
+    assert not isinstance(laplacian_factor(graph), IterativeSolver)
+    direct, inexact = solve_admm(graph, 1e-7, 1000), solve_admm(graph, 1e-7, 1000, iterative)
+    assert inexact.stop is Stop.ACCURATE
+    assert objective(graph, inexact.locations) == pytest.approx(objective(graph, direct.locations), rel=1e-6)
+
+
+class _Useless:
+    """A Laplacian solver that does next to nothing."""
+
+    def refactor(self, weights):
+        self.scale = 1e-4 / weights.max()
+
+    def solve(self, rhs):
+        return self.scale * rhs
+
+
+def test_solves_that_are_too_inexact_are_reported_as_a_stall():
+    edges, t = seq(200, 12, 1)
+    graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
+    result = solve_admm(graph, 1e-8, 2000, _Useless())
+    assert result.stop is Stop.STALLED
+    assert "allow more memory" in result.stop.value
+
+
+def test_the_callback_sees_every_iteration_and_can_cancel():
+    graph, _ = small_problem(6, 3)
+    seen = []
+
+    def watch(info):
+        seen.append(info)
+        return info.iteration < 7
+
+    result = solve_admm(graph, 1e-12, 100, on_iteration=watch)
+    assert result.stop is Stop.CANCELLED
+    assert [info.iteration for info in seen] == [1, 2, 3, 4, 5, 6, 7]
+    assert result.iterations == 7
+    assert seen[-1].objective == pytest.approx(objective(graph, result.locations), rel=1e-12)
+    assert solve_lud(graph, 50, on_iteration=lambda info: info.iteration < 3).iterations == 3
+
+
+def test_an_exception_in_the_callback_reaches_the_caller():
+    graph, _ = small_problem(6, 3)
+
+    def fail(info):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        solve_admm(graph, 1e-12, 100, on_iteration=fail)
+
+
+def test_the_iteration_limit_is_reported():
+    graph, _ = small_problem(7, 3)
+    result = solve_admm(graph, 1e-12, 5)
+    assert result.stop is Stop.MAX_ITERATIONS
+    assert result.iterations == 5
+
+
+def lud_reference(graph):
+    """LUD through cvxpy and Clarabel: optimal value and locations."""
+    cp = pytest.importorskip("cvxpy")
+    t, s = cp.Variable((graph.num_cameras, graph.dimension)), cp.Variable(graph.num_edges)
+    i, j = graph.edges.T
+    deviations = t[i] - t[j] - cp.multiply(cp.reshape(s, (graph.num_edges, 1), order="F"), graph.directions)
+    program = cp.Problem(cp.Minimize(graph.weights @ cp.norm(deviations, 2, axis=1)), [s >= 1, t[0] == 0])
+    program.solve(solver=cp.CLARABEL, tol_gap_abs=1e-9, tol_gap_rel=1e-9, tol_feas=1e-9)
+    return program.value, t.value
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_lud_has_the_optimum_of_a_conic_reference_and_its_bound_closes(d):
+    graph, _ = small_problem(20 + d, d, n=16)
+    value, locations = lud_reference(graph)
+    result = solve_lud(graph, 3000, tol=1e-12)
+    assert result.objective == pytest.approx(value, rel=1e-7)
+    np.testing.assert_allclose(shape(result.locations), shape(locations), atol=1e-4)
+    assert (result.lengths >= 1.0).all()
+    # The bound is below the optimum, and near it once the dual has converged.
+    assert value * (1.0 - 1e-4) <= result.dual_bound <= value * (1.0 + 1e-7)
+    assert result.equality_residual < 1e-12
+
+
+def test_the_bound_of_lud_never_exceeds_the_optimum_from_any_early_iterate():
+    graph, _ = small_problem(30, 3, n=16)
+    value, _ = lud_reference(graph)
+    for iterations in (1, 2, 5, 20):
+        assert 0.0 <= solve_lud(graph, iterations).dual_bound <= value * (1.0 + 1e-7)
+
+
+def test_lud_stands_on_a_chain_where_the_optimum_of_shapefit_collapses():
+    edges, t = seq(300, 36, 1)
+    graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
+    lud = solve_lud(graph, 50, certified=False)
+    collapsed, _, _ = solve_conic(graph, 1e-6, 200)
+    # Seeds 1 to 6: LUD 0.02 to 0.03, the optimum of ShapeFit 0.3 to 1.4 (sqrt(2) is no relation at all).
+    assert np.linalg.norm(shape(lud.locations) - shape(t)) < 0.06
+    assert np.linalg.norm(shape(collapsed) - shape(t)) > 0.3
+
+
+def test_on_a_collapsing_chain_shapefit_says_that_it_has_not_converged():
+    edges, t = seq(300, 36, 1)
+    graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
+    assert solve_admm(graph, 1e-6, 500).stop in (Stop.STALLED, Stop.MAX_ITERATIONS)
+
+
+def plain_step(graph, least, x, t, rho, relaxation):
+    """The proximal step of every edge as it is written in the module, without fusion."""
+    v = graph.directions
+
+    def residual(z):
+        return z - np.maximum(along(z, v), least)[:, None] * v
+
+    def clip(z):
+        r = residual(z)
+        norms = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
+        return np.minimum(1.0, graph.weights / rho / norms)[:, None] * r
+
+    baselines = differences(t, graph.edges)
+    x_next = relaxation * baselines + (1.0 - relaxation) * (x - clip(x)) + clip(x)
+    u = clip(x_next)
+    sums = {
+        OBJECTIVE: graph.weights @ np.linalg.norm(residual(baselines), axis=1),
+        PAIRING: np.sum(rho[:, None] * u * baselines),
+        ALONG: rho @ along(u, v),
+        CHANGE: np.sum(rho[:, None] * (x_next - x) ** 2),
+        INTERIOR: np.sum(np.linalg.norm(rho[:, None] * u, axis=1) < graph.weights * (1.0 - 1e-9)),
+    }
+    y, y_next = x - clip(x), x_next - u
+    residuals = np.sum(rho[:, None] * (baselines - y_next) ** 2), np.sum(rho[:, None] * (y_next - y) ** 2)
+    pull = adjoint(rho[:, None] * (x_next - 2.0 * u - baselines), graph.edges, graph.num_cameras)
+    return x_next, pull, [sums[k] for k in range(5)], residuals
+
+
+@pytest.mark.parametrize("least", [-np.inf, 1.0])
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
+    graph, t = small_problem(40 + d, d)
+    rng = np.random.default_rng(d)
+    rho = rng.uniform(0.2, 5.0, size=graph.num_edges)
+    x = rng.normal(size=graph.directions.shape)
+    passes = EdgePasses(edge_data(graph, least), 1)
+    order = passes.data.order
+    ours = np.empty_like(x)
+    pull, sums = passes.step(x[order], ours, t, rho[order], 1.7)
+    x_next, expected_pull, expected_sums, residuals = plain_step(graph, least, x, t, rho, 1.7)
+    np.testing.assert_allclose(ours, x_next[order], atol=1e-12)
+    np.testing.assert_allclose(pull, expected_pull, atol=1e-11)
+    np.testing.assert_allclose(sums, expected_sums, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(passes.pull(ours, t, rho[order]), expected_pull, atol=1e-11)
+    np.testing.assert_allclose(passes.imbalance(x[order], ours, t, rho[order]), residuals, rtol=1e-12)
+
+
+def test_new_penalties_keep_the_split_point_and_the_dual():
+    graph, _ = small_problem(50, 3)
+    rng = np.random.default_rng(50)
+    passes = EdgePasses(edge_data(graph, -np.inf), 1)
+    x, rho = rng.normal(size=graph.directions.shape), rng.uniform(0.2, 5.0, size=graph.num_edges)
+    dual = passes.dual(x, rho)
+    point = x - dual / rho[:, None]
+    other = rng.uniform(0.2, 5.0, size=graph.num_edges)
+    passes.change_penalties(x, rho, other)
+    np.testing.assert_allclose(passes.dual(x, other), dual, atol=1e-13)
+    np.testing.assert_allclose(x - dual / other[:, None], point, atol=1e-13)
