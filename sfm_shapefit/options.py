@@ -45,7 +45,7 @@ class LocateOptions:
     bundle_adjust: bool = False
     """Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."""
     threads: int = 0
-    """Threads for estimating directions; 0 means one per core. The answer does not depend on it."""
+    """Threads to use; 0 means one per core. The answer does not depend on it."""
 
     def __post_init__(self) -> None:
         for name, kind in (("directions", Source), ("scale", Scale), ("solver", Method)):
@@ -62,7 +62,7 @@ class LocateOptions:
         """Return the solver's share."""
         from sfm_shapefit.solver.options import SolverOptions
 
-        return SolverOptions(method=self.solver, tol=self.tol)
+        return SolverOptions(method=self.solver, tol=self.tol, threads=self.num_threads())
 
     def for_directions(self) -> "DirectionOptions":
         """Return the direction estimator's share."""

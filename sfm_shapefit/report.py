@@ -143,6 +143,7 @@ def solve_summary(result: SolverResult) -> dict[str, Any]:
         "dual_bound": result.dual_bound,
         "gap": result.gap,
         "equality_residual": result.equality_residual,
+        "unique": result.unique,
         "iterations": result.iterations,
         "seconds": result.seconds,
         "method": result.method,

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 
 from sfm_shapefit.arrays import FloatArray
 
-Method = Literal["auto", "conic"]
+Method = Literal["auto", "newton", "admm", "conic"]
 
 
 class Status(enum.Enum):
@@ -21,6 +21,7 @@ class Status(enum.Enum):
         "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
     )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+    CANCELLED = "on_iteration cancelled the solve; these are the last iterate and what it proves"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,19 +45,26 @@ class SolverOptions:
     """Settings of one solve. Unit-free: the program fixes its own scale."""
 
     method: Method = "auto"
-    """Which solver: "conic" is the generic conic program through cvxpy and Clarabel; "auto" picks."""
+    """Which solver: "newton" is primal-dual Newton, "admm" splitting for large graphs, "conic" the generic
+    conic program through cvxpy and Clarabel; "auto" picks by size and predicted fill, and says why."""
     tol: float = 1e-8
     """The certified gap, objective - dual_bound, at which a solve counts as converged."""
-    max_iterations: int = 200
-    """Hard limit; reaching it is reported in `SolverResult.status`, never silent."""
+    max_iterations: int | None = None
+    """Hard limit; None: the method's own. Reaching it is reported in `SolverResult.status`, never silent."""
+    uniqueness: bool = True
+    """Also examine whether the certificate proves the optimum unique; costs one sparse factorisation."""
+    threads: int = 1
+    """Threads of the passes over edges; the answer does not depend on it."""
 
     def __post_init__(self) -> None:
         if self.method not in get_args(Method):
             raise ValueError(f"SolverOptions.method must be one of {get_args(Method)}, got {self.method!r}")
         if not 0.0 < self.tol < 1.0:
             raise ValueError(f"SolverOptions.tol must lie in (0, 1), got {self.tol}")
-        if self.max_iterations < 1:
-            raise ValueError(f"SolverOptions.max_iterations must be >= 1, got {self.max_iterations}")
+        for name in ("max_iterations", "threads"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"SolverOptions.{name} must be >= 1, got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -75,8 +83,13 @@ class SolverResult:
     dual_bound times the sum of signed w_e v_e."""
     equality_residual: float
     """Largest violation of that equality at a camera, relative to the largest weighted degree."""
+    unique: bool | None
+    """True: the certificate proves that no other locations are optimal (up to translation, scale and the
+    gap). False: it does not prove that. None: not examined."""
     iterations: int
+    """Interior-point, Newton or splitting steps."""
     seconds: float
+    """Wall-clock time of solving and certifying."""
     method: str
     """The solver that ran."""
     method_reason: str

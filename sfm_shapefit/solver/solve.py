@@ -1,27 +1,64 @@
 """The one entry to the solvers: check the graph, choose a method, solve, certify."""
 
 import time
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import frozen
+from sfm_shapefit.arrays import FloatArray, frozen
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.rigidity import is_parallel_rigid
+from sfm_shapefit.solver.admm.shapefit import solve_admm
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
+from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.options import (
+    IterationInfo,
+    OnIteration,
+    SolverOptions,
+    SolverResult,
+    Status,
+)
 from sfm_shapefit.solver.program import normalized_locations, projected_length, scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
+_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
+
+# Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
+# whatever the graph, and beyond the second the dense one takes seconds.
+_SMALL, _LARGEST_DENSE = 450, 1800
+_LARGEST_NEWTON_FLOPS = 2e11  # of one block factorisation: about 4 s
 
 
-def solve(graph: ViewGraph, options: SolverOptions | None = None) -> SolverResult:
+class Choice(NamedTuple):
+    """A method and the reason for it."""
+
+    method: str
+    run: Callable[..., "Run"]
+    reason: str
+
+
+class Run(NamedTuple):
+    """What a solver returns; the certificate decides what it is worth."""
+
+    locations: FloatArray
+    dual: FloatArray
+    iterations: int
+
+
+def solve(
+    graph: ViewGraph, options: SolverOptions | None = None, on_iteration: OnIteration | None = None
+) -> SolverResult:
     """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
 
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
         options: solver settings; defaults if None.
+        on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
 
     Returns:
         Locations, status, objective, and a feasible dual point whose value bounds the optimum from below.
@@ -34,26 +71,80 @@ def solve(graph: ViewGraph, options: SolverOptions | None = None) -> SolverResul
     Source: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
     options = options or SolverOptions()
-    _refuse_undetermined(graph)
     start = time.perf_counter()
-    locations, dual, iterations = solve_conic(graph, options.tol, options.max_iterations)
-    length = projected_length(graph, locations)
-    if not (np.isfinite(locations).all() and length > 0.0):
+    _refuse_undetermined(graph)
+    choice = _choose(graph, options)
+    watch = _Watch(on_iteration)
+    limit = options.max_iterations or _LIMITS[choice.method]
+    run = choice.run(graph, options, limit, watch if on_iteration else None)
+    if not (np.isfinite(run.locations).all() and projected_length(graph, run.locations) > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
-    locations = normalized_locations(graph, locations)
-    certificate = certify(graph, locations, dual)
+    locations = normalized_locations(graph, run.locations)
+    certificate = certify(graph, locations, run.dual, uniqueness=options.uniqueness)
     return SolverResult(
         locations=frozen(locations),
-        status=_status(certificate, options, iterations),
+        status=_status(certificate, options.tol, run.iterations >= limit, watch.cancelled),
         objective=certificate.objective,
         dual_bound=certificate.dual_bound,
         dual=certificate.dual,
         equality_residual=certificate.equality_residual,
-        iterations=iterations,
+        unique=certificate.unique,
+        iterations=run.iterations,
         seconds=time.perf_counter() - start,
-        method="conic",
-        method_reason="asked for" if options.method == "conic" else "the only solver so far",
+        method=choice.method,
+        method_reason=choice.reason,
     )
+
+
+def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
+    """Pick the solver by the size of the problem and the predicted fill of its factor."""
+    unknowns = graph.num_cameras * graph.dimension
+    asked = options.method != "auto"
+    if options.method == "conic":
+        return Choice("conic", _run_conic, "asked for")
+    if options.method == "admm":
+        return Choice("admm", _run_admm, "asked for")
+    if unknowns <= _SMALL:
+        return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
+    tree = best_order(adjacency(graph.num_cameras, graph.edges))
+    flops = tree.flops * graph.dimension**3
+    if unknowns <= _LARGEST_DENSE and flops > unknowns**3 / 12:
+        return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
+    predicted = f"{flops / 1e9:.2g} Gflop for a sparse factor"
+    if asked or flops <= _LARGEST_NEWTON_FLOPS:
+        return Choice("newton", _run_sparse, "asked for" if asked else predicted)
+    return Choice("admm", _run_admm, f"{predicted}: too many for Newton")
+
+
+def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
+    return Run(*solve_newton_dense(graph, options.tol, limit, watch))
+
+
+def _run_sparse(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
+    return Run(*solve_newton_sparse(graph, options.tol, limit, watch))
+
+
+def _run_admm(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
+    found = solve_admm(graph, options.tol, limit, threads=options.threads, on_iteration=watch)
+    return Run(found.locations, found.dual, found.iterations)
+
+
+def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None) -> Run:
+    return Run(*solve_conic(graph, options.tol, limit))
+
+
+class _Watch:
+    """Passes iterations on to the user's callback, and remembers whether it cancelled."""
+
+    def __init__(self, on_iteration: OnIteration | None) -> None:
+        self._on_iteration = on_iteration
+        self.cancelled = False
+
+    def __call__(self, info: IterationInfo) -> bool:
+        if self._on_iteration is not None:
+            answer = self._on_iteration(info)
+            self.cancelled = answer is not None and not answer
+        return not self.cancelled
 
 
 def _refuse_undetermined(graph: ViewGraph) -> None:
@@ -75,7 +166,9 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
 
 
-def _status(certificate: Certificate, options: SolverOptions, iterations: int) -> Status:
-    if certificate.gap <= options.tol:
+def _status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
+    if certificate.gap <= tol:
         return Status.CONVERGED
-    return Status.MAX_ITERATIONS if iterations >= options.max_iterations else Status.INACCURATE
+    if cancelled:
+        return Status.CANCELLED
+    return Status.MAX_ITERATIONS if at_limit else Status.INACCURATE
