@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from graph_families import comm, er, geo, seq
 
 from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, solve_admm, solve_lud
 from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
@@ -10,6 +9,7 @@ from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.graph_families import comm, er, geo, seq
 
 
 def view_graph(edges, t, *, sigma, q, seed, weights=None):

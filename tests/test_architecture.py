@@ -36,7 +36,7 @@ LAYERS = [
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py"},
-    "cv2": {"synthetic.py"},
+    "cv2": {"synthetic/scenes.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
     "typer": {"cli.py"},

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import pytest
-from graph_families import FAMILIES, random_blocks, random_weights
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csc_array, csr_array
@@ -29,6 +28,7 @@ from sfm_shapefit.laplacian.operators import (
     laplacian_pattern,
 )
 from sfm_shapefit.laplacian.symbolic import elimination_tree
+from tests.graph_families import FAMILIES, random_blocks, random_weights
 
 Array = npt.NDArray[np.float64]
 EPS = np.finfo(np.float64).eps
@@ -474,7 +474,7 @@ CHILD = """
 import json, sys, time
 import numpy as np
 sys.path.insert(0, sys.argv[1])
-from graph_families import geo, random_weights
+from tests.graph_families import geo, random_weights
 from sfm_shapefit.laplacian.cholesky import analyse, factorise
 edges, t = geo(2000, 20.0, 1)
 begin = time.perf_counter()

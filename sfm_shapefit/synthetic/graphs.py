@@ -1,0 +1,168 @@
+"""Bare graphs of directions whose truth is known: the paper's random model, and four families of view graphs.
+
+    random       Erdos-Renyi G(n, p), locations N(0, I_d): the model of the theorems
+    expander     the same with a given mean degree, for sizes where all pairs cannot be drawn
+    box          an area mapped from a drone: each camera joined to its nearest
+    trajectory   a video: each camera joined to the next ones, and a few loop closures
+    community    an internet collection: clusters with hubs, loosely joined
+
+Each direction is replaced by a uniformly random unit vector with probability q, and is else the true one plus
+sigma times a random unit vector, normalised.
+
+Source of the random model: Hand, Lee, Voroninski (2015), arXiv 1506.01437, section 4.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import normalized
+
+Seed = int | np.random.Generator
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphProblem:
+    """Directions between unknown locations, with the answer."""
+
+    locations: FloatArray
+    """(n, d) the truth."""
+    edges: IntArray
+    """(m, 2) pairs (i, j), i < j, in lexicographic order."""
+    directions: FloatArray
+    """(m, d) measured unit directions of t_i - t_j."""
+    corrupted: BoolArray
+    """(m,) True where the direction is a random one."""
+
+
+def random_graph_problem(
+    n: int, p: float = 0.5, d: int = 3, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return the random model of the paper: locations N(0, I_d), an Erdos-Renyi graph G(n, p).
+
+    Args:
+        n: number of locations.
+        p: probability of each pair.
+        d: dimension, at least 2.
+        sigma: size of the noise of the directions that are not corrupted.
+        q: probability that a direction is replaced by a uniformly random unit vector.
+        seed: an integer, or a Generator to draw from.
+
+    Source: Hand, Lee, Voroninski (2015), section 4.
+    """
+    rng = np.random.default_rng(seed)
+    locations = rng.standard_normal((n, d))
+    i, j = np.triu_indices(n, k=1)
+    present = rng.random(len(i)) < p
+    edges = np.stack([i[present], j[present]], axis=1).astype(np.int64)
+    return _measured(locations, edges, sigma, q, rng)
+
+
+def expander_graph_problem(
+    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return locations N(0, I) and n degree / 2 pairs drawn uniformly; repeated draws are merged."""
+    rng = np.random.default_rng(seed)
+    locations = rng.standard_normal((n, 3))
+    i, j = rng.integers(n, size=(2, round(n * degree / 2.0)))
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng)
+
+
+def box_graph_problem(
+    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
+
+    The model of an area mapped from a drone. About degree / 1.25 neighbours are taken, because the union of
+    the neighbourhoods is larger than each of them.
+    """
+    rng = np.random.default_rng(seed)
+    locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
+    neighbours = _nearest(locations, round(degree / 1.25))
+    camera = np.repeat(np.arange(n), neighbours.shape[1])
+    return _measured(locations, _unique_pairs(camera, neighbours.ravel()), sigma, q, rng)
+
+
+def trajectory_graph_problem(
+    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
+
+    The model of a video. A loop closure joins a random camera and one of its 60 nearest in space.
+    """
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(0.15 * rng.standard_normal(n))
+    steps = np.stack([np.cos(heading), np.sin(heading), 0.2 * rng.standard_normal(n)], axis=1)
+    locations = np.cumsum(steps, axis=0) + 0.3 * rng.standard_normal((n, 3))
+    reach = min(max(round(degree / 2.0), 1), n - 1)
+    i = np.concatenate([np.arange(n - step) for step in range(1, reach + 1)])
+    j = np.concatenate([np.arange(step, n) for step in range(1, reach + 1)])
+    nearest = _nearest(locations, 60)
+    closing = rng.integers(n, size=len(i) // 50)
+    closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
+    edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
+    return _measured(locations, edges, sigma, q, rng)
+
+
+def community_graph_problem(
+    n: int, degree: float = 30.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+) -> GraphProblem:
+    """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
+
+    Locations are N(0, I) around centres N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
+    (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
+    that the mean degree stays somewhat below `degree`.
+    """
+    rng = np.random.default_rng(seed)
+    num_clusters = max(round(n / 400), 1)
+    cluster_centers = rng.standard_normal((num_clusters, 3)) * [10.0, 10.0, 1.0]
+    cluster = np.sort(rng.integers(num_clusters, size=n))
+    locations = cluster_centers[cluster] + rng.standard_normal((n, 3))
+
+    num_drawn = round(n * degree / 2.0)
+    cumulative = np.cumsum(np.minimum((1.0 - rng.random(n)) ** -0.5, 50.0))
+    first = np.searchsorted(cluster, np.arange(num_clusters + 1))  # cameras of a cluster are consecutive
+    bounds = np.concatenate([[0.0], cumulative])[first]
+
+    i = np.searchsorted(cumulative, rng.random(num_drawn) * cumulative[-1], side="right")
+    target = cluster[i]
+    if num_clusters > 1:
+        near = _nearest(cluster_centers, 3)
+        leaves = rng.random(num_drawn) < 0.07
+        target = np.where(leaves, near[target, rng.integers(near.shape[1], size=num_drawn)], target)
+    drawn = bounds[target] + rng.random(num_drawn) * (bounds[target + 1] - bounds[target])
+    j = np.searchsorted(cumulative, drawn, side="right")
+    backbone = [(np.arange(n - step), np.arange(step, n)) for step in range(1, min(5, n))]
+    i = np.concatenate([i, *(a for a, _ in backbone)])
+    j = np.concatenate([j, *(b for _, b in backbone)])
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng)
+
+
+def _measured(
+    locations: FloatArray, edges: IntArray, sigma: float, q: float, rng: np.random.Generator
+) -> GraphProblem:
+    """Return the directions of `edges` with the noise and the corruption of the paper."""
+    true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
+    noisy = normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
+    random = normalized(rng.standard_normal(true.shape))
+    corrupted = rng.random(len(edges)) < q
+    directions = np.where(corrupted[:, None], random, noisy)
+    return GraphProblem(locations=locations, edges=edges, directions=directions, corrupted=corrupted)
+
+
+def _nearest(locations: FloatArray, k: int) -> IntArray:
+    """Return (n, k) the k nearest other locations of each; all others where there are fewer."""
+    from scipy.spatial import KDTree
+
+    k = min(max(k, 1), len(locations) - 1)
+    nearest = np.asarray(KDTree(locations).query(locations, k=k + 1)[1], dtype=np.int64)
+    return nearest[:, 1:]  # the first is the location itself
+
+
+def _unique_pairs(i: npt.NDArray[np.integer], j: npt.NDArray[np.integer]) -> IntArray:
+    """Return the unordered pairs (m, 2) of different cameras, each once, in lexicographic order."""
+    pairs = np.sort(np.stack([i, j], axis=1).astype(np.int64), axis=1)
+    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
