@@ -1,0 +1,26 @@
+"""Benchmarks of sfm_shapefit: `python scripts/benchmark.py real --help`.
+
+One subcommand per module of scripts/benchmarks; each rewrites its own section of scripts/results.md.
+"""
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from benchmarks import real
+
+SUBCOMMANDS = {"real": real}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    subparsers = parser.add_subparsers(dest="subcommand", required=True)
+    for name, module in SUBCOMMANDS.items():
+        module.add_arguments(subparsers.add_parser(name, help=module.HELP, description=module.HELP))
+    args = parser.parse_args(argv)
+    code: int = SUBCOMMANDS[args.subcommand].run(args)
+    return code
+
+
+if __name__ == "__main__":
+    sys.exit(main())
