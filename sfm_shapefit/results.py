@@ -96,9 +96,8 @@ class LocateResult:
         images = [self.reconstruction.image(image_id) for image_id in placed_ids]
         centers = np.array([image.projection_center() for image in images])
         rows = camera_rows(self.placement, centers, self.gauge.similarity.scale)
-        alone = np.flatnonzero(self.placement.graph.degrees() == 0).tolist()
-        for camera in alone:
-            rows[camera] = replace(rows[camera], reason=_why_no_direction(self.directions, camera))
+        for camera, reason in _without_direction(self.directions, self.placement.graph).items():
+            rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(_all_names(self)) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
@@ -335,13 +334,19 @@ def _home_pieces(placement: Placement) -> list[int | None]:
     return homes
 
 
-def _why_no_direction(directions: PairDirections, camera: int) -> str:
-    """Say what became of the pairs of a camera none of whose pairs has a usable direction."""
-    own = np.flatnonzero((directions.pairs == camera).any(axis=1)).tolist()
-    if not own:
-        return "no matches with any posed image"
-    cause, count = Counter(directions.status[p].value for p in own).most_common(1)[0]
-    return f"no usable direction in {len(own)} pairs, most often ({count}): {cause}"
+def _without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:
+    """Say, for the cameras none of whose pairs has a usable direction, what became of their pairs."""
+    causes: dict[int, Counter[str]] = {c: Counter() for c in np.flatnonzero(graph.degrees() == 0).tolist()}
+    for pair, status in zip(directions.pairs.tolist(), directions.status, strict=True):
+        for camera in pair:
+            if camera in causes:
+                causes[camera][status.value] += 1
+    reasons = dict.fromkeys(causes, "no matches with any posed image")
+    for camera, counter in causes.items():
+        for cause, count in counter.most_common(1):
+            total = counter.total()
+            reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
+    return reasons
 
 
 def _adjustment_summary(adjusted: Adjusted) -> dict[str, Any]:
