@@ -18,7 +18,7 @@ from sfm_shapefit.solver.program import (
     scale_functional,
 )
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 
 TOL = SolverOptions().tol
@@ -218,9 +218,10 @@ def test_certify_refuses_what_it_cannot_judge():
         certify(graph, -result.locations, result.dual)
 
 
-def test_too_few_iterations_are_reported_not_hidden():
+@pytest.mark.parametrize("method", ["newton", "conic"])
+def test_too_few_iterations_are_reported_not_hidden(method):
     graph, _ = problem(13, sigma=0.05)
-    result = solve(graph, SolverOptions(max_iterations=4))
+    result = solve(graph, SolverOptions(method=method, max_iterations=3))
     assert result.status is not Status.CONVERGED
     assert result.gap > TOL
     assert np.isfinite(result.locations).all()
@@ -247,7 +248,87 @@ def test_pure_noise_still_ends_certified():
     assert result.objective > 0.3
 
 
-@pytest.mark.parametrize(("field", "value"), [("method", "magic"), ("tol", 0.0), ("max_iterations", 0)])
+def box(n, sigma=0.01, q=0.2):
+    drawn = box_graph_problem(n, 30, sigma=sigma, q=q, seed=n)
+    return ViewGraph(n, drawn.edges, drawn.directions)
+
+
+def test_auto_says_what_it_chose_and_why():
+    small = solve(problem(15, sigma=0.05)[0])
+    assert (small.method, small.method_reason) == ("newton", "60 unknowns: dense")
+    sparse = solve(box(300))
+    assert sparse.method == "newton"
+    assert "Gflop for a sparse factor" in sparse.method_reason
+    assert solve(box(60), SolverOptions(method="admm", tol=1e-3)).method_reason == "asked for"
+
+
+def test_auto_leaves_newton_where_its_factor_would_explode(monkeypatch):
+    from sfm_shapefit.solver import solve as module
+
+    monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", 1e6)
+    drawn = expander_graph_problem(700, 30, sigma=0.01, seed=1)
+    result = solve(ViewGraph(700, drawn.edges, drawn.directions), SolverOptions(tol=1e-3))
+    assert result.method == "admm"
+    assert "too many for Newton" in result.method_reason
+    assert result.status is Status.CONVERGED
+
+
+@pytest.mark.parametrize("n", [60, 300])
+def test_all_methods_agree(n):
+    graph = box(n)
+    reference = solve(graph, SolverOptions(method="conic"))
+    for method in ("newton", "admm"):
+        result = solve(graph, SolverOptions(method=method))
+        assert result.objective == pytest.approx(reference.objective, abs=1e-7)
+        # The optimum is unique; 1e-8 of the objective leaves about its square root of the locations.
+        np.testing.assert_allclose(shape(result.locations), shape(reference.locations), atol=1e-4)
+
+
+@pytest.mark.parametrize("method", ["newton", "admm"])
+def test_the_callback_sees_every_iteration_and_can_cancel(method):
+    graph, seen = box(300), []
+
+    def watch(info):
+        seen.append(info)
+        return len(seen) < 3
+
+    result = solve(graph, SolverOptions(method=method, tol=1e-12), watch)
+    assert result.status is Status.CANCELLED
+    assert [info.iteration for info in seen] == [1, 2, 3]
+    assert np.isfinite(result.locations).all()
+    assert result.dual_bound <= result.objective
+
+
+@pytest.mark.parametrize("method", ["newton", "admm"])
+def test_threads_and_repetitions_change_no_bit(method):
+    graph = box(300)
+    results = [solve(graph, SolverOptions(method=method, tol=1e-6, threads=k)) for k in (1, 2, 1)]
+    for other in results[1:]:
+        np.testing.assert_array_equal(results[0].locations, other.locations)
+        np.testing.assert_array_equal(results[0].dual, other.dual)
+
+
+def test_uniqueness_is_certified_where_it_holds_and_not_where_it_does_not():
+    assert solve(problem(16)[0]).unique is True
+    assert solve(problem(16)[0], SolverOptions(uniqueness=False)).unique is None
+
+
+def test_a_tie_is_not_called_unique():
+    # Four fixed cameras in the plane; the fifth is seen on x = 0, on x = 1, on y = 0 and on y = 1, which costs
+    # the same anywhere in the unit square, and its terms of the scale constraint cancel.
+    fixed = np.array([[0.0, -3.0], [1.0, 4.0], [-3.0, 0.0], [4.0, 1.0]])
+    edges = np.array([(i, j) for i in range(4) for j in range(i + 1, 4)] + [(4, k) for k in range(4)])
+    exact = differences(fixed, edges[:6])
+    tied = np.array([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
+    directions = np.vstack([exact / np.linalg.norm(exact, axis=1, keepdims=True), tied])
+    result = solve(ViewGraph(5, edges, directions, [100.0] * 6 + [1.0] * 4))
+    assert result.status is Status.CONVERGED
+    assert result.unique is False
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("threads", 0), ("method", "magic"), ("tol", 0.0), ("max_iterations", 0)]
+)
 def test_solver_options_out_of_range_are_refused_by_name(field, value):
     with pytest.raises(ValueError, match=field):
         SolverOptions(**{field: value})
