@@ -272,6 +272,8 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
     if placement.solve.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
+    if placement.solve.unique is False:
+        yield "other placements may fit as well: the certificate does not prove the optimum unique"
     share = len(placement.rejected_pairs) / len(placement.edges)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"

@@ -41,6 +41,7 @@ _ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which accel
 _ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _STEP_FACTOR = 10.0
+_EXACT = 1e-12  # an objective below this times kappa counts as 0: exact directions
 _STALL_WINDOW = 150
 
 
@@ -209,7 +210,8 @@ class Iteration:
         """Return the estimate of the relative error of the objective."""
         objective, pairing, along, change = state.sums[:4]
         dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
-        return float(max(abs(objective - dual_value), _STEP_FACTOR * change) / objective)
+        error = max(abs(objective - dual_value), _STEP_FACTOR * change)
+        return float(error / max(objective, _EXACT * self.kappa))
 
     def _floor(self, renewal: int, anderson: Anderson | None) -> float:
         """Return the least residual that penalties take seriously, relative to the mean residual."""
