@@ -26,6 +26,7 @@ from sfm_shapefit.solver.program import normalized_locations, projected_length, 
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
+_LARGEST_RESIDUAL = 1e-9  # of the dual's equality: beyond it the bound is not to be called rigorous
 _LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 
 # Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
@@ -167,7 +168,7 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
 
 
 def _status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
-    if certificate.gap <= tol:
+    if certificate.gap <= tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
         return Status.CONVERGED
     if cancelled:
         return Status.CANCELLED
