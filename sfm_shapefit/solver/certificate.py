@@ -54,11 +54,12 @@ from sfm_shapefit.viewgraph import ViewGraph
 _ROUNDS = 5  # of clipping; later ones gain nothing that the dual itself would not lose
 _ROUND_REDUCTION = 0.1  # of the equality residual per round; exact solves would gain no round
 _NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap
+_ENOUGH = 0.5  # of the gap that is enough: the solve to rounding that follows costs a little
 _RESIDUAL_FLOOR = 0.1  # least residual, relative to the mean one, that the metric takes seriously
 _ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away
 _ON_SURFACE = 0.99  # ||y_e|| / w_e from which a pair counts as on the surface
 _REPAIRS = 4  # each repair shrinks the equality residual to the rounding of the previous one
-_CG_STEPS = 200
+_CG_STEPS = 500  # 10 to 60 on all but long chains
 _SEED = 1
 _EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
@@ -95,6 +96,7 @@ def certify(
     *,
     uniqueness: bool = False,
     factor: LaplacianFactor | None = None,
+    enough: float = 0.0,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -105,12 +107,13 @@ def certify(
         uniqueness: also examine whether the optimum is unique; costs one sparse factorisation.
         factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
             graph; it serves as preconditioner and cannot make the bound wrong.
+        enough: a gap below which a closer bound is not worth the time.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
         UnsolvableError: if the dual must be repaired and the graph is not connected.
     """
-    _check(graph, locations, dual)
+    value = _checked_objective(graph, locations, dual)
     n, w = graph.num_cameras, graph.weights
     c = scale_functional(graph)
     degree = np.bincount(graph.edges.ravel(), weights=np.repeat(w, 2), minlength=n).max()
@@ -120,7 +123,10 @@ def certify(
     worst = _project(graph.directions, w, y)
     total = apply_incidence_transposed(graph.edges, y, n)
     if _largest(total - _multiplier(total, c, t) * c) > _EXACT * degree:
-        worst = _repair(graph, t, y, c, _EXACT * float(degree), factor)
+        metric = _metric(graph, t)
+        precondition = _preconditioner(graph, metric.stiffness, factor)
+        _clip_in_rounds(metric, precondition, y, c, t, value, enough)
+        worst = _restore_exactly(metric, precondition, y, c, t, _EXACT * float(degree))
         total = apply_incidence_transposed(graph.edges, y, n)
     scale = 1.0 / max(1.0, worst)
     y *= scale
@@ -129,7 +135,7 @@ def certify(
     if bound <= 0.0:  # y = 0 is feasible and proves at least this
         y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
     return Certificate(
-        objective=objective(graph, t),
+        objective=value,
         dual_bound=bound,
         dual=frozen(y),
         equality_residual=_largest(total - bound * c) / float(degree),
@@ -161,39 +167,55 @@ class _Metric(NamedTuple):
     """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls the loops over it."""
 
 
-def _repair(
-    graph: ViewGraph,
-    t: FloatArray,
+def _metric(graph: ViewGraph, t: FloatArray) -> _Metric:
+    """Return the metric of the residuals at t, with no pair on the surface of its ball so far."""
+    edges, v = np.ascontiguousarray(graph.edges), np.ascontiguousarray(graph.directions)
+    return _Metric(
+        edges, v, graph.weights, _stiffness(graph, t), np.zeros_like(v), tuple(range(graph.dimension))
+    )
+
+
+def _clip_in_rounds(
+    metric: _Metric,
+    precondition: Preconditioner,
     y: FloatArray,
     c: FloatArray,
-    allowed: float,
-    factor: LaplacianFactor | None,
-) -> float:
-    """Move y, in place, to D^T y = lambda c up to `allowed` at a camera, and close to its balls.
+    t: FloatArray,
+    value: float,
+    enough: float,
+) -> None:
+    """Clip y, in place, and restore the equality roughly, in turns, until its excess costs little.
 
-    Returns:
-        max_e ||y_e|| / w_e.
+    Args:
+        value: the objective at t, to tell how far the bound is.
+        enough: a gap at which to stop.
     """
-    axes = tuple(range(graph.dimension))
-    stiffness = _stiffness(graph, t)
-    metric = _Metric(
-        graph.edges, graph.directions, graph.weights, stiffness, np.zeros_like(graph.directions), axes
-    )
-    precondition = _preconditioner(graph, stiffness, factor)
-    value, worst = objective(graph, t), 1.0
     for _ in range(_ROUNDS):
         _clip(metric, y)
-        _, violation = _violation(metric, y, c, t)
-        worst = _restore(metric, precondition, y, violation, _ROUND_REDUCTION)
-        multiplier, violation = _violation(metric, y, c, t)
-        if (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier):
+        worst = _restore(metric, precondition, y, _violation(metric, y, c, t)[1], _ROUND_REDUCTION)
+        multiplier = _multiplier(apply_incidence_transposed(metric.edges, y, len(c)), c, t)
+        negligible = (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier)
+        if negligible or value - multiplier / max(worst, 1.0) <= _ENOUGH * enough:
             break
-    fine = 0.1 * allowed * float(np.sqrt(graph.num_cameras))
+
+
+def _restore_exactly(
+    metric: _Metric,
+    precondition: Preconditioner,
+    y: FloatArray,
+    c: FloatArray,
+    t: FloatArray,
+    allowed: float,
+) -> float:
+    """Move y, in place, to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e."""
+    fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
+    worst = 1.0
     for _ in range(_REPAIRS):
-        if _largest(violation) <= allowed:
+        violation = _violation(metric, y, c, t)[1]
+        reduction = fine / max(float(np.linalg.norm(violation)), fine)
+        worst = _restore(metric, precondition, y, violation, reduction)
+        if _largest(_violation(metric, y, c, t)[1]) <= allowed:
             break
-        worst = _restore(metric, precondition, y, violation, fine / float(np.linalg.norm(violation)))
-        _, violation = _violation(metric, y, c, t)
     return worst
 
 
@@ -355,7 +377,8 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
         return False
 
 
-def _check(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:
+def _checked_objective(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> float:
+    """Return the objective at the locations, or raise InputError."""
     shapes = (graph.num_cameras, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(
@@ -364,5 +387,7 @@ def _check(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> None:
         )
     if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
         raise InputError("locations and dual must be finite to be certified")
-    if not objective(graph, locations) < np.inf:
+    value = objective(graph, locations - locations.mean(axis=0))
+    if not value < np.inf:
         raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
+    return value
