@@ -54,7 +54,6 @@ from sfm_shapefit.viewgraph import ViewGraph
 _ROUNDS = 5  # of clipping; later ones gain nothing that the dual itself would not lose
 _ROUND_REDUCTION = 0.1  # of the equality residual per round; exact solves would gain no round
 _NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap
-_ENOUGH = 0.5  # of the gap that is enough: the solve to rounding that follows costs a little
 _RESIDUAL_FLOOR = 0.1  # least residual, relative to the mean one, that the metric takes seriously
 _ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away
 _ON_SURFACE = 0.99  # ||y_e|| / w_e from which a pair counts as on the surface
@@ -96,7 +95,6 @@ def certify(
     *,
     uniqueness: bool = False,
     factor: LaplacianFactor | None = None,
-    enough: float = 0.0,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -107,7 +105,6 @@ def certify(
         uniqueness: also examine whether the optimum is unique; costs one sparse factorisation.
         factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
             graph; it serves as preconditioner and cannot make the bound wrong.
-        enough: a gap below which a closer bound is not worth the time.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
@@ -125,7 +122,7 @@ def certify(
     if _largest(total - _multiplier(total, c, t) * c) > _EXACT * degree:
         metric = _metric(graph, t)
         precondition = _preconditioner(graph, metric.stiffness, factor)
-        _clip_in_rounds(metric, precondition, y, c, t, value, enough)
+        _clip_in_rounds(metric, precondition, y, c, t, value)
         worst = _restore_exactly(metric, precondition, y, c, t, _EXACT * float(degree))
         total = apply_incidence_transposed(graph.edges, y, n)
     scale = 1.0 / max(1.0, worst)
@@ -182,20 +179,17 @@ def _clip_in_rounds(
     c: FloatArray,
     t: FloatArray,
     value: float,
-    enough: float,
 ) -> None:
     """Clip y, in place, and restore the equality roughly, in turns, until its excess costs little.
 
     Args:
         value: the objective at t, to tell how far the bound is.
-        enough: a gap at which to stop.
     """
     for _ in range(_ROUNDS):
         _clip(metric, y)
         worst = _restore(metric, precondition, y, _violation(metric, y, c, t)[1], _ROUND_REDUCTION)
         multiplier = _multiplier(apply_incidence_transposed(metric.edges, y, len(c)), c, t)
-        negligible = (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier)
-        if negligible or value - multiplier / max(worst, 1.0) <= _ENOUGH * enough:
+        if (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier):
             break
 
 

@@ -106,7 +106,7 @@ def _split(
     target = _SHARE * tol
     for _ in range(_CERTIFICATES):
         step = splitting.run(0.0, target, max_iterations, on_iteration)
-        certificate = certify(graph, step.locations, step.dual, factor=factor, enough=tol)
+        certificate = certify(graph, step.locations, step.dual, factor=factor)
         finish = _verdict(certificate, step.stop, tol)
         result = HybridResult(
             locations=step.locations,
