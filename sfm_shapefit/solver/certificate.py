@@ -63,6 +63,7 @@ _SEED = 1
 _EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
+_UNIQUENESS_EDGES = 500_000  # beyond it uniqueness is not examined: ordering alone takes seconds
 _UNIQUENESS_FLOPS = 1e11  # a few seconds; beyond it uniqueness is not examined
 
 
@@ -353,6 +354,8 @@ def _move(metric: Any, h: Any, y: Any) -> float:
 
 def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
+    if graph.num_edges > _UNIQUENESS_EDGES:
+        return None
     neighbours = adjacency(graph.num_cameras, graph.edges)
     symbolic = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
     d = graph.dimension
