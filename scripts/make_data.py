@@ -9,7 +9,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
-from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.formats import graph_text
+from sfm_shapefit.synthetic import SceneOptions, make_scene, random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -21,6 +23,7 @@ class BundledScene:
     workspace: WorkspaceOptions
 
 
+GRAPH = "graph40.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -60,10 +63,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder of the scenes")
     out = parser.parse_args().out
+    (out / GRAPH).write_text(bundled_graph_text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
         print(f"{out / name}: {size_kb:.0f} kB")
+
+
+def bundled_graph_text() -> str:
+    """Return the bundled bare graph, of the paper's random model: n = 40, p = 1/2, q = 0.2, sigma = 0.01."""
+    problem = random_graph_problem(40, 0.5, sigma=0.01, q=0.2, seed=40)
+    header = (
+        "# i j vx vy vz: unit directions of t_i - t_j, a fifth of them wrong; python scripts/make_data.py\n"
+    )
+    return header + graph_text(ViewGraph(40, problem.edges, problem.directions))
 
 
 def write_scene(name: str, folder: Path) -> None:

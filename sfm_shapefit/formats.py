@@ -18,6 +18,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
+_ROUNDED = 1e-7
 _MIN_COLUMNS = 4  # two ids and a direction in the plane
 
 
@@ -51,10 +52,25 @@ def read_graph(path: Path | str) -> ViewGraph:
     _refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
     _refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
     _refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
+    rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
+    directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
     try:
-        return ViewGraph(len(ids), edges, directions / lengths[:, None], weights, ids)
+        return ViewGraph(len(ids), edges, directions, weights, ids)
     except InputError as error:
         raise InputError(f"{file}: {error}") from error
+
+
+def graph_text(graph: ViewGraph) -> str:
+    """Return a view graph in the text format that `read_graph` takes; numbers round-trip."""
+    ids = graph.names or tuple(str(k) for k in range(graph.num_cameras))
+    weighted = bool(np.any(graph.weights != 1.0))
+    lines = []
+    for (i, j), v, weight in zip(
+        graph.edges.tolist(), graph.directions.tolist(), graph.weights.tolist(), strict=True
+    ):
+        numbers = [*v, weight] if weighted else v
+        lines.append(" ".join([ids[i], ids[j], *map(repr, numbers)]))
+    return "\n".join(lines) + "\n"
 
 
 def _values(file: Path, numbers: list[int], rows: list[list[str]]) -> FloatArray:

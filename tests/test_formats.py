@@ -8,8 +8,10 @@ from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import read_graph
+from sfm_shapefit.formats import graph_text, read_graph
 from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import BUNDLED
 
 GOOD = "7 3 1 0 0\n3 -2 0 1 0\n-2 7 0 0 1\n"
 
@@ -51,6 +53,27 @@ def test_the_columns_tell_dimension_and_weights(tmp_path, d, weights):
     graph = read_graph(tmp_path / "g.txt")
     assert graph.dimension == d
     assert (graph.weights.max() == 3.0) == weights
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_a_written_graph_is_read_back_to_the_bit(tmp_path, weighted):
+    problem = random_graph_problem(9, 0.9, sigma=0.1, q=0.2, seed=9)
+    weights = np.linspace(0.5, 2.0, len(problem.edges)) if weighted else None
+    graph = ViewGraph(9, problem.edges, problem.directions, weights, names=[f"{k}.jpg" for k in range(9)])
+    again = read_graph(write(tmp_path / "g.txt", graph_text(graph)))
+    assert again.names == graph.names
+    for name in ("edges", "directions", "weights"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(graph, name))
+
+
+def test_the_bundled_graph_is_the_one_that_its_script_makes():
+    from scripts.make_data import bundled_graph_text
+
+    ours = read_graph(BUNDLED / "graph40.txt")
+    lines = bundled_graph_text().splitlines()[1:]
+    np.testing.assert_array_equal(ours.edges, [[int(word) for word in line.split()[:2]] for line in lines])
+    made = [[float(word) for word in line.split()[2:]] for line in lines]
+    np.testing.assert_allclose(ours.directions, made, atol=1e-14)  # another numpy may round differently
 
 
 def test_a_last_coordinate_of_zero_is_no_weight(tmp_path):

@@ -116,7 +116,7 @@ def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
     predicted = f"{flops / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops <= _LARGEST_NEWTON_FLOPS:
         return Choice("newton", _run_sparse, "asked for" if asked else predicted)
-    return Choice("admm", _run_admm, f"{predicted}: too many for Newton")
+    return Choice("admm", _run_admm, f"{predicted}: splitting is faster")
 
 
 def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
