@@ -1,7 +1,7 @@
 """ShapeFit through Clarabel's own interface: the leanest way to give the program to a generic cone solver.
 
-One camera is grounded, and each edge has one cone of d - 1 rows beside its bound, in an orthonormal basis B_e of
-the complement of v_e:
+One camera is grounded, and each edge has one cone of d - 1 rows beside its bound, in an orthonormal basis
+B_e of the complement of v_e:
 
     minimise    sum_e w_e s_e
     subject to  <c, T> = kappa,    (s_e, B_e^T (t_i - t_j)) in the second-order cone,    t_0 = 0
@@ -63,9 +63,7 @@ def solve_direct(graph: "ViewGraph", tol: float) -> DirectAnswer:
     return DirectAnswer(t, -np.einsum("edk,ek->ed", bases, z), int(solution.iterations))
 
 
-def _cone_entries(
-    graph: "ViewGraph", bases: "FloatArray"
-) -> tuple["FloatArray", "np.ndarray", "np.ndarray"]:
+def _cone_entries(graph: "ViewGraph", bases: "FloatArray") -> tuple["FloatArray", "np.ndarray", "np.ndarray"]:
     """Return values, rows and columns of -(s_e, B_e^T (t_i - t_j)) below row 0."""
     m, d, k = bases.shape
     first = 1 + d * np.arange(m)

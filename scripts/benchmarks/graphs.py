@@ -1,4 +1,4 @@
-"""What the benchmarks of bare graphs share: the families by name, a graph with its truth, and the paper's error."""
+"""What the benchmarks of bare graphs share: families by name, a graph with its truth, the paper's error."""
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any

@@ -1,4 +1,4 @@
-"""Where a figure is measured: fresh processes with a stated number of threads and a time limit, and their memory.
+"""Where a figure is measured: fresh processes with a number of threads, a time limit, and their memory.
 
 The number of BLAS threads is read when numpy is loaded, so it must stand in the environment of a process that
 has not loaded it: every measurement runs in a spawned one.

@@ -1,13 +1,14 @@
 """Large view graphs: time, memory and iterations of `solve` as the number of cameras grows.
 
-Each problem is drawn in one process and solved in another, fresh one, so that its peak of memory is its own. There,
-a small problem is solved first (nothing is compiled while the clock runs); then the problem itself, once, everything
-included: checks, rigidity, ordering, symbolic analysis, factorisations, certificate. From `on_iteration` come the
-objective and the clock after each iteration, and in hindsight the time at which the objective came, and stayed,
-within 1e-4 of the best one known. That is the lower of the run's own and of a second, tighter run's.
+Each problem is drawn in one process and solved in another, fresh one, so that its peak of memory is its
+own. There, a small problem is solved first (nothing is compiled while the clock runs); then the problem
+itself, once, everything included: checks, rigidity, ordering, symbolic analysis, factorisations,
+certificate. From `on_iteration` come the objective and the clock after each iteration, and in hindsight the
+time at which the objective came, and stayed, within 1e-4 of the best one known. That is the lower of the
+run's own and of a second, tighter run's.
 
-`auto` carries the limits: it is what a user gets. Where it does not choose ADMM, ADMM is measured beside it, so that
-its iterations can be compared within a family.
+`auto` carries the limits: it is what a user gets. Where it does not choose ADMM, ADMM is measured beside
+it, so that its iterations can be compared within a family.
 """
 
 import argparse
@@ -77,9 +78,7 @@ CASES = (
     ),
     Case(spec=_spec("comm", 1_000, 67.0), tol=1e-4, reference_tol=1e-7),
     Case(spec=_spec("comm", 10_000, 67.0), tol=1e-4, reference_tol=1e-6),
-    Case(
-        spec=_spec("comm", 100_000, 67.0), tol=1e-4, reference_tol=1e-5, close_s=40.0, memory_mb=2000.0
-    ),
+    Case(spec=_spec("comm", 100_000, 67.0), tol=1e-4, reference_tol=1e-5, close_s=40.0, memory_mb=2000.0),
     Case(spec=_spec("er", 1_000, 40.0), tol=1e-4, reference_tol=1e-7),
     Case(spec=_spec("er", 10_000, 40.0), tol=1e-4, reference_tol=1e-6),
     Case(spec=_spec("er", 100_000, 40.0), tol=1e-4, reference_tol=1e-5, close_s=14.0, memory_mb=600.0),
@@ -171,7 +170,11 @@ QUANTITIES = (
         meaning="part of the total after the last iteration",
     ),
     Quantity(
-        name="gap", unit="1", better="lower", rel_tol=1.0, meaning="certified: objective minus a rigorous bound"
+        name="gap",
+        unit="1",
+        better="lower",
+        rel_tol=1.0,
+        meaning="certified: objective minus a rigorous bound",
     ),
     Quantity(
         name="excess known",
@@ -186,7 +189,7 @@ QUANTITIES = (
         unit="MB",
         better="lower",
         rel_tol=0.15,
-        meaning="peak resident memory during `solve`, all included / before it: interpreter, libraries, problem",
+        meaning="peak resident memory during `solve`, all included / before it: libraries, problem",
     ),
 )
 
@@ -196,7 +199,9 @@ QUANTITIES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `scale`."""
-    parser.add_argument("--families", type=families, default=list(FAMILIES), help="geo,comm,er,seq by default")
+    parser.add_argument(
+        "--families", type=families, default=list(FAMILIES), help="geo,comm,er,seq by default"
+    )
     parser.add_argument("--max-n", type=int, default=100_000, help="largest number of cameras (default 1e5)")
     parser.add_argument("--million", action="store_true", help="also a geometric graph of 1e6 cameras")
     parser.add_argument("--threads", type=int, default=2, help="threads (default 2)")
@@ -250,7 +255,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 
 def _measure_case(case: Case, file: Path, args: argparse.Namespace) -> list[Measured]:
-    """Draw the problem into a file and solve it in fresh processes: by `auto`, and by ADMM if that differs."""
+    """Draw the problem into a file; solve it in fresh processes, by `auto` and by ADMM if that differs."""
     variables = thread_environment(args.threads)
     call(save_problem, case.spec, file, environment=variables)
 
@@ -320,9 +325,10 @@ def measure(case: Case, file: Path, asked: str, threads: int) -> Measured:
 
 def _warm_up(spec: GraphSpec, threads: int) -> None:
     """Solve a small graph of the family by every method that the problem may call for."""
-    small = view_graph(draw(GraphSpec(family=spec.family, n=1000, degree=min(spec.degree, 40.0), sigma=0.01)))
+    small = GraphSpec(family=spec.family, n=1000, degree=min(spec.degree, 40.0), sigma=0.01)
+    graph = view_graph(draw(small))
     for method in ("auto", "newton", "admm"):
-        _traced(small, method, 1e-4, threads)
+        _traced(graph, method, 1e-4, threads)
 
 
 def _traced(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple[SolverResult, Trace, float]":
@@ -373,12 +379,14 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     return sum((x - mean_x) * (y - mean_y) for x, y in pairs) / sum((x - mean_x) ** 2 for x, _ in pairs)
 
 
-def noisy(measured: Sequence[Measured], family: str, asked: str = "auto") -> list[Measured]:
-    """Return the solves of a family with noise, smallest first."""
+def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> list[Measured]:
+    """Return the solves of a family with noise, smallest first: what `auto` did, or what ADMM did."""
     chosen = [
         one
         for one in measured
-        if one.case.spec.family == family and one.case.spec.sigma > 0.0 and one.asked == asked
+        if one.case.spec.family == family
+        and one.case.spec.sigma > 0.0
+        and ("admm" in one.method if by_admm else one.asked == "auto")
     ]
     return sorted(chosen, key=lambda one: one.case.spec.n)
 
@@ -413,10 +421,12 @@ def section(measured: Sequence[Measured], about: str, failed: Sequence[str], thr
 
 
 _CAVEATS = (
-    "Caveats: one run each. The best objective is that of two runs of the same solver, so `excess known` says how"
-    " far from the optimum it may still be. A trajectory's optimum is far from its truth (ShapeFit collapses on"
-    " long chains); its error is the program's, not the solver's. The exponent against pairs differs from that"
-    " against cameras because the larger geometric graphs have more pairs per camera."
+    "Caveats: one run each. The best objective is that of two runs of the same solver, so `excess known`"
+    " says how far from the optimum it may still be. A trajectory's optimum is far from its truth (ShapeFit"
+    " collapses on long chains); its error is the program's, not the solver's. The exponent against pairs"
+    " differs from that against cameras because the larger geometric graphs have more pairs per camera."
+    " `auto` may change its method between two sizes; then its exponent mixes two solvers, and that of"
+    " ADMM is the one to extrapolate."
 )
 
 
@@ -494,13 +504,13 @@ def _proof_table(measured: Sequence[Measured]) -> str:
 
 
 def _iteration_table(measured: Sequence[Measured]) -> str:
-    by_admm = [one for one in measured if "admm" in one.method and one.case.spec.sigma > 0.0]
-    sizes = sorted({one.case.spec.n for one in by_admm})
+    by_admm = {family: noisy(measured, family, by_admm=True) for family in FAMILIES}
+    sizes = sorted({one.case.spec.n for found in by_admm.values() for one in found})
     rows = []
     for family, name in FAMILIES.items():
-        found = {one.case.spec.n: one for one in by_admm if one.case.spec.family == family}
-        if found:
-            cells = [found[n].close_at if n in found else None for n in sizes]
+        close_at = {one.case.spec.n: one.close_at for one in by_admm[family]}
+        if close_at:
+            cells = [close_at.get(n) for n in sizes]
             rows.append([name, *("-" if cell is None else f"{cell}" for cell in cells)])
     return table(["family", *(f"{n} cameras" for n in sizes)], rows)
 
@@ -508,29 +518,33 @@ def _iteration_table(measured: Sequence[Measured]) -> str:
 def _exponent_table(measured: Sequence[Measured]) -> str:
     rows = []
     for family, name in FAMILIES.items():
-        found = noisy(measured, family)
-        if len(found) < 2:
-            continue
-        cameras = [float(one.case.spec.n) for one in found]
-        pairs = [float(one.num_edges) for one in found]
-        values = (
-            [one.close_s for one in found],
-            [one.total_s for one in found],
-            [one.peak_mb - one.before_mb for one in found],
-        )
-        cells = [
-            f"{exponent(cameras, value):.2f} / {exponent(pairs, value):.2f}".replace("nan", "-")
-            for value in values
-        ]
-        rows.append([name, " ".join(f"{one.case.spec.n:.0e}".replace("e+0", "e") for one in found), *cells])
+        for by_admm in (False, True):
+            found = noisy(measured, family, by_admm)
+            if len(found) > 1:
+                rows.append([name, "admm" if by_admm else "auto", *_exponent_cells(found)])
     header = [
         "family",
+        "solver",
         "cameras",
         "to 1e-4: per cameras / pairs",
         "total: per cameras / pairs",
         "memory of the solve: per cameras / pairs",
     ]
     return table(header, rows)
+
+
+def _exponent_cells(found: Sequence[Measured]) -> list[str]:
+    """Return the sizes, and the exponents of times and memory."""
+    cameras = [float(one.case.spec.n) for one in found]
+    pairs = [float(one.num_edges) for one in found]
+    values = (
+        [one.close_s for one in found],
+        [one.total_s for one in found],
+        [one.peak_mb - one.before_mb for one in found],
+    )
+    sizes = " ".join(f"{n:.0e}".replace("e+0", "e") for n in cameras)
+    exponents = [f"{exponent(cameras, v):.2f} / {exponent(pairs, v):.2f}".replace("nan", "-") for v in values]
+    return [sizes, *exponents]
 
 
 def plot(measured: Sequence[Measured], file: Path) -> None:

@@ -1,15 +1,16 @@
 """The Newton solver against a generic cone solver: on the paper's random graphs, and on real graphs alone.
 
-Random graphs: G(n, 1/2), a quarter of the directions random, with and without noise. Three contenders are given
-the same `ViewGraph` and run in turn within each repeat, in one process on one thread, so that a change of the
-machine's load meets all of them:
+Random graphs: G(n, 1/2), a quarter of the directions random, with and without noise. Three contenders are
+given the same `ViewGraph` and run in turn within each repeat, in one process on one thread, so that a
+change of the machine's load meets all of them:
 
     ours      solve(graph, method="newton"), checks, rigidity and certificate included, to a certified 1e-8
     cvxpy     the program as a user would write it (`solve_cvxpy`), cvxpy's own compilation included
     Clarabel  called directly on cones of 2 rows (`clarabel_direct`), building its matrices included
 
-Both rivals start from Clarabel's default tolerances, 1e-8, which are tightened tenfold, before the clock runs,
-until their objective is within 1e-8 of a rigorous lower bound: of what ours promises, the primal half.
+Both rivals start from Clarabel's default tolerances, 1e-8, which are tightened tenfold, before the clock
+runs, until their objective is within 1e-8 of a rigorous lower bound: of what ours promises, the primal
+half.
 
 Real graphs: the largest rigid piece that `locate` finds, directions from matches and known rotations.
 """
@@ -42,7 +43,9 @@ TOL = 1e-8
 SIGMAS = (0.0, 0.05)
 CORRUPTED = 0.25
 REPEATS = {50: 15, 100: 9, 200: 5, 300: 3, 500: 2}
-BURST = 2  # runs of a contender before it is the next one's turn: the other's data are out of the caches by then
+BURST = (
+    2  # runs of a contender before it is the next one's turn: the other's data are out of the caches by then
+)
 TARGETS = {
     50: ((30.0, 18.0), (15.0, 9.0)),
     100: ((55.0, 35.0), (25.0, 12.0)),
@@ -150,7 +153,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--sizes", type=sizes, default=list(TARGETS), help=f"of the random graphs (default {known})"
     )
-    parser.add_argument("--repeats", type=int, default=None, help="turns of each contender (default 15 to 2 by size)")
+    parser.add_argument(
+        "--repeats", type=int, default=None, help="turns of each contender (default 15 to 2 by size)"
+    )
     parser.add_argument("--no-real", action="store_true", help="leave the real graphs out")
     parser.add_argument(
         "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the sets"
@@ -193,7 +198,7 @@ def command_line(args: argparse.Namespace) -> str:
 
 
 def _cold_s(one_thread: dict[str, str]) -> tuple[float, float]:
-    """Return the seconds of a first solve in a fresh process, with the compiled code on disk and without."""
+    """Return the seconds of a first solve in a fresh process: compiled code on disk, and nothing compiled."""
     call(first_solve, environment=one_thread)  # fills the cache
     loaded = call(first_solve, environment=one_thread)
     with tempfile.TemporaryDirectory() as folder:
@@ -202,7 +207,7 @@ def _cold_s(one_thread: dict[str, str]) -> tuple[float, float]:
 
 
 def first_solve() -> float:
-    """Return the seconds of importing the package and solving a small problem; to be called once per process."""
+    """Return the seconds of imports and a small problem's solve; to be called once per process."""
     start = time.perf_counter()
     solve_ours(view_graph(draw(GraphSpec(family="er2", n=50, q=CORRUPTED))), TOL)
     return time.perf_counter() - start
@@ -267,12 +272,11 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
         return locations, None, iterations
 
     def direct(tol: float) -> tuple["FloatArray", "FloatArray | None", int]:
-        return tuple(solve_direct(graph, tol))
+        found = solve_direct(graph, tol)
+        return found.locations, found.dual, found.iterations
 
     solvers = {"ours": ours, "cvxpy + Clarabel": cvxpy, "Clarabel directly": direct}
-    tuned = {
-        name: _tuned(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()
-    }
+    tuned = {name: _tuned(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()}
     wall: dict[str, list[float]] = {name: [] for name in solvers}
     cpu: dict[str, list[float]] = {name: [] for name in solvers}
     in_turn = [name for _ in range(repeats) for name in solvers for _ in range(BURST)]
@@ -293,7 +297,7 @@ def _tuned(
     truth: "FloatArray",
     bound: float,
 ) -> Contender:
-    """Return the contender at the loosest tolerance whose answer is within TOL of the bound. A warm-up too."""
+    """Return the contender at the loosest tolerance that brings it within TOL of the bound. A warm-up too."""
     from sfm_shapefit import certify
     from sfm_shapefit.solver.program import objective
 
@@ -302,7 +306,8 @@ def _tuned(
         try:
             locations, dual, iterations = solver(tol)
         except Exception as error:  # whatever a library raises is an answer, to be shown as such
-            return best if not best.failure else Contender(name=name, tolerance=tol, failure=str(error)[:200])
+            reason = " ".join(str(error).split())[:200]
+            return best if not best.failure else Contender(name=name, tolerance=tol, failure=reason)
         if locations is None:
             return best
         centred = locations - locations.mean(axis=0)
@@ -406,7 +411,8 @@ def section(
     loaded, compiled = cold
     parts = [
         "## The solver against a generic cone solver",
-        about + "- Threads: 1 (OPENBLAS_NUM_THREADS and its like = 1 before numpy is loaded), all contenders\n"
+        about
+        + "- Threads: 1 (OPENBLAS_NUM_THREADS and its like = 1 before numpy is loaded), all contenders\n"
         "- Every contender is warmed up before the clock runs. A cold process, imports included, takes"
         f" {number(loaded)} s to its first answer, and {number(compiled)} s where nothing is compiled yet.",
         f"**{sum(check.met for check in checks)} of {len(checks)} limits met.**",
@@ -416,7 +422,10 @@ def section(
         _detail_table(compared),
     ]
     if real:
-        parts += [f"### Real graphs, directions from known rotations, `auto`\n\n{_REAL_NOTE}", _real_table(real)]
+        parts += [
+            f"### Real graphs, directions from known rotations, `auto`\n\n{_REAL_NOTE}",
+            _real_table(real),
+        ]
     if skipped:
         parts.append("Skipped: " + "; ".join(skipped) + ".")
     parts += ["### What the columns mean", legend(QUANTITIES), _CAVEATS]
@@ -428,10 +437,11 @@ _REAL_NOTE = (
     " from those of a gap of 1e-11: what is lost by stopping where it stops."
 )
 _CAVEATS = (
-    "Caveats: the optimum need not be the truth: at n = 50 and this share of random directions, a camera may well"
-    " have nearly as many wrong as right ones, and then every contender has the same error. A rival is tuned by its objective alone, so its own dual may prove less than ours; see its certified"
-    " gap. Where the load average is above the number of cores, times are upper bounds; the ratios hold better,"
-    " because the contenders alternate."
+    "Caveats: the optimum need not be the truth: at n = 50 and this share of random directions, a camera may"
+    " well have nearly as many wrong as right ones, and then every contender has the same error. A rival is"
+    " tuned by its objective alone, so its own dual may prove less than ours; see its certified gap. Where"
+    " the load average is above the number of cores, times are upper bounds; the ratios hold better, since"
+    " the contenders take turns."
 )
 
 
