@@ -131,11 +131,15 @@ def run(args: argparse.Namespace) -> int:
     about = environment(PACKAGES, command_line(args))
     compared = []
     for name in args.problems:
-        print(f"measuring {name}", file=sys.stderr, flush=True)
         spec = PROBLEMS[name]
-        answers = tuple(_answer(contender, spec, args.timeout) for contender in CONTENDERS)
+        answers = []
+        for contender in CONTENDERS:
+            answers.append(_answer(contender, spec, args.timeout))
+            found = answers[-1]
+            figures = f"error {number(found.error)}, {number(found.seconds)} s"
+            print(f"{name}, {found.name}: {figures} {found.note}", file=sys.stderr, flush=True)
         compared.append(
-            Compared(name=name, num_cameras=spec.n, num_edges=len(draw(spec).edges), answers=answers)
+            Compared(name=name, num_cameras=spec.n, num_edges=len(draw(spec).edges), answers=tuple(answers))
         )
     body = section(compared, about, args.timeout)
     print(body)
