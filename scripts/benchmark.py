@@ -7,9 +7,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import real
+from benchmarks import graph_peers, real, scale, solver
 
-SUBCOMMANDS = {"real": real}
+SUBCOMMANDS = {"real": real, "solver": solver, "scale": scale, "peers-graphs": graph_peers}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,8 +2,14 @@
 
     metrics.py   a measured value and what it must reach
     record.py    tables, the machine and its versions, the file of results
+    process.py   fresh processes with a number of threads and a time limit; memory
+    graphs.py    bare graphs by family and size, and the paper's error
     real.py      subcommand `real`: real scenes against their ground truth
     glomap.py    GLOMAP's global positioning, run side by side
+    solver.py    subcommand `solver`: Newton against a generic cone solver
+    clarabel_direct.py    ... called without cvxpy
+    scale.py     subcommand `scale`: large graphs as they grow
+    graph_peers.py    subcommand `peers-graphs`: pytheia and gtsam on bare graphs
 
 A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.
 """

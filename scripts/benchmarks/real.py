@@ -10,10 +10,8 @@ are lower than with independent rotations.
 """
 
 import argparse
-import contextlib
 import math
 import multiprocessing
-import resource
 import sys
 import tempfile
 import time
@@ -24,6 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.metrics import Check, Quantity, median, number, numbers, ratio, times, verdict
+from benchmarks.process import peak_memory_mb
 from benchmarks.record import environment, legend, table, write_section
 
 if TYPE_CHECKING:
@@ -256,7 +255,7 @@ def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, gloma
     model = folder / "sparse" / "0"
     _timed_locate(model, LocateOptions())
     cold_s = time.perf_counter() - start
-    peak_memory_mb = _peak_memory_mb()
+    peak_mb = peak_memory_mb()
     runs = [_timed_locate(model, LocateOptions()) for _ in range(repeats)]
     found = runs[-1][0]
     adjusted, adjustment_s = None, math.nan
@@ -280,7 +279,7 @@ def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, gloma
         cpu_s=tuple(run[2] for run in runs),
         solve_s=median([run[0].solve.seconds for run in runs]),
         positions_s=median([_positions_s(run[0]) for run in runs]),
-        peak_memory_mb=peak_memory_mb,
+        peak_memory_mb=peak_mb,
         peers=peers,
         adjusted=adjusted,
         adjustment_s=adjustment_s,
@@ -337,16 +336,6 @@ def _measure_glomap(folder: Path, truth: Path) -> tuple[Peer, ...]:
                 )
             )
     return tuple(peers)
-
-
-def _peak_memory_mb() -> float:
-    """Return the peak resident memory of this process so far, in 10^6 bytes."""
-    with contextlib.suppress(OSError):  # Linux: unlike ru_maxrss, it does not start at the parent's peak
-        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024 / 1e6
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
 
 
 # --- what is to be reached -------------------------------------------------------------------------

@@ -1,0 +1,78 @@
+"""ShapeFit through Clarabel's own interface: the leanest way to give the program to a generic cone solver.
+
+One camera is grounded, and each edge has one cone of d - 1 rows beside its bound, in an orthonormal basis
+B_e of the complement of v_e:
+
+    minimise    sum_e w_e s_e
+    subject to  <c, T> = kappa,    (s_e, B_e^T (t_i - t_j)) in the second-order cone,    t_0 = 0
+
+The multiplier of edge e is (w_e, z_e) in the same cone, and y_e = -B_e z_e the dual of the program.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.viewgraph import ViewGraph
+
+
+class DirectAnswer(NamedTuple):
+    """What Clarabel returned."""
+
+    locations: "FloatArray"
+    dual: "FloatArray"
+    iterations: int
+
+
+def solve_direct(graph: "ViewGraph", tol: float) -> DirectAnswer:
+    """Build the cone program and solve it with Clarabel's tolerances set to `tol`, on one thread."""
+    import clarabel
+    from scipy.sparse import csc_array
+
+    from sfm_shapefit.geometry import tangent_bases
+    from sfm_shapefit.solver.program import scale_functional
+
+    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
+    bases = tangent_bases(graph.directions)
+    unknowns = (n - 1) * d + m
+    c = scale_functional(graph)[1:].ravel()
+    values, rows, columns = _cone_entries(graph, bases)
+    matrix = csc_array(
+        (
+            np.concatenate([c, values]),
+            (np.concatenate([np.zeros(len(c), dtype=np.int64), rows]), np.r_[: len(c), columns]),
+        ),
+        shape=(1 + m * d, unknowns),
+    )
+    right = np.zeros(1 + m * d)
+    right[0] = graph.weights.sum()
+    cost = np.concatenate([np.zeros((n - 1) * d), graph.weights])
+
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tol
+    cones = [clarabel.ZeroConeT(1), *(clarabel.SecondOrderConeT(d) for _ in range(m))]
+    solution = clarabel.DefaultSolver(
+        csc_array((unknowns, unknowns)), cost, matrix, right, cones, settings
+    ).solve()
+    t = np.vstack([np.zeros((1, d)), np.reshape(solution.x[: (n - 1) * d], (-1, d))])
+    z = np.reshape(solution.z[1:], (m, d))[:, 1:]
+    return DirectAnswer(t, -np.einsum("edk,ek->ed", bases, z), int(solution.iterations))
+
+
+def _cone_entries(graph: "ViewGraph", bases: "FloatArray") -> tuple["FloatArray", "np.ndarray", "np.ndarray"]:
+    """Return values, rows and columns of -(s_e, B_e^T (t_i - t_j)) below row 0."""
+    m, d, k = bases.shape
+    first = 1 + d * np.arange(m)
+    parts = [(-np.ones(m), first, (graph.num_cameras - 1) * d + np.arange(m))]
+    for end, sign in ((0, -1.0), (1, 1.0)):
+        nodes = graph.edges[:, end] - 1
+        kept = nodes >= 0
+        row = np.broadcast_to((first[:, None] + 1 + np.arange(k))[:, None, :], (m, d, k))[kept]
+        column = np.broadcast_to((nodes[:, None] * d + np.arange(d))[:, :, None], (m, d, k))[kept]
+        parts.append((sign * bases[kept].ravel(), row.ravel(), column.ravel()))
+    values, rows, columns = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+    return values, rows, columns

@@ -1,0 +1,406 @@
+"""Bare graphs: pytheia's and gtsam's translation averaging beside ours, on the same directions.
+
+Every contender runs in its own fresh process with a time limit, once after a small warm-up problem, on one
+thread. The clock covers the call alone: a peer's own input types are built before. All keep their default
+options, except that our ShapeFit is certified to 1e-6, and gtsam's measurements have the noise model that
+its interface demands, sigma 0.01, with or without a Huber loss of 1.345 on it. Rotations are identities, so
+that pytheia's camera axes are the world's.
+
+pytheia and gtsam are optional (`pip install pytheia gtsam`, the extra `peers`); without them their rows say
+so.
+"""
+
+import argparse
+import contextlib
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from benchmarks.graphs import GraphSpec, draw, relative_error, view_graph
+from benchmarks.metrics import Check, Quantity, number, ratio, times, verdict
+from benchmarks.process import call, thread_environment
+from benchmarks.record import environment, legend, table, write_section
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.viewgraph import ViewGraph
+
+HELP = "Bare graphs beside pytheia and gtsam; a peer that is not installed is skipped with a sentence."
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("numpy", "scipy", "numba", "pytheia", "gtsam")
+TIMEOUT_S = 150.0
+FASTER = 5.0
+"""Times faster than the fastest peer of equal or better error, to be reached."""
+_GTSAM_SIGMA, _HUBER = 0.01, 1.345
+_SHAPEFIT_TOL = 1e-6
+
+PROBLEMS = {
+    "er2-300": GraphSpec(family="er2", n=300, sigma=0.01),
+    "geo-1000": GraphSpec(family="geo", n=1000, degree=40.0, sigma=0.01),
+    "geo-5000": GraphSpec(family="geo", n=5000, degree=40.0, sigma=0.01),
+    "comm-1000": GraphSpec(family="comm", n=1000, degree=67.0, sigma=0.01),
+}
+WARM_UP = {
+    "er2": GraphSpec(family="er2", n=100, sigma=0.01),
+    "geo": GraphSpec(family="geo", n=1000, degree=20.0, sigma=0.01),
+    "comm": GraphSpec(family="comm", n=1000, degree=20.0, sigma=0.01),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What a contender gave on a problem."""
+
+    name: str
+    ours: bool
+    error: float = math.nan
+    seconds: float = math.nan
+    note: str = ""
+    """Why there is no answer, or what else it says."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """A problem and all answers."""
+
+    name: str
+    num_cameras: int
+    num_edges: int
+    answers: tuple[Answer, ...]
+
+
+QUANTITIES = (
+    Quantity(
+        name="error",
+        unit="1",
+        better="lower",
+        rel_tol=0.05,
+        meaning="against the truth, both centred and of unit norm; a peer's random start changes its own",
+    ),
+    Quantity(
+        name="seconds", unit="s", better="lower", rel_tol=0.5, meaning="wall-clock of the call alone, one run"
+    ),
+    Quantity(
+        name="error / ours",
+        unit="1",
+        better="higher",
+        rel_tol=0.05,
+        meaning="a peer's error over that of our best answer; above 1 ours is better",
+    ),
+    Quantity(
+        name="seconds / ours",
+        unit="1",
+        better="higher",
+        rel_tol=0.5,
+        meaning="a peer's time over that of our best answer (the same one); above 1 ours is faster",
+    ),
+)
+
+
+# --- the subcommand --------------------------------------------------------------------------------
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `peers-graphs`."""
+    parser.add_argument(
+        "--problems", type=problems, default=list(PROBLEMS), help="names, with commas; all by default"
+    )
+    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds per answer (default 150)")
+    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+
+
+def problems(text: str) -> list[str]:
+    """Parse `--problems`."""
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    unknown = [name for name in names if name not in PROBLEMS]
+    if unknown or not names:
+        raise argparse.ArgumentTypeError(
+            f"unknown problem {', '.join(unknown) or '(none)'}; known: {', '.join(PROBLEMS)}"
+        )
+    return list(dict.fromkeys(names))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the section and write it; a missed limit is no failure."""
+    about = environment(PACKAGES, command_line(args))
+    compared = []
+    for name in args.problems:
+        spec = PROBLEMS[name]
+        answers = []
+        for contender in CONTENDERS:
+            answers.append(_answer(contender, spec, args.timeout))
+            found = answers[-1]
+            figures = f"error {number(found.error)}, {number(found.seconds)} s"
+            print(f"{name}, {found.name}: {figures} {found.note}", file=sys.stderr, flush=True)
+        compared.append(
+            Compared(name=name, num_cameras=spec.n, num_edges=len(draw(spec).edges), answers=tuple(answers))
+        )
+    body = section(compared, about, args.timeout)
+    print(body)
+    write_section(args.out, "peers-graphs", body)
+    return 0
+
+
+def command_line(args: argparse.Namespace) -> str:
+    """Return the command that repeats the measurement, without paths."""
+    chosen = "" if args.problems == list(PROBLEMS) else f" --problems {','.join(args.problems)}"
+    limit = "" if args.timeout == TIMEOUT_S else f" --timeout {args.timeout:g}"
+    return f"python scripts/benchmark.py peers-graphs{chosen}{limit}"
+
+
+def _answer(contender: "Contender", spec: GraphSpec, timeout_s: float) -> Answer:
+    """Return a contender's answer, or why there is none."""
+    empty = Answer(name=contender.name, ours=contender.package is None)
+    if contender.package is not None and find_spec(contender.package) is None:
+        return replace(empty, note=f"skipped: {contender.package} is not installed")
+    try:
+        error, seconds, note = call(
+            measure, contender.name, spec, environment=thread_environment(1), timeout_s=timeout_s
+        )
+    except TimeoutError:
+        return replace(empty, note=f"failed: no answer within {timeout_s:g} s")
+    except RuntimeError as reason:
+        return replace(empty, note=f"failed: {reason}")
+    return replace(empty, error=error, seconds=seconds, note=note)
+
+
+# --- the contenders --------------------------------------------------------------------------------
+
+Solver = Callable[[], tuple["FloatArray", str]]
+"""Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
+
+
+def _prepare_shapefit(graph: "ViewGraph") -> Solver:
+    from sfm_shapefit import SolverOptions, solve
+
+    options = SolverOptions(tol=_SHAPEFIT_TOL, uniqueness=False)
+
+    def run_it() -> tuple["FloatArray", str]:
+        found = solve(graph, options)
+        return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
+
+    return run_it
+
+
+def _prepare_lud(graph: "ViewGraph") -> Solver:
+    from sfm_shapefit.solver.admm import solve_lud
+
+    def run_it() -> tuple["FloatArray", str]:
+        found = solve_lud(graph, certified=False)
+        return found.locations, f"{found.iterations} iterations"
+
+    return run_it
+
+
+def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["ViewGraph"], Solver]:
+    def prepare(graph: "ViewGraph") -> Solver:
+        import numpy as np
+        import pytheia
+
+        pairs = {}
+        for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
+            info = pytheia.sfm.TwoViewInfo()
+            info.rotation_2 = np.zeros(3)
+            info.position_2 = -v if i < j else v  # where the second camera is, seen from the first
+            info.num_verified_matches = 100
+            pairs[min(i, j), max(i, j)] = info
+        orientations = {camera: np.zeros(3) for camera in range(graph.num_cameras)}
+
+        def run_it() -> tuple["FloatArray", str]:
+            with _silence():
+                found = estimate(pytheia.sfm, pairs, orientations)
+            return _gathered({k: np.ravel(p) for k, p in found.items()}, graph.num_cameras), ""
+
+        return run_it
+
+    return prepare
+
+
+def _pytheia_lud(sfm: Any, pairs: Any, orientations: Any) -> Any:
+    options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
+    return sfm.LeastUnsquaredDeviationPositionEstimator(options).EstimatePositions(pairs, orientations)
+
+
+def _pytheia_nonlinear(sfm: Any, pairs: Any, orientations: Any) -> Any:
+    options = sfm.NonlinearPositionEstimatorOptions()
+    estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
+    return estimator.EstimatePositions(pairs, orientations)
+
+
+def _prepare_gtsam(robust: bool) -> Callable[["ViewGraph"], Solver]:
+    def prepare(graph: "ViewGraph") -> Solver:
+        import gtsam
+
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, _GTSAM_SIGMA)
+        if robust:
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        measurements = [
+            gtsam.BinaryMeasurementUnit3(i, j, gtsam.Unit3(-v), noise)  # gtsam's points from i to j
+            for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True)
+        ]
+        recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), False)
+
+        def run_it() -> tuple["FloatArray", str]:
+            with _silence():
+                values = recovery.run(measurements, 1.0)
+            points = {k: values.atPoint3(k) for k in range(graph.num_cameras) if values.exists(k)}
+            return _gathered(points, graph.num_cameras), ""
+
+        return run_it
+
+    return prepare
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contender:
+    """A solver of bare graphs and the package it needs; None: ours."""
+
+    name: str
+    prepare: Callable[["ViewGraph"], Solver]
+    package: str | None = None
+
+
+CONTENDERS = (
+    Contender(name="ours, ShapeFit", prepare=_prepare_shapefit),
+    Contender(name="ours, LUD", prepare=_prepare_lud),
+    Contender(name="pytheia LUD", prepare=_prepare_pytheia(_pytheia_lud), package="pytheia"),
+    Contender(name="pytheia Nonlinear", prepare=_prepare_pytheia(_pytheia_nonlinear), package="pytheia"),
+    Contender(name="gtsam TranslationRecovery", prepare=_prepare_gtsam(robust=False), package="gtsam"),
+    Contender(name="gtsam with Huber", prepare=_prepare_gtsam(robust=True), package="gtsam"),
+)
+
+
+# --- measuring -------------------------------------------------------------------------------------
+
+
+def measure(name: str, spec: GraphSpec) -> tuple[float, float, str]:
+    """Return a contender's error, seconds and note on a problem; to be called once per process."""
+    contender = next(one for one in CONTENDERS if one.name == name)
+    if contender.package is None:
+        contender.prepare(view_graph(draw(WARM_UP[spec.family])))()  # compiled code is loaded
+        if spec.family != "er2":
+            contender.prepare(view_graph(draw(WARM_UP["er2"])))()
+    problem = draw(spec)
+    solver = contender.prepare(view_graph(problem))
+    start = time.perf_counter()
+    locations, note = solver()
+    seconds = time.perf_counter() - start
+    return relative_error(locations, problem.locations), seconds, note
+
+
+def _gathered(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
+    """Return the points as an array; RuntimeError if cameras are missing or not finite."""
+    import numpy as np
+
+    missing = n - len(points)
+    if missing:
+        raise RuntimeError(f"{missing} of {n} cameras have no position")
+    locations: FloatArray = np.array([points[camera] for camera in range(n)], dtype=np.float64)
+    if not np.isfinite(locations).all():
+        raise RuntimeError("positions that are not finite")
+    return locations
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Send what C++ libraries write to stdout and stderr nowhere."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        for descriptor, target in zip(saved, (1, 2), strict=True):
+            os.dup2(descriptor, target)
+            os.close(descriptor)
+        os.close(nowhere)
+
+
+# --- what is to be reached -------------------------------------------------------------------------
+
+
+def best_of_ours(one: Compared) -> Answer | None:
+    """Return our answer of the lowest error, None if there is none."""
+    found = [answer for answer in one.answers if answer.ours and math.isfinite(answer.error)]
+    return min(found, key=lambda answer: answer.error, default=None)
+
+
+def checks(one: Compared) -> list[Check]:
+    """Return the checks of one problem: the lowest error of all, and the time of the equally accurate.
+
+    A peer without an answer has no check; where no peer is as accurate as ours, there is none of the time.
+    """
+    ours = best_of_ours(one)
+    peers = [answer for answer in one.answers if not answer.ours and math.isfinite(answer.error)]
+    if not peers:
+        return []
+    error = math.nan if ours is None else ours.error
+    seconds = math.nan if ours is None else ours.seconds
+    found = [Check(name="error", value=error, limit=min(peer.error for peer in peers))]
+    as_good = [peer.seconds for peer in peers if peer.error <= error]
+    if as_good:
+        found.append(
+            Check(name="times faster", value=ratio(min(as_good), seconds), limit=FASTER, better="higher")
+        )
+    return found
+
+
+# --- the section -----------------------------------------------------------------------------------
+
+
+def section(compared: Sequence[Compared], about: str, timeout_s: float) -> str:
+    """Return the section of the file of results."""
+    every = [check for one in compared for check in checks(one)]
+    parts = [
+        "## Peers on bare graphs",
+        about
+        + f"- Threads: 1; a fresh process each, ended after {timeout_s:g} s, imports included; our code is"
+        " warmed up on a small graph first, so that nothing is compiled while the clock runs",
+        f"**{sum(check.met for check in every)} of {len(every)} limits met**: our best answer has the lowest"
+        f" error, and is {FASTER:g} times faster than the fastest peer of equal or lower error, if any. Peers"
+        " without an answer are in no limit.",
+        _answer_table(compared),
+        _verdict_table(compared),
+        "### What the columns mean",
+        legend(QUANTITIES),
+    ]
+    return "\n\n".join(part.strip() for part in parts)
+
+
+def _answer_table(compared: Sequence[Compared]) -> str:
+    rows = []
+    for one in compared:
+        ours = best_of_ours(one)
+        for answer in one.answers:
+            compare = ours is not None and not answer.ours
+            rows.append(
+                [
+                    f"{one.name} ({one.num_edges} pairs)",
+                    answer.name,
+                    number(answer.error),
+                    number(answer.seconds),
+                    times(ratio(answer.error, ours.error)) if ours and compare else "-",
+                    times(ratio(answer.seconds, ours.seconds)) if ours and compare else "-",
+                    answer.note,
+                ]
+            )
+    header = ["problem", "method", "error", "seconds", "error / ours", "seconds / ours", "note"]
+    return table(header, rows)
+
+
+def _verdict_table(compared: Sequence[Compared]) -> str:
+    rows = []
+    for one in compared:
+        ours = best_of_ours(one)
+        rows.append([one.name, "-" if ours is None else ours.name, verdict(checks(one))])
+    return table(["problem", "our best answer", "verdict"], rows)

@@ -1,0 +1,65 @@
+"""What the benchmarks of bare graphs share: families by name, a graph with its truth, the paper's error."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.synthetic import GraphProblem
+    from sfm_shapefit.viewgraph import ViewGraph
+
+SEED = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphSpec:
+    """A random graph problem that can be drawn again anywhere."""
+
+    family: str
+    """er2 is G(n, 1/2), the paper's; geo, comm, er and seq are the families of `sfm_shapefit.synthetic`."""
+    n: int
+    degree: float = 0.0
+    """Mean degree asked for; not used by er2."""
+    sigma: float = 0.0
+    q: float = 0.2
+
+    def __str__(self) -> str:
+        return f"{self.family} {self.n}, sigma {self.sigma:g}"
+
+
+def draw(spec: GraphSpec) -> "GraphProblem":
+    """Return the problem, always the same one."""
+    from sfm_shapefit import synthetic
+
+    noise: dict[str, Any] = {"sigma": spec.sigma, "q": spec.q, "seed": SEED}
+    if spec.family == "er2":
+        return synthetic.random_graph_problem(spec.n, 0.5, **noise)
+    families = {
+        "geo": synthetic.box_graph_problem,
+        "comm": synthetic.community_graph_problem,
+        "er": synthetic.expander_graph_problem,
+        "seq": synthetic.trajectory_graph_problem,
+    }
+    return families[spec.family](spec.n, spec.degree, **noise)
+
+
+def view_graph(problem: "GraphProblem") -> "ViewGraph":
+    """Return the measurements of a problem."""
+    from sfm_shapefit import ViewGraph
+
+    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
+
+
+def relative_error(locations: "FloatArray", truth: "FloatArray") -> float:
+    """Return the paper's error: the distance of the two sets, each centred and scaled to unit norm.
+
+    Source: Hand, Lee, Voroninski (2015), section 4.
+    """
+    import numpy as np
+
+    def normalized(t: "FloatArray") -> "FloatArray":
+        centred = t - t.mean(axis=0)
+        unit: FloatArray = centred / np.linalg.norm(centred)
+        return unit
+
+    return float(np.linalg.norm(normalized(locations) - normalized(truth)))

@@ -1,0 +1,125 @@
+"""Where a figure is measured: fresh processes with a number of threads, a time limit, and their memory.
+
+The number of BLAS threads is read when numpy is loaded, so it must stand in the environment of a process that
+has not loaded it: every measurement runs in a spawned one.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import resource
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+THREAD_VARIABLES = (
+    "OPENBLAS_NUM_THREADS",
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "NUMBA_NUM_THREADS",
+    "RAYON_NUM_THREADS",
+)
+
+
+def thread_environment(threads: int) -> dict[str, str]:
+    """Return the environment in which numerical libraries use so many threads."""
+    return dict.fromkeys(THREAD_VARIABLES, str(threads))
+
+
+def call(
+    function: Callable[..., Any],
+    *args: object,
+    environment: Mapping[str, str] | None = None,
+    timeout_s: float | None = None,
+) -> Any:
+    """Call a function in a fresh process and return its result.
+
+    Args:
+        function: of a module that can be imported; its arguments and its result are pickled.
+        args: its arguments.
+        environment: variables to set for that process, on top of this one's.
+        timeout_s: wall-clock limit, imports included.
+
+    Raises:
+        TimeoutError: if the limit passed; the process is ended.
+        RuntimeError: if the function raised, with its message, or the process died without an answer.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    with _environment(environment or {}):
+        process = context.Process(target=_answer, args=(sender, function, args))
+        process.start()
+    sender.close()
+    try:
+        if not receiver.poll(timeout_s):
+            raise TimeoutError(f"no answer within {timeout_s:g} s")
+        good, answer = receiver.recv()
+    except EOFError:
+        process.join()
+        raise RuntimeError(f"the process ended with code {process.exitcode} and no answer") from None
+    finally:
+        if process.is_alive():
+            process.join(1.0)
+        if process.is_alive():
+            process.kill()
+        process.join()
+        receiver.close()
+    if not good:
+        raise RuntimeError(answer)
+    return answer
+
+
+def _answer(sender: Connection, function: Callable[..., Any], args: tuple[object, ...]) -> None:
+    """Send what the function returns or why it failed."""
+    try:
+        sender.send((True, function(*args)))
+    except Exception as error:  # whatever a library raises is an answer, to be shown as such
+        sender.send((False, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"))
+    finally:
+        sender.close()
+
+
+@contextlib.contextmanager
+def _environment(variables: Mapping[str, str]) -> Iterator[None]:
+    """Set environment variables for the processes that are started inside."""
+    before = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            else:
+                os.environ[name] = value
+
+
+def peak_memory_mb() -> float:
+    """Return the peak resident memory of this process since its start or `reset_peak`, in 10^6 bytes."""
+    high_water = _status_mb("VmHWM:")
+    if high_water is not None:  # Linux: unlike ru_maxrss, it does not start at the parent's peak
+        return high_water
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / 1e6 if sys.platform == "darwin" else peak * 1024 / 1e6
+
+
+def resident_memory_mb() -> float:
+    """Return the resident memory of this process now, in 10^6 bytes; its peak where that is all there is."""
+    resident = _status_mb("VmRSS:")
+    return peak_memory_mb() if resident is None else resident
+
+
+def reset_peak() -> None:
+    """Let the peak start anew at the present memory, where the system can do that (Linux)."""
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
+
+
+def _status_mb(key: str) -> float | None:
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+            if line.startswith(key):
+                return int(line.split()[1]) * 1024 / 1e6
+    return None
