@@ -392,9 +392,9 @@ def test_fewer_than_two_posed_images_are_refused(tmp_path):
         records["frames"][:1],
     )
     records["images"][0][4] = []
-    with pytest.raises(InputError, match="has 1 images with a pose"):
+    with pytest.raises(InputError, match="has only one image with a pose"):
         read_model(write_tiny(tmp_path / "one", records))
-    with pytest.raises(InputError, match="has 0 images with a pose"):
+    with pytest.raises(InputError, match="has no image with a pose"):
         read_model(pycolmap.Reconstruction())
 
 
