@@ -9,6 +9,7 @@ Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solve
 import ast
 import inspect
 import os
+import signal
 import sys
 import textwrap
 import tomllib
@@ -16,12 +17,12 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
 from sfm_shapefit.colmap.workspace import WorkspaceOptions
-from sfm_shapefit.errors import ShapeFitError, UnsolvableError
+from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.synthetic import SceneOptions
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 Options = TypeVar("Options")
 Command = TypeVar("Command", bound=Callable[..., None])
-Text = list[tuple[str, str]]
+Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
 
 _EXIT_USAGE, _EXIT_INPUT, _EXIT_UNSOLVABLE, _EXIT_INTERRUPTED = 2, 3, 4, 130
@@ -65,8 +66,16 @@ Config = Annotated[
 
 
 def main() -> None:
-    """Run the command line."""
-    app()
+    """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
+    _catch_termination()
+    try:
+        app()
+    except KeyboardInterrupt:  # outside a command: while modules are loaded
+        sys.exit(_EXIT_INTERRUPTED)
+
+
+def _interrupt(_signal: int, _frame: object) -> None:
+    raise KeyboardInterrupt
 
 
 # --- flags from options ----------------------------------------------------------------------------
@@ -117,7 +126,7 @@ def _field_documentation(options_type: type) -> dict[str, str]:
 def _options(options_type: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
     """Return options from a TOML file and the flags that were given, which win."""
     known = {item.name for item in fields(options_type)}  # type: ignore[arg-type]
-    values = _read_toml(config, known, options_type) if config else {}
+    values = _read_toml(config, known) if config else {}
     values |= {name: value for name, value in given.items() if value is not None}
     try:
         return options_type(**values)
@@ -125,19 +134,15 @@ def _options(options_type: type[Options], given: dict[str, Any], config: Path | 
         raise typer.BadParameter(str(error)) from error
 
 
-def _read_toml(path: Path, known: set[str], options_type: type) -> dict[str, Any]:
-    """Return the values of a TOML file whose keys and types fit the options."""
+def _read_toml(path: Path, known: set[str]) -> dict[str, Any]:
+    """Return the values of a TOML file whose keys are options."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
-    hints = get_type_hints(options_type)
-    for name, value in values.items():
+    for name in values:
         if name not in known:
             raise typer.BadParameter(f"{path}: {name!r} is no option; known are {', '.join(sorted(known))}")
-        wanted = str if get_origin(hints[name]) is Literal else hints[name]
-        if type(value) is not wanted and not (wanted is float and type(value) is int):
-            raise typer.BadParameter(f"{path}: {name} must be of type {wanted.__name__}, got {value!r}")
     return values
 
 
@@ -155,6 +160,11 @@ def _reported() -> Iterator[None]:
         _fail(str(error), _EXIT_UNSOLVABLE)
     except ShapeFitError as error:
         _fail(str(error), _EXIT_INPUT)
+
+
+def _catch_termination() -> None:
+    """Turn SIGTERM into an interrupt; again once pycolmap is loaded, which brings a handler of its own."""
+    signal.signal(signal.SIGTERM, _interrupt)
 
 
 def _fail(message: str, code: int) -> None:
@@ -193,15 +203,16 @@ def _progress(enabled: bool) -> "Iterator[Progress | None]":
         yield advance
 
 
-def _print_table(title: str, rows: Text) -> None:
+def _print_table(title: str, rows: Rows) -> None:
     """Print a two-column table on stdout."""
     from rich.console import Console
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, show_header=False, title_justify="left")
+    # Text, not markup: names and paths come from strangers, and brackets in them mean nothing.
+    table = Table(title=Text(_printable(title)), show_header=False, title_justify="left")
     for label, value in rows:
-        table.add_row(label, escape("\n".join(_printable(line) for line in value.split("\n"))))
+        table.add_row(label, Text("\n".join(_printable(line) for line in value.split("\n"))))
     Console().print(table)
 
 
@@ -244,6 +255,7 @@ def locate_command(
         from sfm_shapefit.report import dumps
         from sfm_shapefit.results import summary, write_result
 
+        _catch_termination()
         with _progress(not quiet) as progress:
             found = locate(source, database, options, progress)
             write_result(found, target, overwrite=overwrite, protect=protect)
@@ -253,28 +265,38 @@ def locate_command(
             _print_table(f"{len(found.model.names)} images of {source}", _locate_table(found, target))
 
 
-def _locate_table(found: "LocateResult", out: Path) -> Text:
+def _locate_table(found: "LocateResult", out: Path) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
     from sfm_shapefit.results import summary
 
     facts = summary(found)
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
-    pairs = ", ".join(
-        f"{count} {status.replace('_', ' ')}" for status, count in facts["pairs"].items() if count
-    )
     return [
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", _shortened(left_out))] if left_out else []),
-        ("pairs", f"{facts['num_pairs']}: {pairs}"),
+        ("pairs", _pairs_line(facts)),
         ("objective", _objective_line(found.solve)),
         ("scale", found.gauge.statement),
-        ("points", f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"),
+        ("points", _points_line(facts)),
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
     ]
+
+
+def _pairs_line(facts: dict[str, Any]) -> str:
+    counts = dict(facts["pairs"])
+    contradicting, usable = counts.pop("outlier"), counts.pop("usable")
+    others = "".join(f", {count} {status.replace('_', ' ')}" for status, count in counts.items())
+    return f"{facts['num_pairs']}: {usable} usable ({contradicting} contradict the solution){others}"
+
+
+def _points_line(facts: dict[str, Any]) -> str:
+    if facts["num_points"] == 0:
+        return "none"
+    return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
 
 
 def _adjustment_line(found: "LocateResult") -> str:
@@ -313,6 +335,7 @@ def solve_command(
         from sfm_shapefit.report import dumps
         from sfm_shapefit.results import graph_summary, write_graph_result
 
+        _catch_termination()
         found = solve_graph_file(source, options)
         write_graph_result(found, target, overwrite=overwrite)
         if as_json:
@@ -323,7 +346,7 @@ def solve_command(
             )
 
 
-def _solve_table(found: "GraphResult", out: Path) -> Text:
+def _solve_table(found: "GraphResult", out: Path) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
     from sfm_shapefit.results import quality_warnings
 
@@ -378,6 +401,8 @@ def evaluate_command(
 
         errors = evaluate(source, truth, threshold or ())
         if csv is not None:
+            if csv.exists() and csv.suffix.lower() != ".csv":
+                raise InputError(f"{csv} exists and is no .csv file; choose another name")
             write_records(errors.rows(), csv)
         if as_json:
             print(dumps(errors.as_dict()))  # noqa: T201
@@ -385,7 +410,7 @@ def evaluate_command(
             _print_table(f"{source} against {truth}", _evaluation_table(errors))
 
 
-def _evaluation_table(errors: "Evaluation") -> Text:
+def _evaluation_table(errors: "Evaluation") -> Rows:
     """Return the errors in the reference's units."""
     position, rotation = errors.position, errors.rotation_deg
     recall = "\n".join(f"{r.recall:7.1%} within {r.threshold:.4g}" for r in errors.recalls)

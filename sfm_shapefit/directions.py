@@ -99,7 +99,7 @@ class PairDirections:
     num_matches: IntArray
     """(k,) matches the pair came with."""
     num_inliers: IntArray
-    """(k,) matches below the inlier threshold whose point lies in front of both cameras."""
+    """(k,) matches whose Sampson error is below the inlier threshold."""
     cheirality_fraction: FloatArray
     """(k,) share of the inliers with parallax whose point lies in front of both cameras."""
     median_residual_px: FloatArray
@@ -189,7 +189,8 @@ def _judged(
     rules = (  # the first that fires names the reason
         (num_matches < max(options.min_inliers, _MIN_MATCHES), DirectionStatus.TOO_FEW_MATCHES),
         (inliers < options.min_inlier_ratio * num_matches, DirectionStatus.LOW_INLIER_RATIO),
-        (sigma_deg > options.max_sigma_deg, DirectionStatus.NO_PARALLAX),
+        (inliers < options.min_inliers, DirectionStatus.FEW_INLIERS),
+        ((sigma_deg > options.max_sigma_deg) | (voters < options.min_inliers), DirectionStatus.NO_PARALLAX),
         (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
         (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
     )

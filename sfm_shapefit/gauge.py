@@ -15,6 +15,8 @@ from sfm_shapefit.geometry import Similarity, fit_similarity_l1, median_spread
 Scale = Literal["input", "unit"]
 
 
+_CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
+_ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
 _COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
 
 
@@ -28,6 +30,8 @@ class Gauge:
     """The choice that was carried out."""
     statement: str
     """What scale and origin the output has, for the report."""
+    warning: str = ""
+    """Why the scale may be rough, if it may."""
 
 
 def choose_gauge(locations: FloatArray, input_centers: FloatArray, scale: Scale) -> Gauge:
@@ -46,13 +50,19 @@ def choose_gauge(locations: FloatArray, input_centers: FloatArray, scale: Scale)
         return _unit(
             locations, "unit: the input's centres coincide, so the scale is free; median distance is 1"
         )
-    cap = 0.5 * median_spread(input_centers)  # a camera that has flown away must not set the scale
-    similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=cap or np.inf)
+    size = median_spread(input_centers) or spread
+    similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
     if similarity.scale <= 0.0:
         return _unit(locations, "unit: the input's centres contradict the answer; median distance is 1")
-    return Gauge(
-        similarity=similarity, scale="input", statement="input: scale and origin of the input's centres"
-    )
+    off = float(np.median(np.linalg.norm(similarity.apply(locations) - input_centers, axis=1))) / size
+    warning = ""
+    if off > _ROUGH:
+        warning = (
+            f"the input's centres are {off:.0%} of their spread off the answer, so the scale taken from them "
+            "is rough; use the scale unit if they mean nothing"
+        )
+    statement = "input: scale and origin of the input's centres"
+    return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
 
 
 def _unit(locations: FloatArray, statement: str) -> Gauge:

@@ -40,8 +40,11 @@ def kernel(*, parallel: bool = False, exact: bool = False) -> Callable[[Kernel],
     fastmath: bool | set[str] = False if exact else _FASTMATH
 
     def decorate(function: Kernel) -> Kernel:
-        options = {"cache": True, "nogil": True, "error_model": "numpy"}
-        return cast(Kernel, numba.njit(parallel=parallel, fastmath=fastmath, **options)(function))
+        options = {"nogil": True, "error_model": "numpy", "parallel": parallel, "fastmath": fastmath}
+        try:
+            return cast(Kernel, numba.njit(cache=True, **options)(function))
+        except RuntimeError:  # neither the package's folder nor the user's can be written: compile every time
+            return cast(Kernel, numba.njit(**options)(function))
 
     return decorate
 

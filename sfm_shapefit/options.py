@@ -4,8 +4,8 @@ Pure data, and cheap to import. Each stage's own options check the values that b
 """
 
 import os
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
 from sfm_shapefit.gauge import Scale
 from sfm_shapefit.solver.options import Method
@@ -48,6 +48,7 @@ class LocateOptions:
     """Threads to use; 0 means one per core. The answer does not depend on it."""
 
     def __post_init__(self) -> None:
+        self._check_types()
         for name, kind in (("directions", Source), ("scale", Scale), ("solver", Method)):
             choices = get_args(kind)
             if getattr(self, name) not in choices:
@@ -57,6 +58,15 @@ class LocateOptions:
         self.for_solver()
         self.for_directions()
         self.for_structure()
+
+    def _check_types(self) -> None:
+        """Refuse values of another type by name; an integer serves as a float."""
+        hints = get_type_hints(type(self))
+        for item in fields(self):
+            value, wanted = getattr(self, item.name), hints[item.name]
+            accepted = {float: (float, int), int: (int,), bool: (bool,)}.get(wanted, (str,))
+            if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
+                raise ValueError(f"{item.name} must be of type {accepted[0].__name__}, got {value!r}")
 
     def for_solver(self) -> "SolverOptions":
         """Return the solver's share."""

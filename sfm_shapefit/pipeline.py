@@ -19,11 +19,17 @@ from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
-from sfm_shapefit.directions import PairDirections, concatenate, estimate_directions, from_relative_poses
+from sfm_shapefit.directions import (
+    DirectionStatus,
+    PairDirections,
+    concatenate,
+    estimate_directions,
+    from_relative_poses,
+)
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.evaluation import Evaluation, evaluate_poses
 from sfm_shapefit.formats import read_graph
-from sfm_shapefit.gauge import choose_gauge
+from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
@@ -32,6 +38,14 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
     import pycolmap
+
+_CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_ADVICE = {
+    DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
+    DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
+    DirectionStatus.NO_PARALLAX: "cameras that only turn cannot be placed; use images from different places",
+}
+"""What to do where no pair has a direction, by the most frequent reason."""
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the work done so far and the work in all."""
@@ -98,7 +112,7 @@ def locate(
         gauge=gauge,
         adjusted=adjusted,
         timings_s=clock.seconds,
-        warnings=tuple(_warnings(matches, placement)),
+        warnings=tuple(_warnings(matches, placement, gauge, seeded.num_points3D())),
     )
 
 
@@ -130,6 +144,8 @@ def _choose_inputs(
     """Decide where directions come from, and say how."""
     folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None
     if source == "tracks":
+        if database is not None:
+            raise InputError("directions from tracks use no database; leave out one of the two")
         return Inputs(
             folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
         )
@@ -188,10 +204,11 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     """Return the graph of the usable directions; it has at least one edge."""
     usable = directions.usable()
     if len(usable) == 0:
-        reasons = ", ".join(f"{count} {status.value}" for status, count in directions.counts().items())
+        counts = directions.counts()
+        reasons = ", ".join(f"{count} {status.value}" for status, count in counts.items())
         raise UnsolvableError(
             f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
-            "check that the rotations and intrinsics belong to these matches"
+            f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
         )
     return ViewGraph(
         model.num_images, directions.pairs[usable], directions.directions[usable], names=model.names
@@ -244,9 +261,15 @@ def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterat
         clock.advance(done, total)
 
 
-def _warnings(matches: MatchDatabase | None, placement: Placement) -> Iterator[str]:
+def _warnings(
+    matches: MatchDatabase | None, placement: Placement, gauge: Gauge, num_points: int
+) -> Iterator[str]:
     """Yield what the user should know beyond the tables."""
     yield from quality_warnings(placement)
+    if gauge.warning:
+        yield gauge.warning
+    if num_points == 0:
+        yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if matches is not None and matches.unmatched_names:
         names = matches.unmatched_names
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"

@@ -69,7 +69,7 @@ class PieceRow:
 
     num_cameras: int
     scale: str
-    """The gauge of a solved piece, "not solved" for the others."""
+    """The gauge of a solved piece, "free, not solved" for the others."""
     hinges: list[str]
     """Names of the cameras that it shares with other pieces."""
 

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
 
 _SMALLEST_PIECE = 3  # cameras; two cameras of one pair are no piece worth a line
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
+_ALARMING_LEVEL_DEG = 5.0
+_UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 
 
@@ -274,9 +276,26 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
         yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
     if placement.solve.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
+    level = placement.assessment.level_deg
+    if level > _ALARMING_LEVEL_DEG:
+        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
+    yield from _uncertain_cameras(placement)
     share = len(placement.rejected_pairs) / len(placement.edges)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+
+
+def _uncertain_cameras(placement: Placement) -> Iterator[str]:
+    """Yield a warning that names the least certain camera, if any is uncertain."""
+    extent = float(np.linalg.norm(np.ptp(placement.solve.locations, axis=0)))
+    largest = placement.assessment.sigmas.max(axis=1)
+    uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
+    if uncertain and len(placement.cameras) >= _SMALLEST_PIECE:
+        worst = _name(placement.graph, int(placement.cameras[np.argmax(largest)]))
+        yield (
+            f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
+            f"above all {worst}; see sigma and trust in cameras.csv"
+        )
 
 
 def write_result(

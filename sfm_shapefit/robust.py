@@ -25,6 +25,7 @@ from sfm_shapefit.solver.program import adjoint, along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
+_LARGEST_FITTED_SHARE = 0.3  # keeps the quantile below 0.65, so that a third of the pairs may be wrong
 _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _DENSE_UNKNOWNS = 1500
@@ -72,8 +73,7 @@ def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray | Non
     baselines = differences(locations, graph.edges)
     residuals_deg = angle_between_deg(graph.directions, normalized(baselines))
     residuals_deg = np.where(np.isnan(residuals_deg), 180.0, residuals_deg)  # coincident cameras
-    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
-    level = max(np.radians(np.median(residuals_deg)) / median_length, _MIN_LEVEL_RAD)
+    level = _residual_level(graph, np.radians(residuals_deg))
     information = np.linalg.inv(
         own + level**2 * np.broadcast_to(np.eye(freedom), (graph.num_edges, freedom, freedom))
     )
@@ -93,6 +93,19 @@ def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray | Non
         trust=agreeing / np.maximum(graph.degrees(), 1),
         sigmas=_location_sigmas(graph, locations, inliers, bases @ information @ bases.transpose(0, 2, 1)),
     )
+
+
+def _residual_level(graph: ViewGraph, residuals: FloatArray) -> float:
+    """Return the standard deviation per axis that the (m,) residual angles in radians speak of.
+
+    The solution of a sum of norms fits as many equations exactly as there are unknowns. The median of the
+    other residuals stands at the (1 + share) / 2 quantile of all.
+    """
+    freedom = graph.dimension - 1
+    unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    share = min(unknowns / (freedom * graph.num_edges), _LARGEST_FITTED_SHARE)
+    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
+    return max(float(np.quantile(residuals, (1.0 + share) / 2.0) / median_length), _MIN_LEVEL_RAD)
 
 
 def _location_sigmas(

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import os
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
 from sfm_shapefit.options import LocateOptions
-from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint
+from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
 
 RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
 
@@ -100,12 +101,18 @@ def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_pa
         ("--inlier-threshold-px", "0.3", "num_pairs_rejected"),
         ("--max-reprojection-error-px", "0.3", "num_points"),
         ("--min-triangulation-angle-deg", "40", "num_points"),
+        ("--min-inlier-ratio", "0.95", "num_pairs_rejected"),
+        ("--solver", "conic", "solve"),
+        ("--tol", "1e-3", "solve"),
+        ("--scale", "unit", "scale"),
+        ("--bundle-adjust", None, "bundle_adjustment"),
         ("--directions", "tracks", "inputs"),
     ],
 )
 def test_each_flag_matters(tmp_path, flag, value, key):
     plain = json.loads(run("locate", COURTYARD / "truth", tmp_path / "a", "--json").stdout)
-    result = run("locate", COURTYARD / "truth", tmp_path / "b", "--json", flag, value)
+    values = [] if value is None else [value]
+    result = run("locate", COURTYARD / "truth", tmp_path / "b", "--json", flag, *values)
     if flag == "--min-inliers":
         assert "none of the" in refused(result, 4)
     else:
@@ -279,6 +286,57 @@ def test_names_cannot_play_with_the_terminal(tmp_path):
     assert result.exit_code == 0
     assert "\x1b[2J" not in result.output
     assert "[red]" in result.stdout
+
+
+def test_brackets_in_a_path_are_only_brackets(tmp_path):
+    folder = tmp_path / "a[b]:star:[red]"
+    folder.mkdir()
+    scene = copied(RING, folder)
+    result = run("locate", scene / "sparse" / "0", folder / "out")
+    assert result.exit_code == 0, result.output
+    assert "[b]:star:[red]" in "".join(result.stdout.split())
+    assert run("evaluate", folder / "out", scene / "sparse" / "0").exit_code == 0
+
+
+def test_evaluate_does_not_write_over_other_files(ring_out, tmp_path):
+    (tmp_path / "images.bin").write_bytes(b"precious")
+    refused(run("evaluate", ring_out, RING_MODEL, "--csv", tmp_path / "images.bin"), 3)
+    assert (tmp_path / "images.bin").read_bytes() == b"precious"
+
+
+def test_a_scale_from_meaningless_centres_is_warned_about(tmp_path):
+    model = pycolmap.Reconstruction(RING_MODEL)
+    rng = np.random.default_rng(0)
+    for frame in model.frames.values():
+        rotation = frame.rig_from_world.rotation
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, 100.0 * rng.standard_normal(3))
+    model.write(tmp_path)
+    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db", "--json")
+    assert any("of their spread off" in warning for warning in json.loads(result.stdout)["warnings"])
+
+
+def test_a_model_without_points_is_warned_about(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--min-triangulation-angle-deg", "89", "--json")
+    facts = json.loads(result.stdout)
+    assert facts["num_points"] == 0
+    assert any("no 3D point" in warning for warning in facts["warnings"])
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_while_writing_leaves_nothing(tmp_path, number):
+    script = f"""
+import os, sys
+from sfm_shapefit import cli, results
+results.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
+sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
+cli.main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 130
+    assert done.stderr == "sfm-shapefit: interrupted; nothing was written\n"
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):

@@ -237,7 +237,8 @@ def test_standard_deviations_are_in_the_outputs_units(courtyard):
     once = sfm_shapefit.locate(COURTYARD / "truth", COURTYARD / "database.db")
     twice = sfm_shapefit.locate(doubled, COURTYARD / "database.db")
     for small, large in zip(once.cameras, twice.cameras, strict=True):
-        assert large.sigma == pytest.approx([2.0 * value for value in small.sigma], rel=1e-6)
+        # The robust fit of the scale stops at 1e-12 of its cost, which leaves about the root of it.
+        assert large.sigma == pytest.approx([2.0 * value for value in small.sigma], rel=1e-4)
 
 
 def test_images_missing_from_the_database_are_warned_about(tmp_path):
@@ -260,7 +261,15 @@ def test_images_without_a_rotation_are_listed():
 
 
 def test_options_out_of_range_are_refused_by_name():
-    for name, value in (("tol", 2.0), ("threads", -1), ("scale", "metric"), ("min_inlier_ratio", 3.0)):
+    for name, value in (
+        ("threads", 2.5),
+        ("min_inliers", "a"),
+        ("bundle_adjust", 1),
+        ("tol", 2.0),
+        ("threads", -1),
+        ("scale", "metric"),
+        ("min_inlier_ratio", 3.0),
+    ):
         with pytest.raises(ValueError, match=name):
             LocateOptions(**{name: value})
 

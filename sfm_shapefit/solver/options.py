@@ -45,7 +45,8 @@ class SolverOptions:
     """Settings of one solve. Unit-free: the program fixes its own scale."""
 
     method: Method = "auto"
-    """Which solver: "newton" is primal-dual Newton, "admm" splitting for large graphs, "conic" the generic
+    """Which solver: "newton" is primal-dual Newton, "admm" splitting (with Newton steps
+    at the end if the gap needs them) for large graphs, "conic" the generic
     conic program through cvxpy and Clarabel; "auto" picks by size and predicted fill, and says why."""
     tol: float = 1e-8
     """The certified gap, objective - dual_bound, at which a solve counts as converged."""

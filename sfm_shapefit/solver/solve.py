@@ -11,9 +11,9 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.rigidity import is_parallel_rigid
-from sfm_shapefit.solver.admm.shapefit import solve_admm
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import (
     IterationInfo,
@@ -26,12 +26,13 @@ from sfm_shapefit.solver.program import normalized_locations, projected_length, 
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
+_LARGEST_RESIDUAL = 1e-9  # of the dual's equality: beyond it the bound is not to be called rigorous
 _LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 
 # Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
 # whatever the graph, and beyond the second the dense one takes seconds.
 _SMALL, _LARGEST_DENSE = 450, 1800
-_LARGEST_NEWTON_FLOPS = 2e11  # of one block factorisation: about 4 s
+_LARGEST_NEWTON_FLOPS = 4e9  # of one block factorisation: from here on splitting is faster to the same gap
 
 
 class Choice(NamedTuple):
@@ -48,6 +49,8 @@ class Run(NamedTuple):
     locations: FloatArray
     dual: FloatArray
     iterations: int
+    note: str = ""
+    """How it ended, where that is not plain from the certificate."""
 
 
 def solve(
@@ -92,7 +95,7 @@ def solve(
         iterations=run.iterations,
         seconds=time.perf_counter() - start,
         method=choice.method,
-        method_reason=choice.reason,
+        method_reason="; ".join(filter(None, [choice.reason, run.note])),
     )
 
 
@@ -125,8 +128,9 @@ def _run_sparse(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnI
 
 
 def _run_admm(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
-    found = solve_admm(graph, options.tol, limit, threads=options.threads, on_iteration=watch)
-    return Run(found.locations, found.dual, found.iterations)
+    found = solve_hybrid(graph, options.tol, limit, threads=options.threads, on_iteration=watch)
+    note = "" if found.finish is Finish.CERTIFIED else found.finish.value
+    return Run(found.locations, found.certificate.dual, found.iterations, note)
 
 
 def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None) -> Run:
@@ -167,7 +171,7 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
 
 
 def _status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
-    if certificate.gap <= tol:
+    if certificate.gap <= tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
         return Status.CONVERGED
     if cancelled:
         return Status.CANCELLED

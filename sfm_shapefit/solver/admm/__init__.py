@@ -11,13 +11,14 @@ lud        solve_lud
 from sfm_shapefit.solver.admm.engine import Stop
 from sfm_shapefit.solver.admm.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
-from sfm_shapefit.solver.admm.shapefit import AdmmResult, solve_admm
+from sfm_shapefit.solver.admm.shapefit import AdmmResult, Splitting, solve_admm
 
 __all__ = [
     "AdmmResult",
     "IterativeSolver",
     "LaplacianFactor",
     "LudResult",
+    "Splitting",
     "Stop",
     "laplacian_factor",
     "solve_admm",

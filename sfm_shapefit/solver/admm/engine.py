@@ -41,7 +41,6 @@ _ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which accel
 _ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _STEP_FACTOR = 10.0
-_EXACT = 1e-12  # an objective below this times kappa counts as 0: exact directions
 _STALL_WINDOW = 150
 
 
@@ -62,6 +61,8 @@ class Settings:
     """How the iteration runs."""
 
     tol: float
+    absolute_tol: float
+    """Error of the objective, in its own units, that is accurate enough whatever `tol` says."""
     max_iterations: int
     relaxation: float
     renewals: tuple[int, ...]
@@ -93,6 +94,8 @@ class State:
     """Squared step of the iteration before."""
     interior: float = np.inf
     """Fraction of edges inside their ball at the last renewal."""
+    anderson: Anderson | None = None
+    """The history, while the iteration is accelerated."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,29 +126,34 @@ class Iteration:
         self.kappa = kappa
         self._factored = 1.0  # the factor is that of the Laplacian of rho / _factored
 
-    def run(self, on_iteration: OnIteration | None) -> Outcome:
-        """Iterate from the least-squares locations until a reason to stop."""
-        state = self._start()
-        settings, anderson = self.settings, None
-        best, best_at = np.inf, 0
-        for k in range(1, settings.max_iterations + 1):
+    def run(self, on_iteration: OnIteration | None, resumed: Outcome | None = None) -> Outcome:
+        """Iterate from the least-squares locations, or from where a run ended, until a reason to stop.
+
+        Between two runs the factor may have been used for other weights; it is computed anew.
+        """
+        settings = self.settings
+        state, done = (self._start(), 0) if resumed is None else (resumed.state, resumed.iterations)
+        if resumed is not None:
+            self._factor(state)
+        best, best_at = np.inf, done
+        for k in range(done + 1, settings.max_iterations + 1):
             if k > 1:
                 self._move(state)
             renew = k in settings.renewals
             before = state.x.copy() if renew else None
-            anderson = self._pass(state, anderson)
+            self._pass(state)
             if _cancelled(on_iteration, k, self.objective(state)):
                 return Outcome(state=state, iterations=k, stop=Stop.CANCELLED)
             error = self._error(state)
-            if error <= settings.tol:
+            if error <= max(settings.tol * self.objective(state), settings.absolute_tol):
                 return Outcome(state=state, iterations=k, stop=Stop.ACCURATE)
             if error < 0.5 * best:
                 best, best_at = error, k
             elif k - best_at > max(_STALL_WINDOW, k // 2):
                 return Outcome(state=state, iterations=k, stop=Stop.STALLED)
             if before is not None:
-                anderson = self._accelerator(state, anderson)
-                self._renew(state, before, self._floor(settings.renewals.index(k), anderson))
+                state.anderson = self._accelerator(state)
+                self._renew(state, before, self._floor(settings.renewals.index(k), state.anderson))
         return Outcome(state=state, iterations=settings.max_iterations, stop=Stop.MAX_ITERATIONS)
 
     def objective(self, state: State) -> float:
@@ -189,8 +197,9 @@ class Iteration:
         state.t += beta * state.unit
         state.multiplier += beta
 
-    def _pass(self, state: State, anderson: Anderson | None) -> Anderson | None:
-        """Take the proximal step, accelerated if there is a history; return the history to go on with."""
+    def _pass(self, state: State) -> None:
+        """Take the proximal step, accelerated if there is a history."""
+        anderson = state.anderson
         relaxation = self.settings.relaxation if anderson is None else _ANDERSON_RELAXATION
         if anderson is not None and state.spare.shape != state.x.shape:
             state.spare = np.empty_like(state.x)
@@ -199,19 +208,17 @@ class Iteration:
         change, previous = float(state.sums[CHANGE]), state.previous
         state.previous = change
         if anderson is None:
-            return None
+            return
         if change > _ANDERSON_GIVE_UP**2 * previous:
             anderson.restart()
         state.x, state.spare = anderson.advance(state.x, target, state.rho), state.x
         state.pull = self.passes.pull(state.x, state.t, state.rho)
-        return anderson
 
     def _error(self, state: State) -> float:
-        """Return the estimate of the relative error of the objective."""
+        """Return the estimate of the error of the objective, in its own units."""
         objective, pairing, along, change = state.sums[:4]
         dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
-        error = max(abs(objective - dual_value), _STEP_FACTOR * change)
-        return float(error / max(objective, _EXACT * self.kappa))
+        return float(max(abs(objective - dual_value), _STEP_FACTOR * change)) / self.kappa
 
     def _floor(self, renewal: int, anderson: Anderson | None) -> float:
         """Return the least residual that penalties take seriously, relative to the mean residual."""
@@ -236,7 +243,7 @@ class Iteration:
             return _BALANCE
         return float(np.sqrt(np.clip(primal / dual, 1e-2, 1e2)))
 
-    def _accelerator(self, state: State, anderson: Anderson | None) -> Anderson | None:
+    def _accelerator(self, state: State) -> Anderson | None:
         """Return an empty history if so many edges fit exactly that acceleration pays, else None.
 
         With noise, the edges inside their ball become few as the iteration converges; without, they
@@ -246,10 +253,10 @@ class Iteration:
         pays = state.interior >= max(_ANDERSON_INTERIOR, _ANDERSON_KEPT * before)
         if not (self.settings.accelerate and pays):
             return None
-        if anderson is None:
+        if state.anderson is None:
             return Anderson(self.passes, state.x.shape, _ANDERSON_MEMORY)
-        anderson.restart()
-        return anderson
+        state.anderson.restart()
+        return state.anderson
 
 
 def _mean(residuals: FloatArray, weights: FloatArray) -> float:

@@ -71,6 +71,11 @@ class IterativeSolver:
         if not self._solve(probe, 1e-2, _JACOBI_STEPS)[1]:
             self._preconditioner = approximate_cholesky(self._graph, self._weights, _SEED)
 
+    @property
+    def preconditioner(self) -> Preconditioner:
+        """The preconditioner of the last weights: a fixed linear map, as `solve` is not."""
+        return self._preconditioner
+
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with ||rhs - L x|| at most a tenth of ||rhs||, column by column, (n, d)."""
         return self._solve(rhs, _REDUCTION, _MAX_STEPS)[0]

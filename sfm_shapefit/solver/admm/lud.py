@@ -74,7 +74,13 @@ def solve_lud(
         on_iteration: called after each iteration; returning False cancels and returns the iterate.
     """
     settings = Settings(
-        tol=tol, max_iterations=max_iterations, relaxation=1.6, renewals=(), penalty=1.0, accelerate=False
+        absolute_tol=0.0,
+        tol=tol,
+        max_iterations=max_iterations,
+        relaxation=1.6,
+        renewals=(),
+        penalty=1.0,
+        accelerate=False,
     )
     factor = laplacian_factor(graph) if factor is None else factor
     passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), threads)

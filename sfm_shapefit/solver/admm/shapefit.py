@@ -1,12 +1,12 @@
 """ShapeFit by the splitting of `engine`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.solver.admm.edges import EdgePasses, edge_data
-from sfm_shapefit.solver.admm.engine import Iteration, Settings, Stop
+from sfm_shapefit.solver.admm.engine import Iteration, Outcome, Settings, Stop
 from sfm_shapefit.solver.admm.linear import LaplacianFactor, laplacian_factor
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import scale_functional
@@ -26,6 +26,52 @@ class AdmmResult:
     iterations: int
     stop: Stop
     """Why the iteration ended."""
+
+
+class Splitting:
+    """A run of ADMM that can be continued. Close it after use."""
+
+    def __init__(self, graph: ViewGraph, factor: LaplacianFactor, threads: int) -> None:
+        """Set up the iteration; the factor may serve others between two runs."""
+        settings = Settings(
+            tol=0.0,
+            absolute_tol=0.0,
+            max_iterations=0,
+            relaxation=1.7,
+            renewals=_RENEWALS,
+            penalty=0.5,
+            accelerate=True,
+        )
+        self._passes = EdgePasses(edge_data(graph, -np.inf), threads)
+        kappa = float(graph.weights.sum())
+        self._iteration = Iteration(self._passes, factor, settings, scale_functional(graph), kappa)
+        self._outcome: Outcome | None = None
+
+    def close(self) -> None:
+        """End the threads."""
+        self._passes.close()
+
+    def run(
+        self, tol: float, absolute_tol: float, max_iterations: int, on_iteration: OnIteration | None
+    ) -> AdmmResult:
+        """Iterate on until the error of the objective is estimated below `tol`, relative, or `absolute_tol`.
+
+        Args:
+            tol: relative error.
+            absolute_tol: error in units of the objective R / L.
+            max_iterations: limit of all iterations since the beginning.
+            on_iteration: called after each iteration; returning False cancels and returns the iterate.
+        """
+        iteration = self._iteration
+        iteration.settings = replace(
+            iteration.settings, tol=tol, absolute_tol=absolute_tol, max_iterations=max_iterations
+        )
+        outcome = self._outcome = iteration.run(on_iteration, self._outcome)
+        state, order = outcome.state, self._passes.data.order
+        dual = np.empty_like(state.x)
+        dual[order] = self._passes.dual(state.x, state.rho)
+        t = state.t - state.t.mean(axis=0)
+        return AdmmResult(locations=t, dual=dual, iterations=outcome.iterations, stop=outcome.stop)
 
 
 def solve_admm(
@@ -50,22 +96,8 @@ def solve_admm(
     Raises:
         UnsolvableError: if the factor finds the Laplacian singular: the graph is not connected.
     """
-    settings = Settings(
-        tol=tol,
-        max_iterations=max_iterations,
-        relaxation=1.7,
-        renewals=_RENEWALS,
-        penalty=0.5,
-        accelerate=True,
-    )
-    factor = laplacian_factor(graph) if factor is None else factor
-    passes = EdgePasses(edge_data(graph, -np.inf), threads)
+    splitting = Splitting(graph, laplacian_factor(graph) if factor is None else factor, threads)
     try:
-        run = Iteration(passes, factor, settings, scale_functional(graph), float(graph.weights.sum()))
-        outcome = run.run(on_iteration)
-        dual = np.empty_like(graph.directions)
-        dual[passes.data.order] = passes.dual(outcome.state.x, outcome.state.rho)
+        return splitting.run(tol, 0.0, max_iterations, on_iteration)
     finally:
-        passes.close()
-    t = outcome.state.t - outcome.state.t.mean(axis=0)
-    return AdmmResult(locations=t, dual=dual, iterations=outcome.iterations, stop=outcome.stop)
+        splitting.close()

@@ -20,7 +20,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
 from sfm_shapefit.solver.newton.steps import (
     EDGE_WORK,
     MU_PER_GAP,
@@ -55,7 +55,13 @@ _RIDGES = 0.0, 1e-12, 1e-10  # tried in turn, per stiffness of the edge
 
 
 def solve_newton_sparse(
-    graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
+    graph: ViewGraph,
+    tol: float,
+    max_iterations: int,
+    on_iteration: OnIteration | None = None,
+    *,
+    start: tuple[FloatArray, FloatArray] | None = None,
+    plan: SymbolicFactor | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks; as `solve_newton_dense` otherwise.
 
@@ -64,6 +70,9 @@ def solve_newton_sparse(
         tol: the gap wanted, in units of the objective.
         max_iterations: limit of factorisations.
         on_iteration: called after every factorisation and its steps.
+        start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
+            steps then begin with the smoothing that their gap allows. The closer, the fewer factorisations.
+        plan: of the factorisation of the graph's Laplacian, if it is there already.
 
     Returns:
         locations (n, d), the dual (m, d), and the number of factorisations.
@@ -72,13 +81,17 @@ def solve_newton_sparse(
         UnsolvableError: if the directions do not determine any locations.
     """
     problem, iterate, model, step = allocate(graph)
-    neighbours = adjacency(graph.num_cameras, problem.edges)
-    plan = plan_factorisation(neighbours, problem.edges, best_order(neighbours))
+    if plan is None:
+        neighbours = adjacency(graph.num_cameras, problem.edges)
+        plan = plan_factorisation(neighbours, problem.edges, best_order(neighbours))
     factor = allocate_factor(plan, graph.dimension)
-    system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
-    if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
-        raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-    progress = measure(problem, iterate, 1.0, 0.0)
+    if start is None:
+        system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
+        if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
+            raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
+        progress = measure(problem, iterate, 1.0, 0.0)
+    else:
+        progress = _begin_at(problem, *start, iterate)
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
         before = progress.gap
@@ -88,6 +101,16 @@ def solve_newton_sparse(
         if is_cancelled(on_iteration, count, progress):
             break
     return *answer(iterate, progress, tol), count
+
+
+def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate: Iterate) -> Progress:
+    """Take over locations and a feasible dual."""
+    centred = locations - locations.mean(axis=0)
+    iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
+    set_residuals(problem, iterate.t, iterate.r)
+    iterate.y[:] = dual
+    progress = measure(problem, iterate, 1.0, 0.0)
+    return progress._replace(multiplier=progress.objective - progress.gap)
 
 
 class System(NamedTuple):
@@ -185,7 +208,8 @@ def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: i
             factor.refactor(blocks)
         except UnsolvableError:
             continue
-        a, p = factor.solve(problem.c), factor.solve(q)
+        both = factor.solve(np.stack([problem.c, q], axis=2))  # one pass over the factor
+        a, p = np.ascontiguousarray(both[:, :, 0]), np.ascontiguousarray(both[:, :, 1])
         rows = np.stack([problem.c.ravel(), q.ravel()])
         matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / stiffness])
         return System(factor, a, p, rows, matrix) if abs(np.linalg.det(matrix)) > 0.0 else None

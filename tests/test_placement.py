@@ -1,0 +1,101 @@
+"""A view graph placed: piece, solve and verdicts belong together row by row, in any dimension."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.placement import place
+from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def two_pieces():
+    """Five cameras 0-4 after three cameras 4-6 hinged at 4; the small piece's edges come first."""
+    t = np.random.default_rng(0).standard_normal((7, 3))
+    small = [(4, 5), (4, 6), (5, 6)]
+    large = [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    edges = np.array(small + large)
+    return t, edges, normalized(differences(t, edges))
+
+
+@pytest.mark.parametrize("d", [2, 3, 10])
+def test_every_dimension_is_placed_and_judged(d):
+    problem = random_graph_problem(24, 0.9, d=d, sigma=1e-3, q=0.1, seed=d)
+    placement = place(ViewGraph(24, problem.edges, problem.directions))
+    outliers = ~placement.assessment.inliers
+    assert outliers[problem.corrupted].all()
+    # The solution is a little off where a camera has few good pairs, and then so are one or two of them.
+    assert outliers[~problem.corrupted].sum() <= 2
+    assert placement.assessment.sigmas.shape == (24, d)
+    assert np.isfinite(placement.assessment.sigmas).all()
+
+
+def test_covariances_belong_to_the_pairs_of_the_solved_piece():
+    _, edges, v = two_pieces()
+    bent = 5  # the third edge of the large piece
+    v[bent] = normalized(v[bent] + 0.05 * np.cross(v[bent], v[bent + 1]))
+    graph = ViewGraph(7, edges, v)
+    sharp = np.tile((1e-3) ** 2 * np.eye(2), (len(edges), 1, 1))
+    soft = sharp.copy()
+    soft[bent] = 0.1**2 * np.eye(2)
+    # The pair is wrong by 50 of its own sigmas, or by half of one.
+    assert place(graph, covariance=sharp).rejected_pairs.tolist() == [edges[bent].tolist()]
+    assert len(place(graph, covariance=soft).rejected_pairs) == 0
+
+
+def test_rows_speak_of_the_whole_graph():
+    t, edges, v = two_pieces()
+    graph = ViewGraph(7, edges, v, names=[f"image{k}" for k in range(7)])
+    placement = place(graph)
+    rows = camera_rows(placement, placement.solve.locations, 2.0)
+    assert [row.placed for row in rows] == [True] * 5 + [False] * 2
+    assert [row.piece for row in rows] == [0] * 5 + [1, 1]
+    assert rows[5].reason == "another rigid piece, hinged at image4"
+    assert rows[0].sigma == pytest.approx(tuple(2.0 * placement.assessment.sigmas[0]))
+    pairs = pair_rows(placement, np.arange(len(edges)))
+    assert [row.verdict for row in pairs] == ["undetermined"] * 3 + ["inlier"] * 10
+    assert [row.support for row in pairs] == list(range(13))
+    for row, (i, j) in zip(pairs, edges, strict=True):
+        assert (row.name1, row.name2) == (f"image{i}", f"image{j}")
+        np.testing.assert_allclose(row.direction, normalized(t[i] - t[j]), atol=1e-12)
+
+
+def test_a_graph_without_a_triangle_is_refused():
+    with pytest.raises(UnsolvableError, match="no three cameras"):
+        place(ViewGraph(4, [(0, 1), (1, 2), (2, 3)], np.eye(3)))
+
+
+def test_directions_that_do_not_fit_together_raise_the_alarm():
+    noise = random_graph_problem(14, 1.0, sigma=1e-4, q=1.0, seed=3)
+    warnings = list(quality_warnings(place(ViewGraph(14, noise.edges, noise.directions))))
+    assert any("deg off the solution" in warning for warning in warnings)
+    clean = random_graph_problem(14, 1.0, sigma=1e-4, seed=3)
+    assert list(quality_warnings(place(ViewGraph(14, clean.edges, clean.directions)))) == []
+
+
+def test_mostly_contradicting_pairs_raise_the_alarm():
+    problem = random_graph_problem(14, 1.0, sigma=1e-4, q=0.0, seed=5)
+    placement = place(ViewGraph(14, problem.edges, problem.directions))
+    judged = dataclasses.replace(placement.assessment, inliers=np.arange(len(problem.edges)) % 3 == 0)
+    warnings = list(quality_warnings(dataclasses.replace(placement, assessment=judged)))
+    assert any("66% of the pairs contradict the solution" in warning for warning in warnings)
+
+
+def test_a_loose_camera_is_named():
+    problem = random_graph_problem(12, 1.0, seed=4)
+    t = problem.locations.copy()
+    t[11] = 2.0 * t[1] - t[0] + [0.0, 0.0, 1e-3]  # behind camera 1 as seen from camera 0: it may slide
+    edges = np.array([(i, j) for i in range(11) for j in range(i + 1, 11)] + [(0, 11), (1, 11)])
+    noise = 1e-3 * np.random.default_rng(4).standard_normal((len(edges), 3))
+    graph = ViewGraph(
+        12,
+        edges,
+        normalized(normalized(differences(t, edges)) + noise),
+        names=[f"image{k}" for k in range(12)],
+    )
+    assert any("above all image11" in warning for warning in quality_warnings(place(graph)))
