@@ -8,8 +8,8 @@ import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
-from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.colmap.workspace import write_workspace
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
