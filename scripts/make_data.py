@@ -8,9 +8,9 @@ import shutil
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
+from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.formats import graph_text
-from sfm_shapefit.synthetic import SceneOptions, make_scene, random_graph_problem
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 
 

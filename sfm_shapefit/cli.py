@@ -21,11 +21,10 @@ from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
 import typer
 
-from sfm_shapefit.colmap.workspace import WorkspaceOptions
 from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.options import SolverOptions
-from sfm_shapefit.synthetic import SceneOptions
+from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.evaluation import Evaluation

@@ -92,14 +92,18 @@ def locate(
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
             seed, tracks = _seed_and_tracks(model, matches, placement, centers, clock)
-            seeded = triangulate(seed, tracks, options.for_structure())
-        adjusted = None
+            adjusted = None
+            if not options.bundle_adjust:  # which triangulates at the seed's poses itself
+                seeded = triangulate(seed, tracks, options.for_structure())
         if options.bundle_adjust:
             with clock("bundle adjustment"):
                 adjusted = bundle_adjust(seed, tracks, options.for_structure())
                 seeded = adjusted.reconstruction
+        if matches is not None:  # points of the model's own tracks have their colours already
+            with clock("colours"):
+                seeded = colored(seeded, model.reconstruction)
     return LocateResult(
-        reconstruction=colored(seeded, model.reconstruction),
+        reconstruction=seeded,
         inputs=inputs,
         options=options,
         model=model,
@@ -305,7 +309,8 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    model, truth = read_model(reconstruction), read_model(reference)
+    model = read_model(reconstruction, poses_only=True)
+    truth = read_model(reference, poses_only=True)
     return evaluate_poses(
         model.names,
         model.rotations,

@@ -7,8 +7,9 @@ columns and keys may be added, never renamed.
 import csv
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -83,18 +84,21 @@ def write_rows(
         "sigma": [f"sigma_{axis}" for axis in axes],
         "direction": [f"v{axis}" for axis in axes],
     }
-    names = [name for field in fields(row_type) for name in per_axis.get(field.name, [field.name])]
+    names = [field.name for field in fields(row_type)]
+    values_of, nothing = attrgetter(*names), ("",) * dimension
+    is_vector = [name in per_axis for name in names]
 
-    def record(row: CameraRow | PairRow) -> dict[str, object]:
-        values: dict[str, object] = {}
-        for name, value in asdict(row).items():
-            if name in per_axis:
-                values |= dict(zip(per_axis[name], value or [None] * dimension, strict=True))
+    def cells(row: CameraRow | PairRow) -> list[object]:
+        found: list[object] = []
+        for value, vector in zip(values_of(row), is_vector, strict=True):
+            if vector:
+                found.extend(map(_cell, value) if value else nothing)
             else:
-                values[name] = value
-        return values
+                found.append(_cell(value))
+        return found
 
-    write_records([record(row) for row in rows], path, names)
+    columns = [column for name in names for column in per_axis.get(name, [name])]
+    _write_csv(columns, map(cells, rows), path)
 
 
 def axis_names(dimension: int) -> list[str]:
@@ -102,25 +106,27 @@ def axis_names(dimension: int) -> list[str]:
     return list("xyz"[:dimension]) if dimension <= len("xyz") else [f"x{k + 1}" for k in range(dimension)]
 
 
-def write_records(
-    records: Sequence[Mapping[str, object]], path: Path, names: Sequence[str] | None = None
-) -> None:
+def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
     """Write records as CSV; numbers round-trip, NaN and None are empty fields.
 
     Args:
-        records: one mapping per row.
+        records: one mapping per row, at least one; the columns are those of the first.
         path: the file.
-        names: the columns; by default those of the first record.
 
     Raises:
         InputError: if the file cannot be written.
     """
-    columns = names or list(records[0])
+    columns = list(records[0])
+    _write_csv(columns, ([_cell(record[name]) for name in columns] for record in records), path)
+
+
+def _write_csv(columns: Sequence[str], rows: Iterable[list[object]], path: Path) -> None:
+    """Write a header and rows of cells; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
     try:
-        with path.open("w", newline="", encoding="utf-8") as stream:
+        with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
             writer = csv.writer(stream, lineterminator="\n")
             writer.writerow(columns)
-            writer.writerows([_cell(record[name]) for name in columns] for record in records)
+            writer.writerows(rows)
     except OSError as error:
         raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
 
@@ -131,8 +137,13 @@ def write_json(summary: dict[str, Any], path: Path) -> None:
 
 
 def dumps(summary: dict[str, Any]) -> str:
-    """Return a summary as JSON text; NaN and infinities, which JSON has not, become null."""
-    return json.dumps(_finite(summary), indent=2, ensure_ascii=False, allow_nan=False)
+    """Return a summary as JSON text that UTF-8 can encode.
+
+    NaN and infinities, which JSON has not, become null. Bytes of a path that are no UTF-8 become the escape
+    \\udcXX, from which `os.fsencode` of the parsed text gives them back.
+    """
+    text = json.dumps(_finite(summary), indent=2, ensure_ascii=False, allow_nan=False)
+    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")  # Python's escape is JSON's
 
 
 def solve_summary(result: SolverResult) -> dict[str, Any]:
@@ -152,11 +163,11 @@ def solve_summary(result: SolverResult) -> dict[str, Any]:
 
 
 def _cell(value: object) -> object:
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
-        return ""
+    if isinstance(value, float):
+        return repr(float(value)) if math.isfinite(value) else ""
     if isinstance(value, bool):
         return str(value).lower()
-    return repr(float(value)) if isinstance(value, float) else value
+    return "" if value is None else value
 
 
 def _finite(value: Any) -> Any:

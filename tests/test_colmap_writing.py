@@ -290,6 +290,15 @@ def test_wrong_matches_make_no_point_that_misses_its_observations():
     assert max(reprojection_errors_px(structure)) <= 4.0
 
 
+def test_of_two_placed_images_every_match_is_kept_because_there_are_no_longer_tracks():
+    original, _ = ring_model(noise_px=0.3)
+    model = read_model(original)
+    seed = build_seed(model, np.arange(NUM_IMAGES) < 2, model.centers)
+    graph = correspondence_graph(seed, model.image_ids, all_matches())
+    assert triangulate(seed, graph).num_points3D() == 120
+    assert bundle_adjust(seed, graph).num_points == 120
+
+
 def test_matches_that_only_two_images_share_are_left_out_unless_asked_for():
     original, _ = ring_model()
     model = read_model(original)
@@ -314,6 +323,32 @@ def test_tracks_of_a_model_with_other_keypoints_are_refused():
     seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, {0: np.ones((5, 2))})
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
+
+
+def test_a_source_without_colours_leaves_colours_as_they_are_and_costs_no_copy():
+    original, _ = ring_model()
+    structure = triangulate(seeded(original)[0], original)
+    for point in original.points3D.values():
+        point.color = np.zeros(3, dtype=np.uint8)
+    assert colored(structure, original) is structure
+    assert all(point.color.any() for point in structure.points3D.values())
+
+
+def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
+    # every point of the source is split in two of 4 images each, which matches of all images join again
+    original, _ = ring_model()
+    for point_id in list(original.point3D_ids()):
+        half = pycolmap.Track(original.point3D(point_id).track.elements[:4])
+        for element in half.elements:
+            original.delete_observation(element.image_id, element.point2D_idx)
+        original.point3D(point_id).color = np.array([10, 20, 30], dtype=np.uint8)
+        original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
+    seed, graph = seeded(original)
+    structure = colored(triangulate(seed, graph), original)
+    assert structure.num_points3D() == 120
+    for point in structure.points3D.values():
+        # means 15, 20 and 31.5; a half is rounded to even
+        np.testing.assert_array_equal(point.color, [15, 20, 32])
 
 
 def test_colours_come_only_from_images_with_the_same_keypoints():
@@ -383,6 +418,20 @@ def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offs
     point = filtered(seed).points3D[point_id]
     assert point.track.length() == length
     assert point.error == pytest.approx(offset_px / 4 if length == 4 else 0.0, abs=1e-6)
+
+
+def test_point_errors_are_those_of_the_observations_that_are_left():
+    original, _ = ring_model(noise_px=2.0)
+    loose = triangulate(*seeded(original), StructureOptions(max_reprojection_error_px=8.0))
+    for point in loose.points3D.values():
+        point.xyz, point.error = point.xyz + 0.003, 77.0
+    kept = filtered(loose, StructureOptions(max_reprojection_error_px=3.0))
+    assert 0 < kept.compute_num_observations() < loose.compute_num_observations()
+    lengths = [point.track.length() for point in kept.points3D.values()]
+    errors_px = np.split(reprojection_errors_px(kept), np.cumsum(lengths)[:-1])
+    # the same sums in another order: roundings of some pixels
+    mean_px = [error_px.mean() for error_px in errors_px]
+    np.testing.assert_allclose([p.error for p in kept.points3D.values()], mean_px, rtol=1e-12)
 
 
 def test_tracks_shorter_than_asked_for_are_removed():

@@ -98,8 +98,8 @@ def test_points_keep_the_inputs_colours():
 
 
 def test_relative_poses_serve_when_asked_for(tmp_path):
-    from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
-    from sfm_shapefit.synthetic import SceneOptions, make_scene
+    from sfm_shapefit.colmap.workspace import write_workspace
+    from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 
     scene = make_scene(SceneOptions(shape="ring", num_images=8, num_points=1500, seed=3))
     write_workspace(scene, tmp_path / "ring", WorkspaceOptions(relative_poses=True))

@@ -13,13 +13,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit.colmap.workspace import WorkspaceOptions, write_workspace
+from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import (
     GraphProblem,
     Scene,
     SceneOptions,
+    WorkspaceOptions,
     box_graph_problem,
     community_graph_problem,
     make_scene,
@@ -397,6 +398,11 @@ def test_a_rotations_model_has_all_centres_at_the_origin_no_points_and_the_truth
         np.testing.assert_allclose(exact.rotation.matrix(), scene.rotations[index], atol=1e-14)
         center = truth.images[index + 1].projection_center()
         np.testing.assert_allclose(center, scene.centers[index], atol=1e-12)
+
+
+def test_a_workspace_without_points_and_without_matches_is_refused_by_both_fields():
+    with pytest.raises(ValueError, match=r"WorkspaceOptions\.model .* WorkspaceOptions\.database"):
+        WorkspaceOptions(model="rotations", database=False)
 
 
 def test_a_perturbed_full_model_keeps_centres_and_points_and_has_the_truth_beside_it(tmp_path):

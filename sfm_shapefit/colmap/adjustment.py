@@ -100,8 +100,8 @@ def bundle_adjust(
         options: settings; the defaults if None.
 
     Returns:
-        The adjusted model. Colours are lost (see `structure.colored`). The gauge is held by two cameras, so
-        scale and axes stay near the seed's.
+        The adjusted model, with ids and colours of points as from `triangulate`. The gauge is held by two
+        cameras, so scale and axes stay near the seed's.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or the adjustment diverges.

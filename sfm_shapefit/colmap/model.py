@@ -12,6 +12,7 @@ Source of the conventions: https://colmap.github.io/format.html and `colmap/scen
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -24,12 +25,14 @@ from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import normalized
 
+UInt64Array = npt.NDArray[np.uint64]
+
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
 _QUIET = 3  # glog's FATAL
-_NO_POINT = np.uint64(2**64 - 1)
+_POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalised coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
 
@@ -57,12 +60,14 @@ class PosedModel:
         return len(self.image_ids)
 
 
-def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
+def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool = False) -> PosedModel:
     """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
             3.12 on, rigs and frames; or a reconstruction, which is not modified.
+        poses_only: the poses are read to be compared, and no camera will be moved: rigs with several
+            sensors are accepted.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
@@ -78,7 +83,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     try:
         with quiet_pycolmap():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
-            return _posed_model(label, reconstruction)
+            return _posed_model(label, reconstruction, accept_rigs=poses_only)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
@@ -118,8 +123,9 @@ def track_matches(
         InputError: if an observed point of an image is not finite.
     """
     tracks = _Observations.of(model)
-    num_matches = np.zeros(model.num_images)
-    np.add.at(num_matches, tracks.images, tracks.num_following())
+    num_matches = np.asarray(
+        np.bincount(tracks.images, tracks.num_following(), model.num_images), dtype=np.float64
+    )
     for first, last in _batches(num_matches, max_matches_per_batch):
         batch = _track_batch(
             tracks, first, last, num_images=model.num_images, min_matches=max(min_matches, 1)
@@ -187,15 +193,14 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
         raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
 
 
-def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedModel:
+def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_rigs: bool) -> PosedModel:
     """Collect the posed images of a reconstruction."""
     image_ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
     if len(image_ids) < 2:
-        raise InputError(
-            f"{label} has {len(image_ids)} images with a pose, but two or more are needed; register more"
-        )
+        few = "only one image" if image_ids else "no image"
+        raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
     images = [reconstruction.image(i) for i in image_ids]
-    for image in images:
+    for image in [] if accept_rigs else images:
         _refuse_rig(label, image, reconstruction.frame(image.frame_id))
     names = tuple(image.name for image in images)
     if len(set(names)) < len(names):
@@ -273,6 +278,17 @@ def points2d_xy(image: pycolmap.Image) -> FloatArray:
     return np.asarray(_IDENTITY_CAMERA.cam_from_img(image.points2D), dtype=np.float64).reshape(-1, 2)
 
 
+def observed_points(image: pycolmap.Image) -> tuple[IntArray, UInt64Array]:
+    """Return the indices, ascending, of the points2D that observe a 3D point, and the ids of those points.
+
+    pycolmap has no array of the ids. Only the observed points become Python objects, one attribute each;
+    most points of an image usually observe nothing.
+    """
+    keypoints = np.array(image.get_observation_point2D_idxs(), dtype=np.int64)
+    points = image.get_observation_points2D()
+    return keypoints, np.fromiter(map(_POINT3D_ID, points), dtype=np.uint64, count=len(keypoints))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Observations:
     """All unambiguous observations of 3D points by posed images, sorted by point, then by image."""
@@ -285,6 +301,10 @@ class _Observations:
     """(O, 3) unit rays in world axes."""
     track_ends: IntArray
     """(O,) position after the last observation of the same 3D point."""
+    by_image: IntArray
+    """(O,) positions of the observations, image by image."""
+    image_starts: IntArray
+    """(n + 1,) the observations of image i are by_image[image_starts[i]:image_starts[i + 1]]."""
 
     @classmethod
     def of(cls, model: PosedModel) -> "_Observations":
@@ -292,18 +312,21 @@ class _Observations:
         parts = [_image_observations(model, image) for image in range(model.num_images)]
         images = np.repeat(np.arange(model.num_images), [len(ids) for ids, _, _ in parts])
         ids, keypoints, rays = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.lexsort((keypoints, images, ids))
+        order = np.argsort(ids, kind="stable")  # keeps images, and keypoints in an image, ascending
         ids, images, keypoints, rays = ids[order], images[order], keypoints[order], rays[order]
 
         same_as_next = (ids[1:] == ids[:-1]) & (images[1:] == images[:-1])
         ambiguous = np.append(same_as_next, False) | np.insert(same_as_next, 0, False)
         keep = ~ambiguous & np.isfinite(rays).all(axis=1)
-        ids = ids[keep]
+        ids, images = ids[keep], images[keep]
+        _, track_sizes = np.unique(ids, return_counts=True)
         return cls(
-            images=images[keep],
+            images=images,
             keypoints=keypoints[keep],
             rays=rays[keep],
-            track_ends=np.searchsorted(ids, ids, side="right").astype(np.int64),
+            track_ends=np.repeat(np.cumsum(track_sizes), track_sizes),
+            by_image=np.argsort(images, kind="stable"),
+            image_starts=np.append(0, np.cumsum(np.bincount(images, minlength=model.num_images))),
         )
 
     def num_following(self) -> IntArray:
@@ -311,15 +334,14 @@ class _Observations:
         return self.track_ends - np.arange(len(self.track_ends)) - 1
 
 
-def _image_observations(model: PosedModel, index: int) -> tuple[npt.NDArray[np.uint64], IntArray, FloatArray]:
+def _image_observations(model: PosedModel, index: int) -> tuple[UInt64Array, IntArray, FloatArray]:
     """Return point ids, keypoint indices and rays of the observed points of one image."""
     image = model.reconstruction.image(int(model.image_ids[index]))
-    ids = np.array([point.point3D_id for point in image.points2D], dtype=np.uint64)
-    keypoints = np.flatnonzero(ids != _NO_POINT)
+    keypoints, ids = observed_points(image)
     xy = points2d_xy(image)[keypoints]
     if not np.isfinite(xy).all():
         raise InputError(f"image {image.name} has a point whose coordinates are not finite")
-    return ids[keypoints], keypoints, world_rays(model, index, xy)
+    return ids, keypoints, world_rays(model, index, xy)
 
 
 def _batches(sizes: FloatArray, limit: int) -> Iterator[tuple[int, int]]:
@@ -338,7 +360,7 @@ def _track_batch(
     tracks: _Observations, first: int, last: int, *, num_images: int, min_matches: int
 ) -> MatchBatch:
     """Return the matches of all pairs (i, j > i) with first <= i < last that have enough of them."""
-    own = np.flatnonzero((tracks.images >= first) & (tracks.images < last))
+    own = tracks.by_image[tracks.image_starts[first] : tracks.image_starts[last]]
     follows = tracks.num_following()[own]
     left = np.repeat(own, follows)
     right = left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)

@@ -25,7 +25,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.matches import MatchBatch
-from sfm_shapefit.colmap.model import points2d_xy
+from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
 from sfm_shapefit.colmap.seed import without_points
 from sfm_shapefit.errors import InputError
 
@@ -33,6 +33,7 @@ TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
 
 _RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
+_IMAGES_OF_A_CHECKED_TRACK = 3
 _CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
 
 
@@ -48,7 +49,8 @@ class StructureOptions:
     """Points seen in fewer images than this are removed; 2 or more."""
     ignore_two_view_tracks: bool = True
     """Leave out matches that only two images share: a wrong one is not noticed, since one epipolar
-    constraint is all that checks it. Concerns matches of a database, not a model's own tracks."""
+    constraint is all that checks it. Concerns matches of a database, not a model's own tracks, and only
+    models of three images or more: two have no other matches."""
 
     def __post_init__(self) -> None:
         if not 0.0 < self.max_reprojection_error_px < math.inf:
@@ -108,7 +110,8 @@ def triangulate(
         options: filters; the defaults if None.
 
     Returns:
-        A new reconstruction with errors of points updated and colours black (see `colored`).
+        A new reconstruction with errors of points updated. Points from another model's tracks have that
+        model's ids and colours; points from matches are black (see `colored`).
 
     Raises:
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
@@ -119,7 +122,8 @@ def triangulate(
         _triangulate_matches(structure, tracks, options)
     else:
         _triangulate_tracks(structure, tracks, options)
-    return filtered(structure, options)
+    _filter(structure, options)
+    return structure
 
 
 def filtered(
@@ -131,12 +135,8 @@ def filtered(
     observation; points without triangulation angle (the angle of a point that is not finite is NaN, which
     is none); short tracks.
     """
-    options = options or StructureOptions()
     result = pycolmap.Reconstruction(reconstruction)
-    manager = pycolmap.ObservationManager(result)
-    manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
-    manager.filter_points3D_with_short_tracks(options.min_track_length)
-    result.update_point_3d_errors()
+    _filter(result, options or StructureOptions())
     return result
 
 
@@ -146,21 +146,21 @@ def colored(
     """Return a copy whose points take the mean colour of the source's points seen at the same points2D.
 
     Images take part if their points2D are the same in both, in number and coordinates. Points without
-    any common observation keep their colour.
+    any common observation keep their colour. A source without any colour costs no copy: the
+    `reconstruction` itself is returned.
     """
+    if not any(point.color.any() for point in source.points3D.values()):
+        return reconstruction
     result = pycolmap.Reconstruction(reconstruction)
-    ours, theirs = _Observations.of(result), _Observations.of(source)
-    same = [i for i in np.unique(ours.image_ids).tolist() if _has_same_keypoints(result, source, i)]
-    left, right = _common_observations(ours, theirs, same)
-    source_colors = np.array([point.color for point in source.points3D.values()], dtype=np.float64)
-    num_points = result.num_points3D()
-    counts = np.bincount(ours.points[left], minlength=num_points)
-    sums = np.zeros((num_points, 3))
-    np.add.at(sums, ours.points[left], source_colors.reshape(-1, 3)[theirs.points[right]])
-    means = np.rint(sums / np.maximum(counts, 1)[:, None]).astype(np.uint8)
-    for row, point in enumerate(result.points3D.values()):
-        if counts[row]:
-            point.color = means[row]
+    ours, theirs = _common_observations(result, source)
+    source_ids, source_rows = np.unique(theirs, return_inverse=True)
+    source_colors = [source.point3D(i).color for i in source_ids.tolist()]
+    colors = np.array(source_colors, dtype=np.float64).reshape(-1, 3)
+    our_ids, our_rows, counts = np.unique(ours, return_inverse=True, return_counts=True)
+    sums = [np.bincount(our_rows, colors[source_rows, channel]) for channel in range(3)]
+    means = np.rint(np.stack(sums, axis=1) / counts[:, None]).astype(np.uint8)
+    for point_id, mean in zip(our_ids.tolist(), means, strict=True):
+        result.point3D(point_id).color = mean
     return result
 
 
@@ -175,6 +175,13 @@ def _two_view_geometry(matches: IntArray) -> pycolmap.TwoViewGeometry:
     return geometry
 
 
+def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
+    """Do to our own `structure` what `filtered` does to a copy; the filter updates the errors of points."""
+    manager = pycolmap.ObservationManager(structure)
+    manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
+    manager.filter_points3D_with_short_tracks(options.min_track_length)
+
+
 def _triangulate_matches(
     structure: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph, options: StructureOptions
 ) -> None:
@@ -182,7 +189,8 @@ def _triangulate_matches(
     error_px = options.max_reprojection_error_px
     settings = pycolmap.IncrementalTriangulatorOptions()
     settings.random_seed = _RANDOM_SEED
-    settings.ignore_two_view_tracks = options.ignore_two_view_tracks
+    has_third_view = structure.num_reg_images() >= _IMAGES_OF_A_CHECKED_TRACK
+    settings.ignore_two_view_tracks = options.ignore_two_view_tracks and has_third_view
     settings.min_angle = options.min_triangulation_angle_deg
     settings.complete_max_reproj_error = error_px
     settings.merge_max_reproj_error = error_px
@@ -205,69 +213,85 @@ def _triangulate_tracks(
     settings.ransac.max_error = options.max_reprojection_error_px
     settings.ransac.random_seed = _RANDOM_SEED
     registered = sorted(structure.reg_image_ids())
-    images = {i: structure.image(i) for i in registered}
-    poses = {i: image.cam_from_world() for i, image in images.items()}
-    cameras = {i: structure.camera(image.camera_id) for i, image in images.items()}
-    for image_id in registered:
-        if structure.image(image_id).num_points2D() != source.image(image_id).num_points2D():
-            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
-
-    for point_id, point in sorted(source.points3D.items()):
-        seen = [(e.image_id, e.point2D_idx) for e in point.track.elements if e.image_id in images]
-        if len(seen) < options.min_track_length:
-            continue
-        xy = np.array([images[i].point2D(k).xy for i, k in seen])
+    poses = [structure.image(i).cam_from_world() for i in registered]
+    cameras = [structure.camera(structure.image(i).camera_id) for i in registered]
+    observations = _Observations.of(structure, source, registered)
+    for first, last in zip(*observations.tracks_of(options.min_track_length), strict=True):
+        images = observations.images[first:last].tolist()
         found = pycolmap.estimate_triangulation(
-            xy, [poses[i] for i, _ in seen], [cameras[i] for i, _ in seen], settings
+            observations.xy[first:last], [poses[i] for i in images], [cameras[i] for i in images], settings
         )
         if found is not None:
-            track = [e for e, inlier in zip(seen, found["inliers"], strict=True) if inlier]
-            structure.add_point3D_with_id(point_id, _point(found["xyz"], track))
+            seen = zip(images, observations.keypoints[first:last].tolist(), found["inliers"], strict=True)
+            track = [pycolmap.TrackElement(registered[i], k) for i, k, inlier in seen if inlier]
+            point_id = int(observations.points[first])
+            color = source.point3D(point_id).color
+            point = pycolmap.Point3D(xyz=found["xyz"], color=color, track=pycolmap.Track(track))
+            structure.add_point3D_with_id(point_id, point)
 
 
-def _point(xyz: FloatArray, track: list[tuple[int, int]]) -> pycolmap.Point3D:
-    """Return a point (3,) with the track [(image_id, point2D index), ...]."""
-    elements = [pycolmap.TrackElement(image_id, index) for image_id, index in track]
-    return pycolmap.Point3D(xyz=xyz, track=pycolmap.Track(elements))
+@dataclass(frozen=True, slots=True, eq=False)
+class _Observations:
+    """What the registered images of one model see of another's 3D points, sorted by point, then by image."""
+
+    points: UInt64Array
+    """(O,) id of the 3D point."""
+    images: IntArray
+    """(O,) position of the image in the list of registered ones."""
+    keypoints: IntArray
+    """(O,) index into the image's points2D."""
+    xy: FloatArray
+    """(O, 2) pixels of that point."""
+
+    @classmethod
+    def of(
+        cls, structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, image_ids: list[int]
+    ) -> "_Observations":
+        """Collect the observations of the `source`, and their pixels in the `structure`."""
+        points, keypoints, xy = [], [], []
+        for image_id in image_ids:
+            image = structure.image(image_id)
+            if image.num_points2D() != source.image(image_id).num_points2D():
+                raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
+            seen, ids = observed_points(source.image(image_id))
+            points.append(ids)
+            keypoints.append(seen)
+            xy.append(points2d_xy(image)[seen])
+        images = np.repeat(np.arange(len(image_ids)), [len(seen) for seen in keypoints])
+        order = np.argsort(np.concatenate(points), kind="stable")
+        return cls(
+            points=np.concatenate(points)[order],
+            images=images[order],
+            keypoints=np.concatenate(keypoints)[order],
+            xy=np.concatenate(xy)[order],
+        )
+
+    def tracks_of(self, min_length: int) -> tuple[list[int], list[int]]:
+        """Return where each track of at least `min_length` observations starts, and where it ends."""
+        _, firsts, lengths = np.unique(self.points, return_index=True, return_counts=True)
+        firsts, lengths = firsts[lengths >= min_length], lengths[lengths >= min_length]
+        return firsts.tolist(), (firsts + lengths).tolist()
 
 
 # --- colours ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Observations:
-    """All track elements of a reconstruction, in the order of its points."""
-
-    points: IntArray
-    """(O,) row of the point in the reconstruction's points3D."""
-    image_ids: IntArray
-    """(O,)"""
-    keypoints: IntArray
-    """(O,) index into the image's points2D."""
-
-    @classmethod
-    def of(cls, reconstruction: pycolmap.Reconstruction) -> "_Observations":
-        """Collect the track elements."""
-        rows = [
-            (row, element.image_id, element.point2D_idx)
-            for row, point in enumerate(reconstruction.points3D.values())
-            for element in point.track.elements
-        ]
-        table = np.array(rows, dtype=np.int64).reshape(-1, 3)
-        return cls(points=table[:, 0], image_ids=table[:, 1], keypoints=table[:, 2])
-
-    def keys(self) -> IntArray:
-        """Return one integer per observation, unique within a reconstruction."""
-        return (self.image_ids << 32) | self.keypoints
-
-
 def _common_observations(
-    ours: _Observations, theirs: _Observations, image_ids: list[int]
-) -> tuple[IntArray, IntArray]:
-    """Return the positions of the observations that both have, restricted to the given images."""
-    _, left, right = np.intersect1d(ours.keys(), theirs.keys(), return_indices=True)
-    keep = np.isin(ours.image_ids[left], image_ids)
-    return left[keep], right[keep]
+    result: pycolmap.Reconstruction, source: pycolmap.Reconstruction
+) -> tuple[UInt64Array, UInt64Array]:
+    """Return the ids of the two points that each points2D observes, where it observes one in both models."""
+    ours, theirs = [np.empty(0, dtype=np.uint64)], [np.empty(0, dtype=np.uint64)]
+    for image_id in sorted(result.reg_image_ids()):
+        if not _has_same_keypoints(result, source, image_id):
+            continue
+        our_keypoints, our_ids = observed_points(result.image(image_id))
+        their_keypoints, their_ids = observed_points(source.image(image_id))
+        _, left, right = np.intersect1d(
+            our_keypoints, their_keypoints, assume_unique=True, return_indices=True
+        )
+        ours.append(our_ids[left])
+        theirs.append(their_ids[right])
+    return np.concatenate(ours), np.concatenate(theirs)
 
 
 def _has_same_keypoints(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, image_id: int) -> bool:

@@ -11,40 +11,17 @@ which would leave companions beside the file for every reader, so it is switched
 
 import contextlib
 import sqlite3
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.output import atomic_folder
-from sfm_shapefit.synthetic import Scene
-
-ModelContent = Literal["full", "rotations"]
+from sfm_shapefit.synthetic import Scene, WorkspaceOptions
 
 _CAMERA_ID = 1
 _CALIBRATED = 2  # COLMAP's TwoViewGeometry::ConfigurationType
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class WorkspaceOptions:
-    """What stands in the workspace. Every field is a flag of `sfm-shapefit synth`."""
-
-    model: ModelContent = "full"
-    """What sparse/0 states: "full" is poses and points with their tracks; "rotations" keeps the rotations
-    only, as from an inertial sensor: all centres at the origin, no points."""
-    database: bool = True
-    """Write database.db; without it the model's own tracks are the only source of directions."""
-    relative_poses: bool = False
-    """Store cam2_from_cam1 in the two-view geometries; COLMAP leaves it out by default."""
-
-    def __post_init__(self) -> None:
-        if self.model not in get_args(ModelContent):
-            raise ValueError(
-                f"WorkspaceOptions.model must be one of {get_args(ModelContent)}, got {self.model!r}"
-            )
 
 
 def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:

@@ -1,19 +1,42 @@
-"""Synthetic input whose truth is known: photographed scenes, and bare graphs of directions."""
+"""Synthetic input whose truth is known: photographed scenes, and bare graphs of directions.
 
-from sfm_shapefit.synthetic.graphs import (
-    GraphProblem,
-    box_graph_problem,
-    community_graph_problem,
-    expander_graph_problem,
-    random_graph_problem,
-    trajectory_graph_problem,
-)
-from sfm_shapefit.synthetic.scenes import Scene, SceneOptions, make_scene, project_points
+Names are imported when they are first used: the options are cheap, and what makes scenes needs scipy.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sfm_shapefit.synthetic.graphs import (
+        GraphProblem,
+        box_graph_problem,
+        community_graph_problem,
+        expander_graph_problem,
+        random_graph_problem,
+        trajectory_graph_problem,
+    )
+    from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
+    from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
+
+_HOMES = {
+    "graphs": (
+        "GraphProblem",
+        "box_graph_problem",
+        "community_graph_problem",
+        "expander_graph_problem",
+        "random_graph_problem",
+        "trajectory_graph_problem",
+    ),
+    "options": ("SceneOptions", "WorkspaceOptions"),
+    "scenes": ("Scene", "make_scene", "project_points"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
     "GraphProblem",
     "Scene",
     "SceneOptions",
+    "WorkspaceOptions",
     "box_graph_problem",
     "community_graph_problem",
     "expander_graph_problem",
@@ -22,3 +45,13 @@ __all__ = [
     "random_graph_problem",
     "trajectory_graph_problem",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _HOME_OF:
+        return getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_HOME_OF})
