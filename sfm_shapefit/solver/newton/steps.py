@@ -86,6 +86,8 @@ class Step(NamedTuple):
     """(m, d - 1) scratch."""
     ratios: FloatArray
     """(m,) scratch."""
+    rho: FloatArray
+    """(m,) at the point where the step begins."""
 
 
 class Progress(NamedTuple):
@@ -129,7 +131,7 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
     model = Model(graph.weights[:, None, None] * np.eye(d - 1), np.ones(m), nodes())
-    step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m))
+    step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
     return problem, Iterate(nodes(), edges(), edges()), model, step
 
 
@@ -236,11 +238,12 @@ def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -
         rr = mu * mu
         for k in range(len(problem.transverse)):
             rr += r[e, k] * r[e, k]
-        step.ratios[e] = 1.0 - np.sqrt(rr) * model.inverse[e]
+        step.rho[e] = np.sqrt(rr)
     for e in range(len(problem.w)):
-        pull = problem.w[e] * model.inverse[e]
+        inverse = model.inverse[e]
+        keep, pull = 1.0 - step.rho[e] * inverse, problem.w[e] * inverse
         for k in range(len(problem.transverse)):
-            step.y[e, k] = step.ratios[e] * y[e, k] + pull * r[e, k]
+            step.y[e, k] = keep * y[e, k] + pull * r[e, k]
     sum_at_nodes(problem, step)
 
 
@@ -317,15 +320,13 @@ def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> 
     r, dr = iterate.r, step.r
     total = 0.0
     for e in range(len(problem.w)):
-        rr = rd = dd = 0.0
+        rd = dd = 0.0
         for k in range(len(problem.transverse)):
-            rr += r[e, k] * r[e, k]
             rd += r[e, k] * dr[e, k]
             dd += dr[e, k] * dr[e, k]
         change = alpha * (2.0 * rd + alpha * dd)
-        now = rr + mu * mu
-        then = max(now + change, mu * mu)
-        total += problem.w[e] * change / (np.sqrt(now) + np.sqrt(then))
+        then = max(step.rho[e] * step.rho[e] + change, mu * mu)
+        total += problem.w[e] * change / (step.rho[e] + np.sqrt(then))
     return total
 
 
