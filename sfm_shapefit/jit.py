@@ -10,9 +10,9 @@ useless (numba then refuses to cache it). `call_address` takes the address as an
 Determinism: a kernel that calls another one contains its own copy of it, compiled in its own context. Which
 copy runs depends on what was compiled, and what loaded from the cache, in this process. Under fastmath the
 copies may round differently. So a kernel that calls, or is called by, another one and whose sums matter is
-either `exact=True` (then all copies agree to the last bit), or `inline=True` (then the calling kernel is one piece of
-code, whatever else was compiled), or compiled apart and called by its address (`leaf_address`: there is only
-one copy).
+either `exact=True` (then all copies agree to the last bit), or `inline=True` (then its caller is one piece
+of code, whatever else was compiled), or compiled apart and called by its address (`leaf_address`: there is
+only one copy).
 """
 
 from collections.abc import Callable

@@ -52,8 +52,8 @@ class DenseFactor(NamedTuple):
     """(nd * nd,) lower triangle in column-major order."""
     diagonal: FloatArray
     """(n, d, d) scratch: the diagonal blocks of M."""
-    block: FloatArray
-    """(d, d) scratch."""
+    half: FloatArray
+    """(d, d - 1) scratch."""
     translations: FloatArray
     """(d, n * d), 1 / n on the coordinates of each axis."""
     routines: IntArray
@@ -82,7 +82,9 @@ def solve_newton_dense(
     n, d = problem.c.shape
     lapack = routine_addresses(np.float64), FLAGS, work_integers()
     translations = np.tile(np.eye(d) / n, n)
-    factor = DenseFactor(np.empty((n * d) ** 2), np.empty((n, d, d)), np.empty((d, d)), translations, *lapack)
+    factor = DenseFactor(
+        np.empty((n * d) ** 2), np.empty((n, d, d)), np.empty((d, d - 1)), translations, *lapack
+    )
     with one_blas_thread():
         if not _start(problem, iterate, model, factor):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
@@ -188,7 +190,9 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
         column = factor.matrix[q * order : (q + 1) * order]
         translation = factor.translations[q % len(problem.axes)]
         slope = along_c * c[q]
-        first = max(0, order - (order - q + _LANES - 1) // _LANES * _LANES)  # whole vectors; the rest is not read
+        first = max(
+            0, order - (order - q + _LANES - 1) // _LANES * _LANES
+        )  # whole vectors; the rest is not read
         for p in range(first, order):
             column[p] = slope * c[p] + size * translation[p]
         column[q] += ridge
@@ -198,7 +202,7 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
 def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
     """Add D^T S D to the lower triangle of the matrix."""
     edges, basis, s = problem.edges, problem.basis, model.s
-    matrix, diagonal, block = factor.matrix, factor.diagonal, factor.block
+    matrix, diagonal, half = factor.matrix, factor.diagonal, factor.half
     n, d = len(problem.c), len(problem.axes)
     order = n * d
     diagonal[:] = 0.0
@@ -206,22 +210,25 @@ def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
         i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
         corner = min(i, j) * d * order + max(i, j) * d
         for k in range(d):
-            for q in range(d):
+            for g in range(len(problem.transverse)):
                 x = 0.0
                 for f in range(len(problem.transverse)):
-                    for g in range(len(problem.transverse)):
-                        x += basis[e, k, f] * s[e, f, g] * basis[e, q, g]
-                block[k, q] = x
-        for k in range(d):
-            for q in range(d):
-                matrix[corner + k * order + q] -= block[k, q]
-                if k <= q:
-                    diagonal[i, k, q] += block[k, q]
-                    diagonal[j, k, q] += block[k, q]
-    for i in range(n):
+                    x += basis[e, k, f] * s[e, f, g]
+                half[k, g] = x
         for k in range(d):
             for q in range(k, d):
-                matrix[(i * d + k) * order + i * d + q] += diagonal[i, k, q]
+                x = 0.0
+                for g in range(len(problem.transverse)):
+                    x += half[k, g] * basis[e, q, g]
+                matrix[corner + k * order + q] -= x
+                if k < q:
+                    matrix[corner + q * order + k] -= x
+                diagonal[i, k, q] += x
+                diagonal[j, k, q] += x
+    for node in range(n):
+        for k in range(d):
+            for q in range(k, d):
+                matrix[(node * d + k) * order + node * d + q] += diagonal[node, k, q]
 
 
 @kernel(inline=True)

@@ -125,7 +125,8 @@ def _cycle(
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
-    longest = int(np.argmax(along(differences(iterate.t, problem.edges), problem.v)))
+    ends = problem.edges.astype(np.int64)
+    longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
         return progress

@@ -2,7 +2,8 @@
 
 The formulas stand in the docstring of `sfm_shapefit.solver.newton`. Residuals and dual are kept in d - 1
 coordinates across v_e: with an orthonormal basis B_e of these, r_e = B_e^T (t_i - t_j), and B_e y_e is the
-dual of the program. All kernels are `inline`: results must not depend on which copy runs (`sfm_shapefit.jit`).
+dual of the program. All kernels are `inline`: results must not depend on which copy runs
+(`sfm_shapefit.jit`).
 """
 
 from typing import Any, NamedTuple
@@ -22,10 +23,13 @@ STEPS_PER_FACTOR = 10
 _LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
 REFINEMENTS = 3
 STALL = 6  # factorisations without progress after which more will not help
-EDGE_WORK = 1500.0  # a step passes over one edge in the time of so many operations of a factorisation
-SOLVE_WORK = 20.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
+EDGE_WORK = 500.0  # a step passes over one edge in the time of so many operations of a factorisation
+SOLVE_WORK = 5.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
 
-_EQUALITY_PER_GAP, _LEAST_EQUALITY = 1e-5, 1e-13  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
+_EQUALITY_PER_GAP, _LEAST_EQUALITY = (
+    1e-5,
+    1e-13,
+)  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _HALVINGS = 20
@@ -145,7 +149,7 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
 
 @kernel()
 def set_basis(v: Any, basis: Any) -> None:
-    """Write the basis B_e of the space across v_e: the other columns of the reflection that maps v_e to an axis."""
+    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column."""
     for e in range(len(v)):
         sign = 1.0 if v[e, 0] >= 0.0 else -1.0
         inverse = 1.0 / (1.0 + abs(v[e, 0]))
@@ -207,7 +211,7 @@ def pays(first: float, previous: float, gap: float, work: float, step_work: floa
 @kernel(inline=True)
 def allowed_violation(problem: Any, gap: float) -> float:
     """Return how far D^T y+ may be from lambda+ c at a camera."""
-    return max(_EQUALITY_PER_GAP * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c)
+    return float(max(_EQUALITY_PER_GAP * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c))
 
 
 @kernel(inline=True)
@@ -371,7 +375,7 @@ def largest(x: Any) -> float:
         d = max(d, x[e + 3])
     for e in range(whole, len(x)):
         a = max(a, x[e])
-    return max(max(a, b), max(c, d))
+    return max(a, b, c, d)
 
 
 @kernel(inline=True)
