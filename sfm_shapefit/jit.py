@@ -10,8 +10,9 @@ useless (numba then refuses to cache it). `call_address` takes the address as an
 Determinism: a kernel that calls another one contains its own copy of it, compiled in its own context. Which
 copy runs depends on what was compiled, and what loaded from the cache, in this process. Under fastmath the
 copies may round differently. So a kernel that calls, or is called by, another one and whose sums matter is
-either `exact=True` (then all copies agree to the last bit), or compiled apart and called by its address
-(`leaf_address`: there is only one copy).
+either `exact=True` (then all copies agree to the last bit), or `inline=True` (then its caller is one piece
+of code, whatever else was compiled), or compiled apart and called by its address (`leaf_address`: there is
+only one copy).
 """
 
 from collections.abc import Callable
@@ -35,12 +36,18 @@ carray = numba.carray
 _FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def kernel(*, parallel: bool = False, exact: bool = False) -> Callable[[Kernel], Kernel]:
-    """Compile a function with numba on its first call; the machine code is cached beside the source."""
+def kernel(
+    *, parallel: bool = False, exact: bool = False, inline: bool = False
+) -> Callable[[Kernel], Kernel]:
+    """Compile a function with numba on its first call; the machine code is cached beside the source.
+
+    With `inline` the source is copied into every kernel that calls it, and compiled as a part of it.
+    """
     fastmath: bool | set[str] = False if exact else _FASTMATH
 
     def decorate(function: Kernel) -> Kernel:
         options = {"nogil": True, "error_model": "numpy", "parallel": parallel, "fastmath": fastmath}
+        options["inline"] = "always" if inline else "never"
         try:
             return cast(Kernel, numba.njit(cache=True, **options)(function))
         except RuntimeError:  # neither the package's folder nor the user's can be written: compile every time

@@ -93,11 +93,58 @@ def is_parallel_rigid(num_cameras: int, edges: IntArray, dimension: int) -> bool
 
     A single camera without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
     """
-    label = parallel_rigid_pieces(num_cameras, edges, dimension)
+    checked = _checked_edges(num_cameras, edges, dimension)
+    if len(checked) and _grows_from_first_pair(num_cameras, checked):
+        return True
+    label = parallel_rigid_pieces(num_cameras, checked, dimension)
     if len(label) == 0:
         return num_cameras == 1
     touched = np.unique(np.asarray(edges))
     return bool(label.max() == 0) and len(touched) == num_cameras
+
+
+@kernel()
+def _grows_from_first_pair(num_cameras: int, edges: IntArray) -> bool:
+    """Return whether the first pair grows to all cameras by cameras that are joined to two of its own.
+
+    Sufficient for rigidity, and linear in the pairs: each such camera has 2 (d - 1) >= d new copies of edges.
+    """
+    start, neighbour = _adjacency(num_cameras, edges)
+    links = np.zeros(num_cameras, dtype=np.int64)
+    last = np.full(num_cameras, -1)  # the member that linked last: a pair given twice is one link
+    members = np.empty(num_cameras, dtype=np.int64)
+    members[0], members[1] = edges[0, 0], edges[0, 1]
+    links[members[0]] = links[members[1]] = 2
+    size, done = 2, 0
+    while done < size:
+        camera = members[done]
+        done += 1
+        for p in range(start[camera], start[camera + 1]):
+            other = neighbour[p]
+            links[other] += last[other] != camera
+            if links[other] == 2 and last[other] != camera:
+                members[size] = other
+                size += 1
+            last[other] = camera
+    return bool(size == num_cameras)
+
+
+@kernel()
+def _adjacency(num_cameras: int, edges: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the neighbours of each camera, one camera after the other, and where each begins, (n + 1,)."""
+    start = np.zeros(num_cameras + 2, dtype=np.int64)
+    for e in range(len(edges)):
+        start[edges[e, 0] + 2] += 1
+        start[edges[e, 1] + 2] += 1
+    for camera in range(num_cameras):
+        start[camera + 2] += start[camera + 1]
+    neighbour = np.empty(2 * len(edges), dtype=np.int64)
+    for e in range(len(edges)):
+        for side in range(2):
+            camera = edges[e, side]
+            neighbour[start[camera + 1]] = edges[e, 1 - side]
+            start[camera + 1] += 1
+    return start[:-1], neighbour
 
 
 def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:

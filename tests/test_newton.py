@@ -75,9 +75,10 @@ def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
     assert bound <= objective(graph, reference) + 1e-14
     ours, theirs = normalized_locations(graph, t), normalized_locations(graph, reference)
     diameter = np.linalg.norm(np.ptp(theirs, axis=0))
-    # The reference stops at 1e-12 of the objective; where noise makes the minimum flat, its locations are
-    # off by the root of that, not ours: so little noise here, and the objectives for much noise below.
-    assert np.abs(ours - theirs).max() <= 1e-7 * diameter
+    # Where noise makes the minimum flat, the reference's locations are off by about the root of what its
+    # objective is above our bound, which is up to 1e-12; elsewhere 1e-7 is met.
+    excess = max(objective(graph, reference) - bound, 0.0)
+    assert np.abs(ours - theirs).max() <= max(1e-7, np.sqrt(excess)) * diameter
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0])

@@ -22,7 +22,7 @@ from threadpoolctl import ThreadpoolController
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import array_address, call_address, function_address, kernel
 
-_POTRF, _TRSM, _SYRK, _GEMM, _POTRS = range(5)
+_POTRF, _TRSM, _SYRK, _GEMM, _TRSV = range(5)
 
 FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
 """Character arguments of the Fortran routines, in one array: "L", "R", "T", "N"."""
@@ -55,9 +55,9 @@ def one_blas_thread() -> Iterator[None]:
 
 @lru_cache(maxsize=2)
 def _addresses(letter: str) -> tuple[int, ...]:
-    """Return the addresses of xpotrf, xtrsm, xsyrk, xgemm and xpotrs for x = "s" or "d"."""
+    """Return the addresses of xpotrf, xtrsm, xsyrk, xgemm and xtrsv for x = "s" or "d"."""
     blas, lapack = "scipy.linalg.cython_blas", "scipy.linalg.cython_lapack"
-    routines = ((lapack, "potrf"), (blas, "trsm"), (blas, "syrk"), (blas, "gemm"), (lapack, "potrs"))
+    routines = ((lapack, "potrf"), (blas, "trsm"), (blas, "syrk"), (blas, "gemm"), (blas, "trsv"))
     return tuple(function_address(module, letter + name) for module, name in routines)
 
 
@@ -148,11 +148,14 @@ def syrk(
 
 
 @kernel(exact=True)
-def potrs(routines: Any, flags: Any, integers: Any, a: Any, order: int, b: Any) -> None:
-    """Solve L L^T x = b in place; `a` holds L as one block, b its right-hand sides one after the other."""
+def solve_factored(routines: Any, flags: Any, integers: Any, a: Any, order: int, b: Any) -> None:
+    """Solve L L^T x = b in place for one right-hand side; `a` holds L as one block.
+
+    By xtrsv: xpotrs packs L for blocks of right-hand sides, which for one costs more than the solve.
+    """
     integers[0] = order
-    integers[1] = b.size // order
-    integers[2] = 0
+    integers[1] = 1
     text, ints = array_address(flags), array_address(integers)
     matrix, right = array_address(a), array_address(b)
-    call_address(routines[_POTRS], (text, ints, ints + 4, matrix, ints, right, ints, ints + 8))
+    call_address(routines[_TRSV], (text, text + 3, text + 3, ints, matrix, ints, right, ints + 4))
+    call_address(routines[_TRSV], (text, text + 2, text + 3, ints, matrix, ints, right, ints + 4))

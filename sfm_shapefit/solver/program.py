@@ -17,28 +17,27 @@ Source: Hand, Lee, Voroninski, "ShapeFit: Exact location recovery from corrupted
 directions", 2015 (arXiv 1506.01437), the program called ShapeFit. Weights w_e = 1 there.
 """
 
+from typing import Any
+
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.jit import kernel
 from sfm_shapefit.viewgraph import ViewGraph
 
 
 def differences(t: FloatArray, edges: IntArray) -> FloatArray:
     """Return D T, the baselines t_i - t_j, shape (m, d)."""
-    baselines: FloatArray = t[edges[:, 0]] - t[edges[:, 1]]
+    baselines = np.empty((len(edges), t.shape[1]))
+    _differences(t, edges, baselines)
     return baselines
 
 
 def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
     """Return D^T y, at every node the sum of its incident signed y_e, shape (n, d)."""
-    return np.stack(
-        [
-            np.bincount(edges[:, 0], weights=column, minlength=num_nodes)
-            - np.bincount(edges[:, 1], weights=column, minlength=num_nodes)
-            for column in y.T
-        ],
-        axis=1,
-    )
+    total = np.zeros((num_nodes, y.shape[1]))
+    _add_adjoint(y, edges, total)
+    return total
 
 
 def along(x: FloatArray, v: FloatArray) -> FloatArray:
@@ -52,7 +51,8 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
     Formed explicitly: sqrt(||x||^2 - <x, v>^2) would lose half of the digits.
     """
-    transverse: FloatArray = x - along(x, v)[:, None] * v
+    transverse = np.empty(x.shape)
+    _across(x, v, transverse)
     return transverse
 
 
@@ -63,19 +63,18 @@ def scale_functional(graph: ViewGraph) -> FloatArray:
 
 def residual_sum(graph: ViewGraph, t: FloatArray) -> float:
     """Return R(T), the weighted sum of the transverse residuals, in the units of `t`."""
-    transverse = across(differences(t, graph.edges), graph.directions)
-    return float(graph.weights @ np.linalg.norm(transverse, axis=1))
+    return _sums(t, graph.edges, graph.directions, graph.weights)[0]
 
 
 def projected_length(graph: ViewGraph, t: FloatArray) -> float:
     """Return L(T), the weighted sum of the baselines' lengths along their directions."""
-    return float(graph.weights @ along(differences(t, graph.edges), graph.directions))
+    return _sums(t, graph.edges, graph.directions, graph.weights)[1]
 
 
 def objective(graph: ViewGraph, t: FloatArray) -> float:
     """Return R(T) / L(T), the paper's objective; infinite where L(T) <= 0."""
-    length = projected_length(graph, t)
-    return residual_sum(graph, t) / length if length > 0.0 else float("inf")
+    residual, length = _sums(t, graph.edges, graph.directions, graph.weights)
+    return residual / length if length > 0.0 else float("inf")
 
 
 def normalized_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -83,3 +82,45 @@ def normalized_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
     centred: FloatArray = t - t.mean(axis=0)
     scale = float(graph.weights.sum()) / projected_length(graph, centred)
     return centred * scale
+
+
+@kernel(exact=True)
+def _differences(t: Any, edges: Any, out: Any) -> None:
+    for e in range(len(edges)):
+        for k in range(t.shape[1]):
+            out[e, k] = t[edges[e, 0], k] - t[edges[e, 1], k]
+
+
+@kernel(exact=True)
+def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
+    for e in range(len(edges)):
+        for k in range(y.shape[1]):
+            out[edges[e, 0], k] += y[e, k]
+            out[edges[e, 1], k] -= y[e, k]
+
+
+@kernel(exact=True)
+def _across(x: Any, v: Any, out: Any) -> None:
+    for e in range(len(x)):
+        length = 0.0
+        for k in range(x.shape[1]):
+            length += x[e, k] * v[e, k]
+        for k in range(x.shape[1]):
+            out[e, k] = x[e, k] - length * v[e, k]
+
+
+@kernel(exact=True)
+def _sums(t: Any, edges: Any, v: Any, w: Any) -> tuple[float, float]:
+    """Return R(T) and L(T)."""
+    residual, length = 0.0, 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        projected = 0.0
+        for k in range(t.shape[1]):
+            projected += (t[i, k] - t[j, k]) * v[e, k]
+        square = 0.0
+        for k in range(t.shape[1]):
+            square += (t[i, k] - t[j, k] - projected * v[e, k]) ** 2
+        residual += w[e] * np.sqrt(square)
+        length += w[e] * projected
+    return residual, length

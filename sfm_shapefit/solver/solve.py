@@ -32,6 +32,7 @@ _LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 # Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
 # whatever the graph, and beyond the second the dense one takes seconds.
 _SMALL, _LARGEST_DENSE = 450, 1800
+_DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination saves much
 _LARGEST_NEWTON_FLOPS = 4e9  # of one block factorisation: from here on splitting is faster to the same gap
 
 
@@ -109,10 +110,13 @@ def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
         return Choice("admm", _run_admm, "asked for")
     if unknowns <= _SMALL:
         return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
-    tree = best_order(adjacency(graph.num_cameras, graph.edges))
-    flops = tree.flops * graph.dimension**3
+    dense = Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
+    share = 2.0 * graph.num_edges / (graph.num_cameras * (graph.num_cameras - 1.0))
+    flops = np.inf
+    if unknowns > _LARGEST_DENSE or share < _DENSE_GRAPH:
+        flops = best_order(adjacency(graph.num_cameras, graph.edges)).flops * graph.dimension**3
     if unknowns <= _LARGEST_DENSE and flops > unknowns**3 / 12:
-        return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
+        return dense
     predicted = f"{flops / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops <= _LARGEST_NEWTON_FLOPS:
         return Choice("newton", _run_sparse, "asked for" if asked else predicted)
@@ -155,12 +159,12 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
     """Raise UnsolvableError where the program has no unique answer whatever the directions say."""
     if graph.num_cameras < 2 or graph.num_edges == 0:
         raise UnsolvableError("the graph has no pair of cameras; nothing can be placed")
-    components = int(graph.components().max()) + 1
-    if components > 1:
-        raise UnsolvableError(
-            f"the graph falls into {components} connected components; solve each one separately"
-        )
     if not is_parallel_rigid(graph.num_cameras, graph.edges, graph.dimension):
+        components = int(graph.components().max()) + 1
+        if components > 1:
+            raise UnsolvableError(
+                f"the graph falls into {components} connected components; solve each one separately"
+            )
         raise UnsolvableError(
             "the graph is not parallel rigid, so the directions do not determine the locations; "
             "solve its largest piece (sfm_shapefit.rigidity.rigid_pieces)"

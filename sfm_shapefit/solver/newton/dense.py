@@ -11,8 +11,8 @@ from sfm_shapefit.laplacian.dense import (
     FLAGS,
     one_blas_thread,
     potrf,
-    potrs,
     routine_addresses,
+    solve_factored,
     work_integers,
 )
 from sfm_shapefit.solver.newton.steps import (
@@ -41,6 +41,7 @@ from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.viewgraph import ViewGraph
 
 _RIDGE = 1e-14, 1e-9  # first and last multiple of the identity added to M, per mean eigenvalue
+_LANES = 16  # entries that a vectorised loop takes at once
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
 
@@ -51,6 +52,10 @@ class DenseFactor(NamedTuple):
     """(nd * nd,) lower triangle in column-major order."""
     diagonal: FloatArray
     """(n, d, d) scratch: the diagonal blocks of M."""
+    half: FloatArray
+    """(d, d - 1) scratch."""
+    translations: FloatArray
+    """(d, n * d), 1 / n on the coordinates of each axis."""
     routines: IntArray
     flags: Any
     integers: Any
@@ -76,7 +81,10 @@ def solve_newton_dense(
     problem, iterate, model, step = allocate(graph)
     n, d = problem.c.shape
     lapack = routine_addresses(np.float64), FLAGS, work_integers()
-    factor = DenseFactor(np.empty((n * d) ** 2), np.empty((n, d, d)), *lapack)
+    translations = np.tile(np.eye(d) / n, n)
+    factor = DenseFactor(
+        np.empty((n * d) ** 2), np.empty((n, d, d)), np.empty((d, d - 1)), translations, *lapack
+    )
     with one_blas_thread():
         if not _start(problem, iterate, model, factor):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
@@ -91,10 +99,10 @@ def solve_newton_dense(
             count += done
             if is_cancelled(on_iteration, count, progress):
                 break
-    return *answer(iterate, progress, tol), count
+    return *answer(problem, iterate, progress, tol), count
 
 
-@kernel(exact=True)
+@kernel()
 def _newton(
     problem: Any,
     iterate: Any,
@@ -116,7 +124,7 @@ def _newton(
     return count, stalled, progress
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _cycle(
     problem: Any, iterate: Any, model: Any, factor: Any, step: Any, progress: Any, tol: float
 ) -> Progress:
@@ -124,7 +132,7 @@ def _cycle(
     first, multiplier = progress.gap, progress.multiplier
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
-    linearise(iterate, mu, model)
+    linearise(problem, iterate, mu, model)
     if _factorise(problem, model, factor) != 0:
         return Progress(mu, multiplier, progress.objective, first)
     order = float(problem.c.size)
@@ -144,22 +152,21 @@ def _cycle(
     return Progress(progress.mu, progress.multiplier, progress.objective, progress.gap)
 
 
-@kernel(exact=True)
+@kernel()
 def _start(problem: Any, iterate: Any, model: Any, factor: Any) -> bool:
     """Factor the projected Laplacian D^T W P D, which is M at rho = 1, y = r = 0, and start from it."""
     if _factorise(problem, model, factor) != 0:
         return False
-    started: bool = start_from(problem, model.a, iterate)
-    return started
+    return start_from(problem, model.a, iterate)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _factorise(problem: Any, model: Any, factor: Any) -> int:
     """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if it worked."""
     order = problem.c.size
     size = 0.0  # mean eigenvalue
     for e in range(len(problem.w)):
-        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] / model.rho[e] / order
+        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] * model.inverse[e] / order
     ridge, last = _RIDGE
     info = 1
     while info != 0 and ridge <= last:
@@ -173,52 +180,58 @@ def _factorise(problem: Any, model: Any, factor: Any) -> int:
     return info
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
-    n, d = problem.c.shape
-    order = n * d
+    order = problem.c.size
     c = problem.c.reshape(order)
     along_c = size / dot(problem.c, problem.c)
     for q in range(order):
         column = factor.matrix[q * order : (q + 1) * order]
+        translation = factor.translations[q % len(problem.axes)]
         slope = along_c * c[q]
-        for p in range(q, order):
-            column[p] = slope * c[p]
-        for p in range(q, order, d):
-            column[p] += size / n
+        first = max(
+            0, order - (order - q + _LANES - 1) // _LANES * _LANES
+        )  # whole vectors; the rest is not read
+        for p in range(first, order):
+            column[p] = slope * c[p] + size * translation[p]
         column[q] += ridge
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
     """Add D^T S D to the lower triangle of the matrix."""
-    edges, v, w, y, r = problem.edges, problem.v, problem.w, model.y, model.r
-    matrix, diagonal = factor.matrix, factor.diagonal
+    edges, basis, s = problem.edges, problem.basis, model.s
+    matrix, diagonal, half = factor.matrix, factor.diagonal, factor.half
     n, d = len(problem.c), len(problem.axes)
     order = n * d
     diagonal[:] = 0.0
     for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
+        i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
         corner = min(i, j) * d * order + max(i, j) * d
-        inverse = 1.0 / model.rho[e]
-        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
         for k in range(d):
-            for q in range(d):
-                s = -stiffness * v[e, k] * v[e, q] - bend * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
-                if k == q:
-                    s += stiffness
-                matrix[corner + k * order + q] -= s
-                if k <= q:
-                    diagonal[i, k, q] += s
-                    diagonal[j, k, q] += s
-    for i in range(n):
+            for g in range(len(problem.transverse)):
+                x = 0.0
+                for f in range(len(problem.transverse)):
+                    x += basis[e, k, f] * s[e, f, g]
+                half[k, g] = x
         for k in range(d):
             for q in range(k, d):
-                matrix[(i * d + k) * order + i * d + q] += diagonal[i, k, q]
+                x = 0.0
+                for g in range(len(problem.transverse)):
+                    x += half[k, g] * basis[e, q, g]
+                matrix[corner + k * order + q] -= x
+                if k < q:
+                    matrix[corner + q * order + k] -= x
+                diagonal[i, k, q] += x
+                diagonal[j, k, q] += x
+    for node in range(n):
+        for k in range(d):
+            for q in range(k, d):
+                matrix[(node * d + k) * order + node * d + q] += diagonal[node, k, q]
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _propose(
     problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
@@ -244,7 +257,7 @@ def _propose(
     return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def _solve(factor: Any, nodes: Any) -> None:
     """Replace `nodes` by M^-1 nodes."""
-    potrs(factor.routines, factor.flags, factor.integers, factor.matrix, nodes.size, nodes)
+    solve_factored(factor.routines, factor.flags, factor.integers, factor.matrix, nodes.size, nodes)

@@ -82,8 +82,8 @@ def solve_newton_sparse(
     """
     problem, iterate, model, step = allocate(graph)
     if plan is None:
-        neighbours = adjacency(graph.num_cameras, problem.edges)
-        plan = plan_factorisation(neighbours, problem.edges, best_order(neighbours))
+        neighbours = adjacency(graph.num_cameras, graph.edges)
+        plan = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
     factor = allocate_factor(plan, graph.dimension)
     if start is None:
         system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
@@ -100,7 +100,7 @@ def solve_newton_sparse(
         count += 1
         if is_cancelled(on_iteration, count, progress):
             break
-    return *answer(iterate, progress, tol), count
+    return *answer(problem, iterate, progress, tol), count
 
 
 def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate: Iterate) -> Progress:
@@ -108,7 +108,7 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     centred = locations - locations.mean(axis=0)
     iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
     set_residuals(problem, iterate.t, iterate.r)
-    iterate.y[:] = dual
+    iterate.y[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
     progress = measure(problem, iterate, 1.0, 0.0)
     return progress._replace(multiplier=progress.objective - progress.gap)
 
@@ -147,8 +147,9 @@ def _cycle(
     first, multiplier = progress.gap, progress.multiplier
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
-    linearise(iterate, mu, model)
-    longest = int(np.argmax(along(differences(iterate.t, problem.edges), problem.v)))
+    linearise(problem, iterate, mu, model)
+    ends = problem.edges.astype(np.int64)
+    longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
         return progress
@@ -195,12 +196,12 @@ def _propose(
 
 def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: int) -> System | None:
     """Factor M'; None if it is not positive definite."""
-    m, d = model.y.shape
+    m, d = problem.v.shape
     v = problem.v[pinned]
     blocks = np.empty((m, d, d))
     q = np.zeros_like(problem.c)
     q[problem.edges[pinned, 0]], q[problem.edges[pinned, 1]] = v, -v
-    stiffness = float(np.mean(problem.w / model.rho))
+    stiffness = float(np.mean(problem.w * model.inverse))
     for ridge in _RIDGES:
         _set_blocks(problem, model, ridge, blocks)
         blocks[pinned] += stiffness * np.outer(v, v)
@@ -216,15 +217,16 @@ def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: i
     return None
 
 
-@kernel(exact=True)
+@kernel()
 def _set_blocks(problem: Any, model: Any, ridge: float, blocks: Any) -> None:
     """Write S_e, plus `ridge` times its stiffness times the identity."""
-    v, w, y, r = problem.v, problem.w, model.y, model.r
-    d = len(problem.axes)
-    for e in range(len(w)):
-        inverse = 1.0 / model.rho[e]
-        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
-        for k in range(d):
-            for q in range(d):
-                s = -stiffness * v[e, k] * v[e, q] - bend * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
-                blocks[e, k, q] = s + stiffness * (1.0 + ridge) if k == q else s
+    basis, s = problem.basis, model.s
+    for e in range(len(problem.w)):
+        stiffness = problem.w[e] * model.inverse[e]
+        for k in range(len(problem.axes)):
+            for q in range(len(problem.axes)):
+                x = ridge * stiffness if k == q else 0.0
+                for f in range(len(problem.transverse)):
+                    for g in range(len(problem.transverse)):
+                        x += basis[e, k, f] * s[e, f, g] * basis[e, q, g]
+                blocks[e, k, q] = x

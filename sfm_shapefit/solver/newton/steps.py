@@ -1,14 +1,17 @@
 """The parts of a Newton cycle that know nothing of the matrix: passes over the edges, in kernels.
 
-The formulas stand in the docstring of `sfm_shapefit.solver.newton`. All kernels are `exact`: they call
-each other, and results must not depend on which copy runs (`sfm_shapefit.jit`).
+The formulas stand in the docstring of `sfm_shapefit.solver.newton`. Residuals and dual are kept in d - 1
+coordinates across v_e: with an orthonormal basis B_e of these, r_e = B_e^T (t_i - t_j), and B_e y_e is the
+dual of the program. All kernels are `inline`: results must not depend on which copy runs
+(`sfm_shapefit.jit`).
 """
 
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
@@ -20,10 +23,13 @@ STEPS_PER_FACTOR = 10
 _LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
 REFINEMENTS = 3
 STALL = 6  # factorisations without progress after which more will not help
-EDGE_WORK = 1500.0  # a step passes over one edge in the time of so many operations of a factorisation
-SOLVE_WORK = 20.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
+EDGE_WORK = 500.0  # a step passes over one edge in the time of so many operations of a factorisation
+SOLVE_WORK = 5.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
 
-_EQUALITY = 1e-5, 1e-13  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
+_EQUALITY_PER_GAP, _LEAST_EQUALITY = (
+    1e-5,
+    1e-13,
+)  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _HALVINGS = 20
@@ -33,13 +39,18 @@ _CANCEL = 1e-12  # size of c, relative to the sum of weights, that is rounding
 class Problem(NamedTuple):
     """The data, as the kernels take them."""
 
-    edges: IntArray
+    edges: npt.NDArray[np.uint32]
+    """(m, 2); unsigned, for an index that cannot be negative costs less."""
     v: FloatArray
+    basis: FloatArray
+    """(m, d, d - 1) orthonormal columns B_e, orthogonal to v_e."""
     w: FloatArray
     c: FloatArray
     kappa: float
     axes: tuple[int, ...]
     """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls the loops over it."""
+    transverse: tuple[int, ...]
+    """(0, ..., d - 2), for loops over the coordinates across v."""
 
 
 class Iterate(NamedTuple):
@@ -48,17 +59,17 @@ class Iterate(NamedTuple):
     t: FloatArray
     """(n, d) locations, <c, T> = kappa."""
     y: FloatArray
-    """(m, d) feasible dual."""
+    """(m, d - 1) feasible dual."""
     r: FloatArray
-    """(m, d) residuals P_e (t_i - t_j)."""
+    """(m, d - 1) residuals B_e^T (t_i - t_j)."""
 
 
 class Model(NamedTuple):
-    """The linearisation: S_e by the y, r, rho it was taken at, and a = M^-1 c."""
+    """The linearisation: S_e, 1 / rho_e, and a = M^-1 c."""
 
-    y: FloatArray
-    r: FloatArray
-    rho: FloatArray
+    s: FloatArray
+    """(m, d - 1, d - 1), B_e^T S_e B_e."""
+    inverse: FloatArray
     """(m,)"""
     a: FloatArray
     """(n, d)"""
@@ -70,11 +81,17 @@ class Step(NamedTuple):
     t: FloatArray
     """(n, d), dT."""
     r: FloatArray
-    """(m, d), P D dT."""
+    """(m, d - 1), B^T D dT."""
     y: FloatArray
-    """(m, d), g and then y+."""
+    """(m, d - 1), g and then y+."""
     nodes: FloatArray
     """(n, d) right-hand side, then solution."""
+    change: FloatArray
+    """(m, d - 1) scratch."""
+    ratios: FloatArray
+    """(m,) scratch."""
+    rho: FloatArray
+    """(m,) at the point where the step begins."""
 
 
 class Progress(NamedTuple):
@@ -101,20 +118,24 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
         return np.empty((n, d))
 
     def edges() -> FloatArray:
-        return np.empty((m, d))
+        return np.empty((m, d - 1))
 
+    basis = np.empty((m, d, d - 1))
+    set_basis(graph.directions, basis)
     problem = Problem(
-        np.ascontiguousarray(graph.edges),
-        np.ascontiguousarray(graph.directions),
-        np.ascontiguousarray(graph.weights),
+        graph.edges.astype(np.uint32),
+        graph.directions,
+        basis,
+        graph.weights,
         scale_functional(graph),
         float(graph.weights.sum()),
         tuple(range(d)),
+        tuple(range(d - 1)),
     )
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-    model = Model(np.zeros((m, d)), np.zeros((m, d)), np.ones(m), nodes())
-    step = Step(nodes(), edges(), edges(), nodes())
+    model = Model(graph.weights[:, None, None] * np.eye(d - 1), np.ones(m), nodes())
+    step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
     return problem, Iterate(nodes(), edges(), edges()), model, step
 
 
@@ -126,216 +147,250 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
     return on_iteration(IterationInfo(iteration, progress.objective, bound)) is False
 
 
-@kernel(exact=True)
+@kernel()
+def set_basis(v: Any, basis: Any) -> None:
+    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column."""
+    for e in range(len(v)):
+        sign = 1.0 if v[e, 0] >= 0.0 else -1.0
+        inverse = 1.0 / (1.0 + abs(v[e, 0]))
+        for q in range(v.shape[1] - 1):
+            basis[e, 0, q] = -sign * v[e, q + 1]
+            for k in range(1, v.shape[1]):
+                basis[e, k, q] = (1.0 if k == q + 1 else 0.0) - inverse * v[e, k] * v[e, q + 1]
+
+
+@kernel(inline=True)
 def start_from(problem: Any, a: Any, iterate: Any) -> bool:
     """Start from the least-squares locations along `a`, whose scaled residuals are a feasible dual."""
     length = dot(problem.c, a)
-    if not length > 0.0:
-        return False
-    iterate.t[:] = (problem.kappa / length) * a
-    set_residuals(problem, iterate.t, iterate.r)
-    worst = 0.0
-    for e in range(len(problem.w)):
-        rr = 0.0
-        for k in range(len(problem.axes)):
-            rr += iterate.r[e, k] ** 2
-        worst = max(worst, np.sqrt(rr))
-    for e in range(len(problem.w)):
-        scale = problem.w[e] / worst if worst > 0.0 else 0.0
-        for k in range(len(problem.axes)):
-            iterate.y[e, k] = scale * iterate.r[e, k]
-    return True
+    if length > 0.0:
+        iterate.t[:] = (problem.kappa / length) * a
+        set_residuals(problem, iterate.t, iterate.r)
+        worst = 0.0
+        for e in range(len(problem.w)):
+            rr = 0.0
+            for k in range(len(problem.transverse)):
+                rr += iterate.r[e, k] ** 2
+            worst = max(worst, np.sqrt(rr))
+        for e in range(len(problem.w)):
+            scale = problem.w[e] / worst if worst > 0.0 else 0.0
+            for k in range(len(problem.transverse)):
+                iterate.y[e, k] = scale * iterate.r[e, k]
+    return bool(length > 0.0)
 
 
-def answer(iterate: Iterate, progress: Progress, tol: float) -> tuple[FloatArray, FloatArray]:
+def answer(
+    problem: Problem, iterate: Iterate, progress: Progress, tol: float
+) -> tuple[FloatArray, FloatArray]:
     """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
     if progress.objective <= tol:
         iterate.y[:] = 0.0
-    return iterate.t, iterate.y
+    return iterate.t, np.einsum("ekq,eq->ek", problem.basis, iterate.y)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def measure(problem: Any, iterate: Any, mu: float, multiplier: float) -> Progress:
     """Return the scalars at the iterate."""
-    objective, bound = objective_and_bound(problem, iterate)
-    return Progress(mu, multiplier, objective, objective - bound)
+    objective = bound = 0.0
+    for e in range(len(problem.w)):
+        rr = yr = 0.0
+        for k in range(len(problem.transverse)):
+            rr += iterate.r[e, k] * iterate.r[e, k]
+            yr += iterate.r[e, k] * iterate.y[e, k]
+        objective += problem.w[e] * np.sqrt(rr)
+        bound += yr
+    return Progress(mu, multiplier, objective / problem.kappa, (objective - bound) / problem.kappa)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def pays(first: float, previous: float, gap: float, work: float, step_work: float) -> bool:
     """Return whether the last step gained at least as much per unit of work as the cycle did on average."""
     return bool(np.log(previous / gap) * work >= np.log(first / gap) * step_work)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def allowed_violation(problem: Any, gap: float) -> float:
     """Return how far D^T y+ may be from lambda+ c at a camera."""
-    per_gap, least = _EQUALITY
-    return float(max(per_gap * gap, least) * problem.kappa / len(problem.c))
+    return float(max(_EQUALITY_PER_GAP * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c))
 
 
-@kernel(exact=True)
-def linearise(iterate: Any, mu: float, model: Any) -> None:
-    """Keep the iterate as the point at which S is taken."""
+@kernel(inline=True)
+def linearise(problem: Any, iterate: Any, mu: float, model: Any) -> None:
+    """Take S at the iterate."""
+    y, r = iterate.y, iterate.r
     floor = max(mu, _LEAST_MU)
-    for e in range(len(iterate.r)):
+    for e in range(len(problem.w)):
         rr = floor * floor
-        for k in range(iterate.r.shape[1]):
-            rr += iterate.r[e, k] ** 2
-            model.y[e, k] = iterate.y[e, k]
-            model.r[e, k] = iterate.r[e, k]
-        model.rho[e] = np.sqrt(rr)
+        for k in range(len(problem.transverse)):
+            rr += r[e, k] * r[e, k]
+        model.inverse[e] = 1.0 / np.sqrt(rr)
+    for e in range(len(problem.w)):
+        inverse = model.inverse[e]
+        for k in range(len(problem.transverse)):
+            for q in range(len(problem.transverse)):
+                bend = 0.5 * inverse * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
+                model.s[e, k, q] = inverse * ((problem.w[e] if k == q else 0.0) - bend)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -> None:
     """Begin a step: dT = 0, y+ = g with g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, nodes = D^T g."""
-    edges, w, y, r, nodes = problem.edges, problem.w, iterate.y, iterate.r, step.nodes
+    y, r = iterate.y, iterate.r
     step.t[:] = 0.0
-    nodes[:] = 0.0
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
+    step.r[:] = 0.0
+    for e in range(len(problem.w)):
         rr = mu * mu
-        for k in range(len(problem.axes)):
-            rr += r[e, k] ** 2
-        inverse = 1.0 / model.rho[e]
-        keep, pull = 1.0 - np.sqrt(rr) * inverse, w[e] * inverse
-        for k in range(len(problem.axes)):
-            x = keep * y[e, k] + pull * r[e, k]
-            step.r[e, k] = 0.0
-            step.y[e, k] = x
-            nodes[i, k] += x
-            nodes[j, k] -= x
+        for k in range(len(problem.transverse)):
+            rr += r[e, k] * r[e, k]
+        step.rho[e] = np.sqrt(rr)
+    for e in range(len(problem.w)):
+        inverse = model.inverse[e]
+        keep, pull = 1.0 - step.rho[e] * inverse, problem.w[e] * inverse
+        for k in range(len(problem.transverse)):
+            step.y[e, k] = keep * y[e, k] + pull * r[e, k]
+    sum_at_nodes(problem, step)
 
 
-@kernel(exact=True)
+@kernel(inline=True)
 def extend_step(problem: Any, model: Any, dt: Any, step: Any) -> None:
     """Add dt to the step: dT += dt, y+_e += S_e P_e (dt_i - dt_j), nodes = D^T y+.
 
     A refinement adds its small dt to the dual that is there: y+ from the whole dT would carry the
     rounding of dT, multiplied by a stiffness of the order 1 / mu.
     """
-    edges, v, w, y, nodes = problem.edges, problem.v, problem.w, step.y, step.nodes
+    change = step.change
     step.t[:] += dt
+    set_residuals(problem, dt, change)
+    for e in range(len(problem.w)):
+        for k in range(len(problem.transverse)):
+            step.r[e, k] += change[e, k]
+    for e in range(len(problem.w)):
+        for k in range(len(problem.transverse)):
+            x = step.y[e, k]
+            for q in range(len(problem.transverse)):
+                x += model.s[e, k, q] * change[e, q]
+            step.y[e, k] = x
+    sum_at_nodes(problem, step)
+
+
+@kernel(inline=True)
+def sum_at_nodes(problem: Any, step: Any) -> None:
+    """nodes = D^T y+."""
+    edges, basis, nodes = problem.edges, problem.basis, step.nodes
     nodes[:] = 0.0
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        s = 0.0
         for k in range(len(problem.axes)):
-            s += (dt[i, k] - dt[j, k]) * v[e, k]
-        yd = rd = 0.0
-        for k in range(len(problem.axes)):
-            x = (dt[i, k] - dt[j, k]) - s * v[e, k]
-            step.r[e, k] += x
-            yd += model.y[e, k] * x
-            rd += model.r[e, k] * x
-        inverse = 1.0 / model.rho[e]
-        stiffness, bend = w[e] * inverse, 0.5 * inverse * inverse
-        yv = 0.0
-        for k in range(len(problem.axes)):
-            x = (dt[i, k] - dt[j, k]) - s * v[e, k]
-            y[e, k] += stiffness * x - bend * (rd * model.y[e, k] + yd * model.r[e, k])
-            yv += y[e, k] * v[e, k]
-        for k in range(len(problem.axes)):
-            y[e, k] -= yv * v[e, k]
-            nodes[i, k] += y[e, k]
-            nodes[j, k] -= y[e, k]
+            x = 0.0
+            for q in range(len(problem.transverse)):
+                x += basis[e, k, q] * step.y[e, q]
+            nodes[i, k] += x
+            nodes[j, k] -= x
 
 
-@kernel(exact=True)
+@kernel(inline=True)
+def set_residuals(problem: Any, t: Any, r: Any) -> None:
+    """r_e = B_e^T (t_i - t_j)."""
+    edges, basis = problem.edges, problem.basis
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        for q in range(len(problem.transverse)):
+            x = 0.0
+            for k in range(len(problem.axes)):
+                x += basis[e, k, q] * (t[i, k] - t[j, k])
+            r[e, q] = x
+
+
+@kernel(inline=True)
 def take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, target: float) -> float:
     """Move along the step as far as it helps; return the new multiplier."""
     alpha = 1.0
-    while alpha > 0.0 and _increase(problem, iterate, step, mu, alpha) > 0.0:
+    while alpha > 0.0 and increase(problem, iterate, step, mu, alpha) > 0.0:
         alpha = 0.5 * alpha if alpha > 0.5**_HALVINGS else 0.0
-    length, excess = _dual_limits(problem, iterate, step)
-    beta = min(1.0, _TO_BOUNDARY * length)
-    partly = multiplier + beta * (target - multiplier)
-    scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0))) if excess > 1.0 else 1.0
-    if excess > 1.0 and scale * target > partly:
-        _move(iterate, step, alpha, 0.0, scale)
-        return scale * target
-    _move(iterate, step, alpha, 1.0 - beta, beta)
-    return partly
+    excess = np.sqrt(largest_dual(problem, step))
+    beta = min(1.0, _TO_BOUNDARY / speed_of_exit(problem, iterate, step)) if excess > 1.0 else 1.0
+    keep, gain, reached = 1.0 - beta, beta, multiplier + beta * (target - multiplier)
+    if excess > 1.0:
+        scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0)))
+        if scale * target > reached:
+            keep, gain, reached = 0.0, scale, scale * target
+    move(problem, iterate, step, alpha, keep, gain)
+    return reached
 
 
-@kernel(exact=True)
-def _increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
+@kernel(inline=True)
+def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
     """Return the change of sum_e w_e rho_e from r to r + alpha dr, without cancellation."""
     r, dr = iterate.r, step.r
     total = 0.0
     for e in range(len(problem.w)):
-        rr = rd = dd = 0.0
-        for k in range(len(problem.axes)):
-            rr += r[e, k] * r[e, k]
+        rd = dd = 0.0
+        for k in range(len(problem.transverse)):
             rd += r[e, k] * dr[e, k]
             dd += dr[e, k] * dr[e, k]
         change = alpha * (2.0 * rd + alpha * dd)
-        now = rr + mu * mu
-        then = max(now + change, mu * mu)
-        total += problem.w[e] * change / (np.sqrt(now) + np.sqrt(then))
+        then = max(step.rho[e] * step.rho[e] + change, mu * mu)
+        total += problem.w[e] * change / (step.rho[e] + np.sqrt(then))
     return total
 
 
-@kernel(exact=True)
-def _dual_limits(problem: Any, iterate: Any, step: Any) -> tuple[float, float]:
-    """Return the longest step from y towards y+ inside the ball, and max_e ||y+_e|| / w_e."""
-    length, excess = np.inf, 0.0
+@kernel(inline=True)
+def largest_dual(problem: Any, step: Any) -> float:
+    """Return max_e ||y+_e||^2 / w_e^2, and leave the ratios in the scratch."""
     for e in range(len(problem.w)):
-        dd = yd = yy = pp = 0.0
-        for k in range(len(problem.axes)):
-            y, target = iterate.y[e, k], step.y[e, k]
-            dd += (target - y) ** 2
-            yd += (target - y) * y
+        pp = 0.0
+        for k in range(len(problem.transverse)):
+            pp += step.y[e, k] * step.y[e, k]
+        step.ratios[e] = pp / (problem.w[e] * problem.w[e])
+    return largest(step.ratios)
+
+
+@kernel(inline=True)
+def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
+    """Return 1 / the longest step from y towards y+ inside the ball, given the ratios of `largest_dual`."""
+    ratios = step.ratios
+    for e in range(len(problem.w)):
+        dd = yd = yy = 0.0
+        for k in range(len(problem.transverse)):
+            y, towards = iterate.y[e, k], step.y[e, k] - iterate.y[e, k]
+            dd += towards * towards
+            yd += towards * y
             yy += y * y
-            pp += target * target
-        ww = problem.w[e] ** 2
-        if pp > ww:
-            excess = max(excess, pp / ww)
-            room = max(ww - yy, 0.0)
-            root = np.sqrt(yd * yd + dd * room)
-            length = min(length, room / (yd + root) if yd > 0.0 else (root - yd) / dd)
-    return length, np.sqrt(excess)
+        room = max(problem.w[e] * problem.w[e] - yy, 0.0)
+        root = np.sqrt(yd * yd + dd * room)
+        speed = (yd + root if yd > 0.0 else dd) / (room if yd > 0.0 else root - yd)
+        ratios[e] = speed if ratios[e] > 1.0 else 0.0
+    return largest(ratios)
 
 
-@kernel(exact=True)
-def _move(iterate: Any, step: Any, alpha: float, keep: float, gain: float) -> None:
+@kernel(inline=True)
+def largest(x: Any) -> float:
+    """Return the largest of non-negative numbers; by four maxima, for one would be a chain of waits."""
+    a = b = c = d = 0.0
+    whole = len(x) // 4 * 4
+    for e in range(0, whole, 4):
+        a = max(a, x[e])
+        b = max(b, x[e + 1])
+        c = max(c, x[e + 2])
+        d = max(d, x[e + 3])
+    for e in range(whole, len(x)):
+        a = max(a, x[e])
+    return max(a, b, c, d)
+
+
+@kernel(inline=True)
+def move(problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float) -> None:
     """T += alpha dT, r += alpha dr, y = keep y + gain y+."""
     iterate.t[:] += alpha * step.t
-    for e in range(len(iterate.r)):
-        for k in range(iterate.r.shape[1]):
+    for e in range(len(problem.w)):
+        for k in range(len(problem.transverse)):
             iterate.r[e, k] += alpha * step.r[e, k]
+    for e in range(len(problem.w)):
+        for k in range(len(problem.transverse)):
             iterate.y[e, k] = keep * iterate.y[e, k] + gain * step.y[e, k]
 
 
-@kernel(exact=True)
-def set_residuals(problem: Any, t: Any, r: Any) -> None:
-    """r_e = P_e (t_i - t_j)."""
-    edges, v = problem.edges, problem.v
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        s = 0.0
-        for k in range(len(problem.axes)):
-            s += (t[i, k] - t[j, k]) * v[e, k]
-        for k in range(len(problem.axes)):
-            r[e, k] = (t[i, k] - t[j, k]) - s * v[e, k]
-
-
-@kernel(exact=True)
-def objective_and_bound(problem: Any, iterate: Any) -> tuple[float, float]:
-    """Return R(T) / kappa and the dual value lambda = <y, r> / kappa."""
-    objective = bound = 0.0
-    for e in range(len(problem.w)):
-        rr = yr = 0.0
-        for k in range(len(problem.axes)):
-            rr += iterate.r[e, k] * iterate.r[e, k]
-            yr += iterate.r[e, k] * iterate.y[e, k]
-        objective += problem.w[e] * np.sqrt(rr)
-        bound += yr
-    return objective / problem.kappa, bound / problem.kappa
-
-
-@kernel(exact=True)
+@kernel(inline=True)
 def dot(x: Any, y: Any) -> float:
     """Return the inner product of two (n, d) arrays."""
     total = 0.0
