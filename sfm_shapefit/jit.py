@@ -29,16 +29,13 @@ from numba.extending import get_cython_function_address, intrinsic
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-prange = numba.prange
 carray = numba.carray
 """In a leaf (see `leaf_address`): `carray(pointer, shape)` is the array behind a pointer."""
 
 _FASTMATH = {"contract", "reassoc", "nsz", "arcp"}
 
 
-def kernel(
-    *, parallel: bool = False, exact: bool = False, inline: bool = False
-) -> Callable[[Kernel], Kernel]:
+def kernel(*, exact: bool = False, inline: bool = False) -> Callable[[Kernel], Kernel]:
     """Compile a function with numba on its first call; the machine code is cached beside the source.
 
     With `inline` the source is copied into every kernel that calls it, and compiled as a part of it.
@@ -46,7 +43,7 @@ def kernel(
     fastmath: bool | set[str] = False if exact else _FASTMATH
 
     def decorate(function: Kernel) -> Kernel:
-        options = {"nogil": True, "error_model": "numpy", "parallel": parallel, "fastmath": fastmath}
+        options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
         options["inline"] = "always" if inline else "never"
         try:
             return cast(Kernel, numba.njit(cache=True, **options)(function))

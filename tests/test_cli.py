@@ -266,7 +266,7 @@ def test_evaluate_refuses_models_without_common_cameras(tmp_path):
     for image_id in list(other.images):
         other.image(image_id).name = f"other{image_id}.jpg"
     other.write(tmp_path)
-    refused(run("evaluate", RING_MODEL, tmp_path), 3)
+    assert "share 0 image names" in refused(run("evaluate", RING_MODEL, tmp_path), 3)
 
 
 def test_synth_makes_a_workspace_that_locate_takes(tmp_path):

@@ -115,11 +115,6 @@ class MatchDatabase:
         """Number of pairs of posed images with verified inlier matches."""
         return int(self._pairs.has_matches.sum())
 
-    @property
-    def num_matches(self) -> int:
-        """Number of inlier matches of those pairs, for progress."""
-        return int(self._pairs.num_inliers[self._pairs.has_matches].sum())
-
     def keypoints(self, image: int) -> FloatArray:
         """Return the pixels of the keypoints of one image.
 
