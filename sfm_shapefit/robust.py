@@ -14,12 +14,13 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, eye_array
+from scipy.sparse import eye_array
 from scipy.sparse.linalg import splu
 from scipy.special import chdtri
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
+from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import adjoint, along, differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -139,21 +140,9 @@ def _gauge_directions(locations: FloatArray) -> FloatArray:
     return np.column_stack([np.tile(np.eye(d), (n, 1)) / np.sqrt(n), centred / np.linalg.norm(centred)])
 
 
-def _block_laplacian(n: int, edges: IntArray, blocks: FloatArray) -> csc_array:
-    """Return H = D^T diag(blocks) D, shape (n d, n d)."""
-    i, j = edges.T
-    d = blocks.shape[1]
-    corners = ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0))
-    axis_a, axis_b = (axis.ravel() for axis in np.indices((d, d)))
-    rows = np.concatenate([(d * a[:, None] + axis_a).ravel() for a, _, _ in corners])
-    columns = np.concatenate([(d * b[:, None] + axis_b).ravel() for _, b, _ in corners])
-    values = np.concatenate([(sign * blocks).ravel() for _, _, sign in corners])
-    return coo_array((values, (rows, columns)), shape=(d * n, d * n)).tocsc()
-
-
 def _dense_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
     """Return the diagonal of the inverse of H on the complement of the gauge, shape (n d,)."""
-    hessian = _block_laplacian(n, edges, blocks).toarray()
+    hessian = assemble(laplacian_pattern(n, edges), blocks).toarray()
     size = float(hessian.diagonal().max())
     hessian += size * gauge @ gauge.T + _RIDGE * size * np.eye(len(hessian))
     inverse = np.linalg.inv(hessian)
@@ -162,7 +151,7 @@ def _dense_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatAr
 
 def _sampled_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
     """Estimate the same diagonal from samples H^-1 b with b of covariance H, shape (n d,)."""
-    hessian = _block_laplacian(n, edges, blocks)
+    hessian = assemble(laplacian_pattern(n, edges), blocks)
     ridge = _RIDGE * float(hessian.diagonal().max())
     regular = (hessian + ridge * eye_array(hessian.shape[0], format="csc")).tocsc()
     factor = splu(regular, permc_spec="MMD_AT_PLUS_A")
