@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
-from sfm_shapefit.robust import Assessment, assess
+from sfm_shapefit.robust.verdicts import Assessment, assess
 from sfm_shapefit.solver.options import SolverOptions, SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph

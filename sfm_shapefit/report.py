@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.robust import Verdict
+from sfm_shapefit.robust.verdicts import Verdict
 from sfm_shapefit.solver.options import SolverResult
 
 SCHEMA_VERSION = 1

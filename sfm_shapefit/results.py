@@ -29,7 +29,7 @@ from sfm_shapefit.report import (
     write_rows,
 )
 from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
-from sfm_shapefit.robust import Verdict
+from sfm_shapefit.robust.verdicts import Verdict
 from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
 from sfm_shapefit.viewgraph import ViewGraph
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit import robust
 from sfm_shapefit.gauge import choose_gauge
 from sfm_shapefit.geometry import normalized, tangent_bases
-from sfm_shapefit.robust import assess
+from sfm_shapefit.robust import verdicts
+from sfm_shapefit.robust.verdicts import assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -68,7 +68,7 @@ def test_unknown_covariances_are_judged_by_the_common_level():
 def test_standard_deviations_predict_the_scatter_of_least_squares():
     t, edges, _ = measured(4)
     v = normalized(differences(t, edges))
-    gauge = robust._gauge_directions(t)
+    gauge = verdicts._gauge_directions(t)
     bases = tangent_bases(v)
     lengths = np.linalg.norm(differences(t, edges), axis=1)
     rows = np.zeros((2 * len(edges), 36))  # tangential change of each direction per change of the locations
@@ -87,7 +87,7 @@ def test_sampled_standard_deviations_agree_with_the_exact_ones(monkeypatch):
     t, edges, v = measured(5, n=20)
     graph = ViewGraph(20, edges, v)
     exact = assess(graph, t, covariances(len(edges))).sigmas
-    monkeypatch.setattr(robust, "_DENSE_UNKNOWNS", 0)
+    monkeypatch.setattr(verdicts, "_DENSE_UNKNOWNS", 0)
     sampled = assess(graph, t, covariances(len(edges))).sigmas
     # 200 samples: 5 % at one sigma, and the largest of 60 values is at 2.6 sigma or so.
     np.testing.assert_allclose(sampled, exact, rtol=0.2)

@@ -1,0 +1,1 @@
+"""What the answer is worth: verdicts on pairs, uncertainty and trust of cameras."""
