@@ -35,9 +35,9 @@ def draw_courtyard(found: LocateResult, path: Path) -> None:
     images = [found.reconstruction.image(i) for i in found.model.image_ids.tolist()]
     centers = np.array([image.projection_center() for image in images])
     forward = np.array([image.cam_from_world().rotation.matrix()[2] for image in images])
-    placement, inliers = found.placement, found.placement.assessment.inliers
-    edges = placement.graph.edges[placement.edges]
-    directions = placement.graph.directions[placement.edges]
+    placement, inliers = found.placement, found.placement.assessment.inliers[found.placement.pairs]
+    edges = placement.graph.edges[placement.edges[placement.pairs]]
+    directions = placement.graph.directions[placement.edges[placement.pairs]]
 
     for (i, j), v in zip(edges, directions, strict=True):
         for start, end in ((centers[i], centers[i] - STUB_M * v), (centers[j], centers[j] + STUB_M * v)):

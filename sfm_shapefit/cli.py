@@ -15,7 +15,7 @@ import textwrap
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_type_hints
 
@@ -23,7 +23,7 @@ import typer
 
 from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
 
 if TYPE_CHECKING:
@@ -111,10 +111,13 @@ def _flags(options_type: type) -> list[inspect.Parameter]:
 
 
 def _field_documentation(options_type: type) -> dict[str, str]:
-    """Return the sentence under each field of a dataclass."""
+    """Return the sentence under each field of a dataclass and of those it inherits from."""
+    found: dict[str, str] = {}
+    for base in options_type.__bases__:
+        if is_dataclass(base):
+            found |= _field_documentation(base)
     (definition,) = ast.parse(textwrap.dedent(inspect.getsource(options_type))).body
     assert isinstance(definition, ast.ClassDef)
-    found: dict[str, str] = {}
     for statement, following in zip(definition.body, definition.body[1:], strict=False):
         if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
             is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
@@ -276,6 +279,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         *([("not placed", _shortened(left_out))] if left_out else []),
         ("pairs", _pairs_line(facts)),
         ("objective", _objective_line(found.solve)),
+        ("centres", found.placement.finish.statement()),
         ("scale", found.gauge.statement),
         ("points", _points_line(facts)),
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
@@ -309,7 +313,7 @@ def _adjustment_line(found: "LocateResult") -> str:
 
 
 @app.command("solve")
-@_takes(SolverOptions)
+@_takes(PlacementOptions)
 def solve_command(
     graph: Annotated[
         Path | None, typer.Argument(metavar="GRAPH", help="Text file: i j vx vy vz [weight] per line.")
@@ -327,7 +331,7 @@ def solve_command(
     with _reported():
         from sfm_shapefit.output import check_output
 
-        options = _options(SolverOptions, given)
+        options = _options(PlacementOptions, given)
         check_output(target, overwrite=overwrite, protect=[source])
 
         from sfm_shapefit.pipeline import solve_graph_file
@@ -357,9 +361,10 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
         *([("not placed", _shortened(left_out))] if left_out else []),
         (
             "pairs",
-            f"{placement.graph.num_edges}, of which {len(placement.rejected_pairs)} contradict the solution",
+            f"{placement.num_pairs}, of which {len(placement.rejected_pairs)} contradict the solution",
         ),
         ("objective", _objective_line(placement.solve)),
+        ("locations", placement.finish.statement()),
         *[("warning", warning) for warning in quality_warnings(placement)],
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: locate.json, cameras.csv, pairs.csv"),

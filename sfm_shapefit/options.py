@@ -8,12 +8,13 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
 from sfm_shapefit.gauge import Scale
+from sfm_shapefit.robust.options import Objective
 from sfm_shapefit.solver.options import Method
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.structure import StructureOptions
     from sfm_shapefit.directions import DirectionOptions
-    from sfm_shapefit.solver.options import SolverOptions
+    from sfm_shapefit.robust.options import PlacementOptions
 
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 
@@ -27,6 +28,12 @@ class LocateOptions:
     model's own tracks; "auto" takes matches if there is a database, else tracks."""
     solver: Method = "auto"
     """The ShapeFit solver; "auto" picks one and says which."""
+    objective: Objective = "auto"
+    """Which start the cameras come from. ShapeFit is solved and certified always. "auto" solves LUD
+    too, which does not collapse on long chains, refines both and keeps the one that fits the angles
+    better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit."""
+    refine: bool = True
+    """Refine the start robustly in the angles of the directions; never for "shapefit"."""
     tol: float = 1e-8
     """Certified gap at which the solve counts as converged."""
     scale: Scale = "input"
@@ -49,13 +56,18 @@ class LocateOptions:
 
     def __post_init__(self) -> None:
         self._check_types()
-        for name, kind in (("directions", Source), ("scale", Scale), ("solver", Method)):
+        for name, kind in (
+            ("directions", Source),
+            ("scale", Scale),
+            ("solver", Method),
+            ("objective", Objective),
+        ):
             choices = get_args(kind)
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
-        self.for_solver()
+        self.for_placement()
         self.for_directions()
         self.for_structure()
 
@@ -68,11 +80,17 @@ class LocateOptions:
             if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
                 raise ValueError(f"{item.name} must be of type {accepted[0].__name__}, got {value!r}")
 
-    def for_solver(self) -> "SolverOptions":
-        """Return the solver's share."""
-        from sfm_shapefit.solver.options import SolverOptions
+    def for_placement(self) -> "PlacementOptions":
+        """Return the share of the solver and of what follows it."""
+        from sfm_shapefit.robust.options import PlacementOptions
 
-        return SolverOptions(method=self.solver, tol=self.tol, threads=self.num_threads())
+        return PlacementOptions(
+            method=self.solver,
+            tol=self.tol,
+            threads=self.num_threads(),
+            objective=self.objective,
+            refine=self.refine,
+        )
 
     def for_directions(self) -> "DirectionOptions":
         """Return the direction estimator's share."""

@@ -33,7 +33,7 @@ from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -86,8 +86,8 @@ def locate(
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("solve"):
             graph = _view_graph(model, directions)
-            placement = place(graph, options.for_solver(), directions.covariance[directions.usable()])
-            locations = placement.solve.locations
+            placement = place(graph, options.for_placement(), directions.covariance[directions.usable()])
+            locations = placement.locations
             gauge = choose_gauge(locations, model.centers[placement.cameras], options.scale)
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
@@ -275,18 +275,18 @@ def _warnings(
         yield f"{len(names)} images of the model are not in the database, {names[0]} for one"
 
 
-def solve_graph_file(path: Path | str, options: SolverOptions | None = None) -> GraphResult:
+def solve_graph_file(path: Path | str, options: PlacementOptions | None = None) -> GraphResult:
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
 
     Args:
         path: a text file, see `formats.read_graph`.
-        options: settings of the solver; defaults if None.
+        options: settings; defaults if None.
 
     Raises:
         InputError: if the file is malformed; the message names the line.
         UnsolvableError: if the directions determine nothing.
     """
-    options = options or SolverOptions()
+    options = options or PlacementOptions()
     clock = _Clock(lambda _stage, _done, _total: None)
     with clock("read"):
         graph = read_graph(path)

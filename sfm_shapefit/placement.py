@@ -1,33 +1,55 @@
-"""A view graph placed: its largest rigid piece, solved and judged. What `locate` and `solve` share."""
+"""A view graph placed: its largest rigid piece, solved, finished and judged. What `locate` and `solve` share."""
 
 from dataclasses import dataclass
+
+import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.robust.finish import Finish, finish
+from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.verdicts import Assessment, assess
-from sfm_shapefit.solver.options import SolverOptions, SolverResult
+from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Placement:
-    """The locations of a view graph's largest rigid piece, and the evidence for them."""
+    """The locations of a view graph's largest rigid piece, and the evidence for them.
+
+    Nodes of the graph from `num_cameras` on are 3D points: they help to place the cameras, and are no cameras.
+    """
 
     graph: ViewGraph
     """The whole graph."""
+    num_cameras: int
+    """The nodes 0..num_cameras-1 are cameras."""
     pieces: list[RigidPiece]
-    """Its parallel-rigid pieces, largest first; piece 0 is the one that is solved."""
+    """Its parallel-rigid pieces, most cameras first; piece 0 is the one that is solved."""
     solve: SolverResult
-    """Row k belongs to camera `cameras[k]` of the graph, row e of the dual to its edge `edges[e]`."""
+    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to
+    its edge `edges[e]`."""
+    finish: Finish
+    """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
-    """Evidence for the same cameras and edges, in the solver's units."""
+    """Evidence at these locations for the same nodes and edges, in the solver's units."""
+
+    @property
+    def nodes(self) -> IntArray:
+        """The nodes of the graph that are placed, cameras first, ascending."""
+        return self.pieces[0].cameras
 
     @property
     def cameras(self) -> IntArray:
-        """The cameras of the graph that are placed, ascending."""
-        return self.pieces[0].cameras
+        """The cameras of the graph that are placed, ascending; the first rows of everything per node."""
+        return self.nodes[self.nodes < self.num_cameras]
+
+    @property
+    def locations(self) -> FloatArray:
+        """The centres (k, d) of `cameras`, in the solver's units."""
+        return self.finish.locations[: len(self.cameras)]
 
     @property
     def edges(self) -> IntArray:
@@ -35,34 +57,63 @@ class Placement:
         return self.pieces[0].edges
 
     @property
+    def pairs(self) -> IntArray:
+        """Those of `edges` that join two cameras, as rows of everything per edge."""
+        return np.flatnonzero((self.graph.edges[self.edges] < self.num_cameras).all(axis=1))
+
+    @property
+    def num_pairs(self) -> int:
+        """Pairs of cameras of the whole graph; they stand before the directions to points."""
+        return int(np.sum((self.graph.edges < self.num_cameras).all(axis=1)))
+
+    @property
     def rejected_pairs(self) -> IntArray:
-        """The pairs (k, 2) of the graph that contradict the solution."""
-        pairs: IntArray = self.graph.edges[self.edges[~self.assessment.inliers]]
+        """The pairs (k, 2) of cameras that contradict the solution."""
+        rejected = self.pairs[~self.assessment.inliers[self.pairs]]
+        pairs: IntArray = self.graph.edges[self.edges[rejected]]
         return pairs
 
 
 def place(
-    graph: ViewGraph, options: SolverOptions | None = None, covariance: FloatArray | None = None
+    graph: ViewGraph,
+    options: PlacementOptions | None = None,
+    covariance: FloatArray | None = None,
+    num_cameras: int | None = None,
 ) -> Placement:
-    """Solve the largest rigid piece of a view graph and judge its pairs and cameras by the solution.
+    """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
 
     Args:
         graph: any view graph with at least one edge; what its largest rigid piece leaves out is not placed.
-        options: settings of the solver; defaults if None.
+        options: settings; defaults if None.
         covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
+        num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
     """
-    pieces = rigid_pieces(graph)
-    if not pieces or len(pieces[0].cameras) < min(3, graph.num_cameras):
+    options = options or PlacementOptions()
+    num_cameras = graph.num_cameras if num_cameras is None else num_cameras
+    pieces = _most_cameras_first(rigid_pieces(graph), num_cameras)
+    if not pieces or np.sum(pieces[0].cameras < num_cameras) < min(3, num_cameras):
         raise UnsolvableError(
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
             "match more pairs, above all pairs that close triangles"
         )
     piece, _ = graph.restricted_to(pieces[0].edges)
-    solved = solve(piece, options)
     known = None if covariance is None else covariance[pieces[0].edges]
+    classes = (graph.edges[pieces[0].edges] >= num_cameras).any(axis=1).astype(np.int64)
+    solved = solve(piece, options)
+    finished = finish(piece, solved, options, known, classes)
     return Placement(
-        graph=graph, pieces=pieces, solve=solved, assessment=assess(piece, solved.locations, known)
+        graph=graph,
+        num_cameras=num_cameras,
+        pieces=pieces,
+        solve=solved,
+        finish=finished,
+        assessment=assess(piece, finished.locations, known),
     )
+
+
+def _most_cameras_first(pieces: list[RigidPiece], num_cameras: int) -> list[RigidPiece]:
+    """Sort pieces by their number of cameras; pieces of as many stay in their order."""
+    return sorted(pieces, key=lambda piece: -int(np.sum(piece.cameras < num_cameras)))

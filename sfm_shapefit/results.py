@@ -29,8 +29,10 @@ from sfm_shapefit.report import (
     write_rows,
 )
 from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
+from sfm_shapefit.robust.finish import Finish
+from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.verdicts import Verdict
-from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
+from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -127,7 +129,7 @@ class GraphResult:
 
     path: Path
     """The graph's file."""
-    options: SolverOptions
+    options: PlacementOptions
     placement: Placement
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
@@ -135,12 +137,12 @@ class GraphResult:
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per node."""
-        return camera_rows(self.placement, self.placement.solve.locations, 1.0)
+        return camera_rows(self.placement, self.placement.locations, 1.0)
 
     @property
     def pairs(self) -> list[PairRow]:
         """One row per edge."""
-        return pair_rows(self.placement, np.zeros(self.placement.graph.num_edges, dtype=np.int64))
+        return pair_rows(self.placement, np.zeros(self.placement.num_pairs, dtype=np.int64))
 
 
 def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
@@ -157,7 +159,8 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
     reasons = left_out_reasons(graph, placement.pieces)
     sigmas = scale * placement.assessment.sigmas
     rows = []
-    for camera, degree in enumerate(graph.degrees().tolist()):
+    degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
+    for camera, degree in enumerate(degrees.tolist()):
         row = CameraRow(name=_name(graph, camera), piece=homes[camera], degree=degree)
         k = row_of.get(camera)
         if k is None:
@@ -176,12 +179,12 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
 
 
 def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
-    """Return one row per edge of a placed graph; `support` (m,) is their number of inlier matches."""
+    """Return one row per pair of cameras; `support` (m,) is their number of inlier matches."""
     graph, assessment = placement.graph, placement.assessment
     row_of = {edge: e for e, edge in enumerate(placement.edges.tolist())}
     dual_norms = np.linalg.norm(placement.solve.dual, axis=1) / graph.weights[placement.edges]
     rows = []
-    for edge, (i, j) in enumerate(graph.edges.tolist()):
+    for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
             name1=_name(graph, i),
             name2=_name(graph, j),
@@ -209,7 +212,7 @@ def piece_rows(placement: Placement, scale: str) -> list[PieceRow]:
     """Return one row per parallel-rigid piece of three cameras or more, and for the solved one."""
     return [
         PieceRow(
-            num_cameras=len(piece.cameras),
+            num_cameras=int(np.sum(piece.cameras < placement.num_cameras)),
             scale=scale if k == 0 else "free, not solved",
             hinges=[_name(placement.graph, hinge) for hinge in piece.hinges.tolist()],
         )
@@ -221,7 +224,7 @@ def piece_rows(placement: Placement, scale: str) -> list[PieceRow]:
 def summary(found: LocateResult) -> dict[str, Any]:
     """Return what stands in locate.json: plain values, schema version first."""
     placement = found.placement
-    num_unusable = len(found.directions.pairs) - placement.graph.num_edges
+    num_unusable = len(found.directions.pairs) - placement.num_pairs
     return {
         "schema_version": SCHEMA_VERSION,
         "inputs": {
@@ -242,6 +245,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "scale": found.gauge.statement,
         "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
         "solve": solve_summary(found.solve),
+        "finish": _finish_summary(placement.finish),
         "bundle_adjustment": found.adjusted and _adjustment_summary(found.adjusted),
         "timings_s": found.timings_s,
         "warnings": list(found.warnings),
@@ -259,11 +263,12 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "dimension": placement.graph.dimension,
         "num_images": placement.graph.num_cameras,
         "num_placed": len(placement.cameras),
-        "num_pairs": placement.graph.num_edges,
+        "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "residual_level_deg": placement.assessment.level_deg,
         "pieces": [asdict(row) for row in piece_rows(placement, _SOLVER_SCALE)],
         "solve": solve_summary(placement.solve),
+        "finish": _finish_summary(placement.finish),
         "timings_s": found.timings_s,
         "warnings": list(quality_warnings(placement)),
         "versions": _versions(),
@@ -279,16 +284,29 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     level = placement.assessment.level_deg
     if level > _ALARMING_LEVEL_DEG:
         yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
+    yield from _collapse(placement.finish)
     yield from _uncertain_cameras(placement)
-    share = len(placement.rejected_pairs) / len(placement.edges)
+    share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
 
 
+def _collapse(finish: Finish) -> Iterator[str]:
+    """Yield a warning where the two convex programs disagree about lengths."""
+    if not finish.collapsed:
+        return
+    assert finish.disagreement is not None
+    yield (
+        f"ShapeFit and LUD disagree about lengths (by {finish.disagreement:.0%}), as they do on long chains and "
+        f"under heavy corruption; kept: {finish.start}"
+        + ("" if finish.refined else ", unrefined; --objective auto refines both and compares")
+    )
+
+
 def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
-    extent = float(np.linalg.norm(np.ptp(placement.solve.locations, axis=0)))
-    largest = placement.assessment.sigmas.max(axis=1)
+    extent = float(np.linalg.norm(np.ptp(placement.locations, axis=0)))
+    largest = placement.assessment.sigmas[: len(placement.cameras)].max(axis=1)
     uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
     if uncertain and len(placement.cameras) >= _SMALLEST_PIECE:
         worst = _name(placement.graph, int(placement.cameras[np.argmax(largest)]))
@@ -368,6 +386,27 @@ def _without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int
             total = counter.total()
             reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
     return reasons
+
+
+def _finish_summary(finish: Finish) -> dict[str, Any]:
+    lud = finish.lud
+    return {
+        "start": finish.start,
+        "refined": finish.refined,
+        "reason": finish.reason,
+        "disagreement": finish.disagreement,
+        "costs": finish.costs,
+        "levels_deg": list(finish.levels_deg),
+        "moved_median": finish.moved[0],
+        "moved_max": finish.moved[1],
+        "lud": lud
+        and {
+            "objective": lud.objective,
+            "dual_bound": lud.dual_bound,
+            "equality_residual": lud.equality_residual,
+            "iterations": lud.iterations,
+        },
+    }
 
 
 def _adjustment_summary(adjusted: Adjusted) -> dict[str, Any]:

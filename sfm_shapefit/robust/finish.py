@@ -1,0 +1,227 @@
+"""From the certified solve to the locations that are kept: a second start, and the robust finish of both.
+
+ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
+corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
+neither bias exists, and the one of lower robust cost is kept. How far the two convex starts disagree says
+whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the logarithm of
+the ratio of their node lengths, a camera's node length being the median length of its pairs.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
+from sfm_shapefit.solver.angular import (
+    AngularResult,
+    Metric,
+    plan_refinement,
+    refine_angles,
+    residual_levels,
+    robust_cost,
+)
+from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
+from sfm_shapefit.viewgraph import ViewGraph
+
+COLLAPSED = 0.3
+"""Disagreement of the starts beyond which one of them has collapsed."""
+
+_LUD_STEPS = 50  # more change nothing after the refinement
+_LUD_CERTIFIED_PAIRS = 50_000  # its bound costs about 100 more iterations
+_LUD_PAIRS = 1_000_000  # beyond, the second start takes as long as the first
+_POINT_WEIGHT = 10.0  # of a direction to a 3D point in LUD, where all have one loss whatever their noise
+_TIE = 1e-3  # relative difference of costs that says nothing where the starts disagree
+_OPENING_RAD = 0.1  # width of the kernel at which unrefined starts are compared at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Start:
+    """One convex start, and what became of it."""
+
+    name: str
+    """ "ShapeFit" or "LUD"."""
+    locations: FloatArray
+    """(n, d) as solved."""
+    refined: AngularResult | None
+    """None where it was not refined."""
+
+    @property
+    def best(self) -> FloatArray:
+        """The refined locations if there are any."""
+        return self.locations if self.refined is None else self.refined.locations
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Finish:
+    """The locations that are kept, and why."""
+
+    locations: FloatArray
+    """(n, d) centred, scaled like the solver's."""
+    start: str
+    """The convex program they come from, "ShapeFit" or "LUD"."""
+    refined: bool
+    """Whether they differ from its optimum."""
+    reason: str
+    """Why this start, a sentence for the user."""
+    disagreement: float | None
+    """Standard deviation of the log ratio of node lengths between the two starts; None with one start."""
+    costs: dict[str, float]
+    """Robust cost of what each start led to, all at `levels_deg`."""
+    levels_deg: tuple[float, ...]
+    """Noise level of each class of directions: between cameras, then from cameras to points."""
+    moved: tuple[float, float]
+    """Median and largest move of a node by the refinement, as a share of the median distance from the
+    centre."""
+    lud: LudResult | None
+    """The second start, with its own dual bound (0 where that was not computed)."""
+
+    @property
+    def collapsed(self) -> bool:
+        """Whether the starts disagree so much that one of them must have collapsed."""
+        return self.disagreement is not None and self.disagreement > COLLAPSED
+
+    def statement(self) -> str:
+        """Say where the locations come from and what the refinement changed, in a sentence."""
+        if not self.refined:
+            return f"{self.start}, not refined: {self.reason}"
+        median, largest = self.moved
+        return (
+            f"{self.start}, refined in angles (moved by {median:.2%} of the extent, at most {largest:.2%}): "
+            f"{self.reason}"
+        )
+
+
+def finish(
+    graph: ViewGraph,
+    solved: SolverResult,
+    options: PlacementOptions,
+    covariance: FloatArray | None = None,
+    classes: IntArray | None = None,
+) -> Finish:
+    """Return the locations to keep for a solved view graph.
+
+    Args:
+        graph: connected and parallel rigid.
+        solved: its certified ShapeFit solution.
+        options: which starts, and whether to refine.
+        covariance: (m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
+            unknown, None where all are.
+        classes: (m,) 0 for pairs of cameras, 1 for directions to points; None: all 0.
+    """
+    classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
+    metric = Metric(covariance, classes)
+    wants_lud = graph.num_edges <= _LUD_PAIRS and graph.num_cameras > 2
+    lud = _lud_start(graph, classes, options.threads) if wants_lud else None
+    plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
+
+    starts = [_refined("ShapeFit", solved.locations, graph, metric, plan)]
+    if lud is not None:
+        starts.append(_refined("LUD", lud.locations, graph, metric, plan))
+    apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
+    levels = _common_levels(graph, starts, metric)
+    costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
+    kept, reason = _choose(starts, costs, apart, options)
+    if plan is None and options.refine and options.objective != "shapefit":
+        reason += "; not refined, since the factor for that would be too large"
+    return Finish(
+        locations=normalized_locations(graph, kept.best),
+        start=kept.name,
+        refined=kept.refined is not None
+        and not np.array_equal(kept.refined.locations, _unit(kept.locations)),
+        reason=reason,
+        disagreement=apart,
+        costs=costs,
+        levels_deg=tuple(np.degrees(levels).tolist()),
+        moved=_moves(kept),
+        lud=lud,
+    )
+
+
+def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
+    """Return the standard deviation of the log ratio of node lengths of two sets of locations (n, d)."""
+    ratio = np.log(_node_lengths(graph, a) / _node_lengths(graph, b))
+    return float(np.std(ratio))
+
+
+def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return the median length of each camera's pairs, (n,), at least a millionth of the median of all."""
+    lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
+    camera = graph.edges.T.ravel()
+    order = np.lexsort((np.tile(lengths, 2), camera))
+    degree = graph.degrees()
+    first = np.cumsum(degree) - degree
+    ranked = np.tile(lengths, 2)[order]
+    low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
+    return np.maximum(0.5 * (low + high), 1e-6 * np.median(lengths))
+
+
+def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
+    """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
+    weights = np.where(classes > 0, _POINT_WEIGHT, 1.0) * graph.weights
+    weighted = ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
+    certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
+    found = solve_lud(weighted, _LUD_STEPS, certified=certified, threads=threads)
+    usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
+    return found if usable else None
+
+
+def _refined(
+    name: str, locations: FloatArray, graph: ViewGraph, metric: Metric, plan: SymbolicFactor | None
+) -> Start:
+    """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
+    refined = None if plan is None else refine_angles(graph, locations, metric, plan)
+    if refined is not None and projected_length(graph, refined.locations) <= 0.0:
+        refined = None
+    return Start(name=name, locations=locations, refined=refined)
+
+
+def _common_levels(graph: ViewGraph, starts: list[Start], metric: Metric) -> FloatArray:
+    """Return the levels at which costs are compared: the smallest, class by class, that a start ended with."""
+    ended = [start.refined.levels_rad for start in starts if start.refined is not None]
+    if not ended:
+        opening = np.full(int(metric.classes.max()) + 1, _OPENING_RAD)
+        ended = [residual_levels(graph, start.locations, metric, opening) for start in starts]
+    return np.asarray(np.min(ended, axis=0))
+
+
+def _choose(
+    starts: list[Start], costs: dict[str, float], apart: float | None, options: PlacementOptions
+) -> tuple[Start, str]:
+    """Return the start to keep and the reason."""
+    by_name = {start.name: start for start in starts}
+    if options.objective == "shapefit":
+        return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
+    if len(starts) == 1:
+        return by_name["ShapeFit"], "the graph has no second start"
+    if options.objective == "lud":
+        return by_name["LUD"], "LUD, as asked"
+    assert apart is not None
+    difference = costs["LUD"] - costs["ShapeFit"]
+    if apart <= COLLAPSED:
+        name = "LUD" if difference < 0.0 else "ShapeFit"
+        return by_name[
+            name
+        ], f"both starts agree (lengths to {apart:.0%}); {name} fits the directions no worse"
+    if abs(difference) <= _TIE * min(costs.values()):
+        return by_name["LUD"], (
+            f"the starts disagree (lengths by {apart:.0%}) and fit alike: LUD, whose lengths cannot collapse"
+        )
+    name = "LUD" if difference < 0.0 else "ShapeFit"
+    return by_name[name], f"the starts disagree (lengths by {apart:.0%}); {name} fits the directions better"
+
+
+def _unit(t: FloatArray) -> FloatArray:
+    centred = t - t.mean(axis=0)
+    return np.asarray(centred / np.linalg.norm(centred))
+
+
+def _moves(kept: Start) -> tuple[float, float]:
+    """Return the median and the largest move by the refinement, as a share of the extent."""
+    before, after = _unit(kept.locations), _unit(kept.best)
+    moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
+    return float(np.median(moved)), float(moved.max())
