@@ -56,12 +56,8 @@ class LocateOptions:
 
     def __post_init__(self) -> None:
         self._check_types()
-        for name, kind in (
-            ("directions", Source),
-            ("scale", Scale),
-            ("solver", Method),
-            ("objective", Objective),
-        ):
+        kinds = {"directions": Source, "scale": Scale, "solver": Method, "objective": Objective}
+        for name, kind in kinds.items():
             choices = get_args(kind)
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")

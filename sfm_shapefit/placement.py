@@ -1,4 +1,4 @@
-"""A view graph placed: its largest rigid piece, solved, finished and judged. What `locate` and `solve` share."""
+"""A view graph placed: its largest rigid piece, solved, finished, judged. What `locate` and `solve` share."""
 
 from dataclasses import dataclass
 
@@ -19,7 +19,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 class Placement:
     """The locations of a view graph's largest rigid piece, and the evidence for them.
 
-    Nodes of the graph from `num_cameras` on are 3D points: they help to place the cameras, and are no cameras.
+    Nodes of the graph from `num_cameras` on are 3D points, which only help to place the cameras.
     """
 
     graph: ViewGraph
@@ -101,7 +101,7 @@ def place(
         )
     piece, _ = graph.restricted_to(pieces[0].edges)
     known = None if covariance is None else covariance[pieces[0].edges]
-    classes = (graph.edges[pieces[0].edges] >= num_cameras).any(axis=1).astype(np.int64)
+    classes = np.max(graph.edges[pieces[0].edges] >= num_cameras, axis=1).astype(np.int64)
     solved = solve(piece, options)
     finished = finish(piece, solved, options, known, classes)
     return Placement(

@@ -297,8 +297,8 @@ def _collapse(finish: Finish) -> Iterator[str]:
         return
     assert finish.disagreement is not None
     yield (
-        f"ShapeFit and LUD disagree about lengths (by {finish.disagreement:.0%}), as they do on long chains and "
-        f"under heavy corruption; kept: {finish.start}"
+        f"ShapeFit and LUD disagree about lengths (by {finish.disagreement:.0%}), as they do on long chains "
+        f"and under heavy corruption; kept: {finish.start}"
         + ("" if finish.refined else ", unrefined; --objective auto refines both and compares")
     )
 

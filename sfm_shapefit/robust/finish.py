@@ -3,8 +3,8 @@
 ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
 corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
 neither bias exists, and the one of lower robust cost is kept. How far the two convex starts disagree says
-whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the logarithm of
-the ratio of their node lengths, a camera's node length being the median length of its pairs.
+whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the log ratio of
+their node lengths, a camera's node length being the median length of its pairs.
 """
 
 from dataclasses import dataclass
@@ -131,8 +131,7 @@ def finish(
     return Finish(
         locations=normalized_locations(graph, kept.best),
         start=kept.name,
-        refined=kept.refined is not None
-        and not np.array_equal(kept.refined.locations, _unit(kept.locations)),
+        refined=_moves(kept)[1] > 0.0,
         reason=reason,
         disagreement=apart,
         costs=costs,
@@ -157,7 +156,7 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     first = np.cumsum(degree) - degree
     ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
-    return np.maximum(0.5 * (low + high), 1e-6 * np.median(lengths))
+    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.median(lengths)))
 
 
 def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
@@ -181,7 +180,7 @@ def _refined(
 
 
 def _common_levels(graph: ViewGraph, starts: list[Start], metric: Metric) -> FloatArray:
-    """Return the levels at which costs are compared: the smallest, class by class, that a start ended with."""
+    """Return the levels at which costs are compared: the smallest of each class that a start ended with."""
     ended = [start.refined.levels_rad for start in starts if start.refined is not None]
     if not ended:
         opening = np.full(int(metric.classes.max()) + 1, _OPENING_RAD)
@@ -204,9 +203,7 @@ def _choose(
     difference = costs["LUD"] - costs["ShapeFit"]
     if apart <= COLLAPSED:
         name = "LUD" if difference < 0.0 else "ShapeFit"
-        return by_name[
-            name
-        ], f"both starts agree (lengths to {apart:.0%}); {name} fits the directions no worse"
+        return by_name[name], f"both starts agree (lengths to {apart:.0%}); {name} fits no worse"
     if abs(difference) <= _TIE * min(costs.values()):
         return by_name["LUD"], (
             f"the starts disagree (lengths by {apart:.0%}) and fit alike: LUD, whose lengths cannot collapse"

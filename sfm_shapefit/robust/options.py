@@ -1,4 +1,4 @@
-"""How a view graph is placed: the solver's options, and what is done beyond the certified solve. Pure data."""
+"""How a view graph is placed: the solver's options, and what follows the certified solve. Pure data."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
