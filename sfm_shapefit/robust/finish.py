@@ -3,8 +3,8 @@
 ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
 corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
 neither bias exists, and the one of lower robust cost is kept. How far the two convex starts disagree says
-whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the log ratio of
-their node lengths, a camera's node length being the median length of its pairs.
+whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the log ratio
+of their node lengths, a camera's node length being the median length of its pairs.
 """
 
 from dataclasses import dataclass
