@@ -279,6 +279,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         *([("not placed", _shortened(left_out))] if left_out else []),
         ("pairs", _pairs_line(facts)),
         ("objective", _objective_line(found.solve)),
+        ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
         ("centres", found.placement.finish.statement()),
         ("scale", found.gauge.statement),
         ("points", _points_line(facts)),

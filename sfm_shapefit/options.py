@@ -16,7 +16,10 @@ if TYPE_CHECKING:
     from sfm_shapefit.directions import DirectionOptions
     from sfm_shapefit.robust.options import PlacementOptions
 
+Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
+
+_MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time of the solve
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,6 +37,9 @@ class LocateOptions:
     better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit."""
     refine: bool = True
     """Refine the start robustly in the angles of the directions; never for "shapefit"."""
+    points: Points = "auto"
+    """3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what directions
+    between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 cameras."""
     tol: float = 1e-8
     """Certified gap at which the solve counts as converged."""
     scale: Scale = "input"
@@ -56,7 +62,13 @@ class LocateOptions:
 
     def __post_init__(self) -> None:
         self._check_types()
-        kinds = {"directions": Source, "scale": Scale, "solver": Method, "objective": Objective}
+        kinds = {
+            "directions": Source,
+            "scale": Scale,
+            "solver": Method,
+            "objective": Objective,
+            "points": Points,
+        }
         for name, kind in kinds.items():
             choices = get_args(kind)
             if getattr(self, name) not in choices:
@@ -75,6 +87,10 @@ class LocateOptions:
             accepted = {float: (float, int), int: (int,), bool: (bool,)}.get(wanted, (str,))
             if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
                 raise ValueError(f"{item.name} must be of type {accepted[0].__name__}, got {value!r}")
+
+    def uses_points(self, num_cameras: int) -> bool:
+        """Return whether 3D points join the view graph of so many cameras."""
+        return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
 
     def for_placement(self) -> "PlacementOptions":
         """Return the share of the solver and of what follows it."""

@@ -34,6 +34,7 @@ from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
 from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.tracks import JointGraph, build_tracks, covering_set, join_points
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -85,8 +86,8 @@ def locate(
         with clock("directions"):
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("solve"):
-            graph = _view_graph(model, directions)
-            placement = place(graph, options.for_placement(), directions.covariance[directions.usable()])
+            graph = _joint_graph(model, matches, directions, options)
+            placement = place(graph.graph, options.for_placement(), graph.covariance, graph.num_cameras)
             locations = placement.locations
             gauge = choose_gauge(locations, model.centers[placement.cameras], options.scale)
         with clock("structure"):
@@ -213,6 +214,20 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     return ViewGraph(
         model.num_images, directions.pairs[usable], directions.directions[usable], names=model.names
     )
+
+
+def _joint_graph(
+    model: PosedModel, matches: MatchDatabase | None, directions: PairDirections, options: LocateOptions
+) -> JointGraph:
+    """Return the view graph, with 3D points as further nodes if the options want them."""
+    graph, covariance = _view_graph(model, directions), directions.covariance[directions.usable()]
+    if not options.uses_points(model.num_images):
+        return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
+    batches = track_matches(model, 1) if matches is None else matches.iter_matches(1)
+    pixel_angles = 1.0 / model.focal_lengths_px
+    tracks = build_tracks(batches, directions, pixel_angles, options.inlier_threshold_px)
+    chosen = tracks.subset(covering_set(tracks, model.num_images))
+    return join_points(graph, covariance, chosen, pixel_angles)
 
 
 def _seed_and_tracks(

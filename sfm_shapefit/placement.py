@@ -110,8 +110,19 @@ def place(
         pieces=pieces,
         solve=solved,
         finish=finished,
-        assessment=assess(piece, finished.locations, known),
+        assessment=assess(piece, finished.locations, _with_levels(piece, finished, known, classes)),
     )
+
+
+def _with_levels(
+    graph: ViewGraph, finished: Finish, covariance: FloatArray | None, classes: IntArray
+) -> FloatArray | None:
+    """Return the covariances, with the level of each class added where there are two classes."""
+    if not classes.any():
+        return covariance
+    own = 0.0 if covariance is None else np.nan_to_num(covariance)
+    levels = np.radians(np.array(finished.levels_deg))[classes]
+    return np.asarray(own + levels[:, None, None] ** 2 * np.eye(graph.dimension - 1))
 
 
 def _most_cameras_first(pieces: list[RigidPiece], num_cameras: int) -> list[RigidPiece]:

@@ -241,6 +241,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         | {"outlier": len(placement.rejected_pairs)},
         "num_points": found.reconstruction.num_points3D(),
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
+        "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "residual_level_deg": placement.assessment.level_deg,
         "scale": found.gauge.statement,
         "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],

@@ -28,6 +28,7 @@ LAYERS = [
     "evaluation",
     "synthetic",
     "colmap",
+    "tracks",
     "options",
     "report",
     "results",
