@@ -139,10 +139,31 @@ def test_a_reconstruction_in_memory_is_not_changed():
         np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
 
 
+PAIRS_ONLY = LocateOptions(points="never")
+
+
+@pytest.mark.parametrize(
+    "kept",
+    [
+        lambda i, j: 1 not in (i, j) or (i, j) == (1, 2),
+        lambda i, j: j - i in (1, 7),
+        lambda i, j: {i, j} <= {1, 2, 3, 4} or {i, j} <= {4, 5, 6, 7, 8},
+    ],
+    ids=["pendant", "ring", "hinge"],
+)
+def test_points_place_cameras_that_pairs_do_not_determine(tmp_path, kept):
+    scene = copied(RING, tmp_path)
+    keep_pairs(scene / "database.db", kept)
+    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    errors = sfm_shapefit.evaluate(found.reconstruction, RING / "truth").position
+    assert found.reconstruction.num_reg_images() == 8
+    assert errors.max < 0.02  # of a ring of radius 5; a pair alone leaves the distance free
+
+
 def test_a_camera_that_hangs_by_one_pair_is_left_out_by_name(tmp_path):
     scene = copied(RING, tmp_path)
     keep_pairs(scene / "database.db", lambda i, j: 1 not in (i, j) or (i, j) == (1, 2))
-    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    found = sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
     rows = {row.name: row for row in found.cameras}
     assert [name for name, row in rows.items() if not row.placed] == ["0001.jpg"]
     assert rows["0001.jpg"].reason == "pendant: joined by a single pair to 0002.jpg"
@@ -154,14 +175,14 @@ def test_a_ring_of_single_pairs_determines_nothing(tmp_path):
     scene = copied(RING, tmp_path)
     keep_pairs(scene / "database.db", lambda i, j: j - i in (1, 7))
     with pytest.raises(UnsolvableError, match="no three cameras"):
-        sfm_shapefit.locate(scene / "sparse" / "0")
+        sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
 
 
 def test_two_groups_joined_at_one_camera_are_two_pieces(tmp_path):
     scene = copied(RING, tmp_path)
     first, second = {1, 2, 3, 4}, {4, 5, 6, 7, 8}
     keep_pairs(scene / "database.db", lambda i, j: {i, j} <= first or {i, j} <= second)
-    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    found = sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
     facts = summary(found)
     assert [piece["num_cameras"] for piece in facts["pieces"]] == [5, 4]
     assert [piece["hinges"] for piece in facts["pieces"]] == [["0004.jpg"], ["0004.jpg"]]

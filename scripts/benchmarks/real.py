@@ -267,7 +267,7 @@ def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, gloma
     return Measured(
         name=scene.name,
         num_posed=found.model.num_images,
-        num_placed=len(found.pieces[0].cameras),
+        num_placed=len(found.placement.cameras),
         num_pairs=len(found.directions.pairs),
         num_pairs_used=len(found.pieces[0].edges),
         errors=_errors(found.reconstruction, folder / scene.truth),
