@@ -20,6 +20,7 @@ from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
 from sfm_shapefit.directions import (
+    CONTRADICTIONS,
     DirectionStatus,
     PairDirections,
     concatenate,
@@ -32,7 +33,8 @@ from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
-from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
+from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings, trust_warnings
+from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -40,6 +42,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_FEWEST_KEPT = 3  # cameras; fewer trusted ones are no result
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -86,12 +89,14 @@ def locate(
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("solve"):
             graph = _view_graph(model, directions)
-            placement = place(graph, options.for_solver(), directions.covariance[directions.usable()])
-            locations = placement.solve.locations
-            gauge = choose_gauge(locations, model.centers[placement.cameras], options.scale)
+            known = directions.covariance[directions.usable()]
+            placement = place(graph, options.for_solver(), known, _evidence(directions))
+            kept = _trusted(placement, options.min_trust)
+            locations = placement.solve.locations[kept]
+            gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
-            seed, tracks = _seed_and_tracks(model, matches, placement, centers, clock)
+            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock)
             adjusted = None
             if not options.bundle_adjust:  # which triangulates at the seed's poses itself
                 seeded = triangulate(seed, tracks, options.for_structure())
@@ -109,10 +114,11 @@ def locate(
         model=model,
         directions=directions,
         placement=placement,
+        kept=kept,
         gauge=gauge,
         adjusted=adjusted,
         timings_s=clock.seconds,
-        warnings=tuple(_warnings(matches, placement, gauge, seeded.num_points3D())),
+        warnings=tuple(_warnings(matches, placement, kept, gauge, seeded.num_points3D())),
     )
 
 
@@ -215,18 +221,39 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
+def _evidence(directions: PairDirections) -> Evidence:
+    """Return what the matches say of the cameras beyond the usable directions."""
+    usable = directions.usable()
+    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
+    return Evidence(
+        support=directions.num_matches[usable],
+        contradicting=directions.pairs[against].reshape(-1, 2),
+        contradicting_support=directions.num_matches[against],
+    )
+
+
+def _trusted(placement: Placement, min_trust: float) -> BoolArray:
+    """Return which of the placed cameras are trusted enough; all, if hardly any is."""
+    kept: BoolArray = placement.assessment.trust >= min_trust
+    return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
+
+
 def _seed_and_tracks(
     model: PosedModel,
     matches: MatchDatabase | None,
     placement: Placement,
-    centers: FloatArray,
+    located: tuple[BoolArray, FloatArray],
     clock: _Clock,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
-    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
+    """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
+
+    `located` says which of the placement's cameras are kept, and where those are in the output's units.
+    """
+    kept, centers = located
     placed = np.zeros(model.num_images, dtype=np.bool_)
-    placed[placement.cameras] = True
+    placed[placement.cameras[kept]] = True
     all_centers = np.full((model.num_images, 3), np.nan)
-    all_centers[placement.cameras] = centers
+    all_centers[placement.cameras[kept]] = centers
     if matches is None:
         return build_seed(model, placed, all_centers), model.reconstruction
     seed = build_seed(model, placed, all_centers, matches.keypoints)
@@ -262,10 +289,11 @@ def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterat
 
 
 def _warnings(
-    matches: MatchDatabase | None, placement: Placement, gauge: Gauge, num_points: int
+    matches: MatchDatabase | None, placement: Placement, kept: BoolArray, gauge: Gauge, num_points: int
 ) -> Iterator[str]:
     """Yield what the user should know beyond the tables."""
     yield from quality_warnings(placement)
+    yield from trust_warnings(placement, kept)
     if gauge.warning:
         yield gauge.warning
     if num_points == 0:

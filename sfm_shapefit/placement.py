@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
 from sfm_shapefit.solver.options import SolverOptions, SolverResult
 from sfm_shapefit.solver.solve import solve
@@ -42,7 +43,10 @@ class Placement:
 
 
 def place(
-    graph: ViewGraph, options: SolverOptions | None = None, covariance: FloatArray | None = None
+    graph: ViewGraph,
+    options: SolverOptions | None = None,
+    covariance: FloatArray | None = None,
+    evidence: Evidence | None = None,
 ) -> Placement:
     """Solve the largest rigid piece of a view graph and judge its pairs and cameras by the solution.
 
@@ -50,6 +54,7 @@ def place(
         graph: any view graph with at least one edge; what its largest rigid piece leaves out is not placed.
         options: settings of the solver; defaults if None.
         covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
+        evidence: support of the graph's edges, and pairs whose matches contradict the rotations, see `assess`.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
@@ -63,6 +68,7 @@ def place(
     piece, _ = graph.restricted_to(pieces[0].edges)
     solved = solve(piece, options)
     known = None if covariance is None else covariance[pieces[0].edges]
+    heard = evidence and evidence.restricted_to(pieces[0].edges, pieces[0].cameras, graph.num_cameras)
     return Placement(
-        graph=graph, pieces=pieces, solve=solved, assessment=assess(piece, solved.locations, known)
+        graph=graph, pieces=pieces, solve=solved, assessment=assess(piece, solved.locations, known, heard)
     )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.seed import write_model
@@ -40,6 +40,7 @@ _SMALLEST_PIECE = 3  # cameras; two cameras of one pair are no piece worth a lin
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
 _ALARMING_LEVEL_DEG = 5.0
 _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
+_UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 
 
@@ -72,6 +73,8 @@ class LocateResult:
     placement: Placement
     """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
     largest rigid piece solved, and the evidence for it, in the solver's units."""
+    kept: BoolArray
+    """Which of the placement's cameras are in the output; the others are not trusted enough."""
     gauge: Gauge
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
@@ -94,9 +97,10 @@ class LocateResult:
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        placed_ids = self.model.image_ids[self.placement.cameras].tolist()
-        images = [self.reconstruction.image(image_id) for image_id in placed_ids]
-        centers = np.array([image.projection_center() for image in images])
+        kept_ids = self.model.image_ids[self.placement.cameras[self.kept]].tolist()
+        images = [self.reconstruction.image(image_id) for image_id in kept_ids]
+        centers = np.full((len(self.kept), 3), np.nan)
+        centers[self.kept] = [image.projection_center() for image in images]
         rows = camera_rows(self.placement, centers, self.gauge.similarity.scale)
         for camera, reason in _without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
@@ -148,7 +152,8 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
 
     Args:
         placement: the graph and its solution.
-        centers: (k, d) centres of the placed cameras in the output's units.
+        centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
+            because they are not trusted.
         scale: the output's units in one unit of the solver.
     """
     graph = placement.graph
@@ -163,12 +168,15 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
         if k is None:
             rows.append(replace(row, reason=reasons[camera]))
             continue
+        kept = bool(np.isfinite(centers[k]).all())
+        trust, reason = float(placement.assessment.trust[k]), placement.assessment.reasons[k]
         rows.append(
             replace(
                 row,
-                placed=True,
-                center=tuple(centers[k].tolist()),
-                trust=float(placement.assessment.trust[k]),
+                placed=kept,
+                reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
+                center=tuple(centers[k].tolist()) if kept else (),
+                trust=trust,
                 sigma=tuple(sigmas[k].tolist()),
             )
         )
@@ -193,13 +201,15 @@ def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
         if e is None:
             rows.append(replace(row, reason="outside the piece that is solved"))
             continue
-        verdict = Verdict.INLIER if assessment.inliers[e] else Verdict.OUTLIER
+        verdict = assessment.verdict(e)
         rows.append(
             replace(
                 row,
                 residual_deg=float(assessment.residuals_deg[e]),
                 dual_norm=float(dual_norms[e]),
+                leverage=float(assessment.leverages[e]),
                 verdict=verdict.value,
+                reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
             )
         )
     return rows
@@ -231,7 +241,8 @@ def summary(found: LocateResult) -> dict[str, Any]:
         },
         "options": asdict(found.options),
         "num_images": len(_all_names(found)),
-        "num_placed": len(placement.cameras),
+        "num_placed": int(np.sum(found.kept)),
+        "not_trusted": _not_trusted(found),
         "num_pairs": len(found.directions.pairs),
         "num_pairs_rejected": num_unusable + len(placement.rejected_pairs),
         "pairs": {status.name.lower(): count for status, count in found.directions.counts().items()}
@@ -283,6 +294,27 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     share = len(placement.rejected_pairs) / len(placement.edges)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+
+
+def _not_trusted(found: LocateResult) -> dict[str, str]:
+    """Return the reason for each camera that is left out because it is not trusted."""
+    placement = found.placement
+    return {
+        _name(placement.graph, int(placement.cameras[k])): placement.assessment.reasons[k]
+        for k in np.flatnonzero(~found.kept).tolist()
+    }
+
+
+def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
+    """Yield which cameras are left out for want of trust, if any are."""
+    lost = np.flatnonzero(~kept)
+    if len(lost):
+        worst = int(lost[np.argmin(placement.assessment.trust[lost])])
+        yield (
+            f"{len(lost)} cameras are left out because they are not trusted, above all "
+            f"{_name(placement.graph, int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]}); "
+            "--min-trust 0 keeps them"
+        )
 
 
 def _uncertain_cameras(placement: Placement) -> Iterator[str]:
