@@ -34,6 +34,7 @@ from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings, trust_warnings
+from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.viewgraph import ViewGraph
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
 _FEWEST_KEPT = 3  # cameras; fewer trusted ones are no result
+_MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -90,7 +92,8 @@ def locate(
         with clock("solve"):
             graph = _view_graph(model, directions)
             known = directions.covariance[directions.usable()]
-            placement = place(graph, options.for_solver(), known, _evidence(directions))
+            errors = _shared_errors(model, matches, directions, inputs.source, options)
+            placement = place(graph, options.for_solver(), known, _evidence(directions, errors))
             kept = _trusted(placement, options.min_trust)
             locations = placement.solve.locations[kept]
             gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
@@ -221,7 +224,36 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def _evidence(directions: PairDirections) -> Evidence:
+def _shared_errors(
+    model: PosedModel,
+    matches: MatchDatabase | None,
+    directions: PairDirections,
+    source: Source,
+    options: LocateOptions,
+) -> FloatArray | None:
+    """Return samples of the usable directions' errors, which share keypoints; None where that is not known."""
+    usable = directions.usable()
+    if source == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
+        return None
+    row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
+    errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
+    for batch in track_matches(model, 1) if matches is None else matches.iter_matches(1):
+        rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
+        errors[rows] = sample_direction_errors(
+            batch.pairs,
+            batch.offsets,
+            batch.keypoints,
+            (batch.rays_i, batch.rays_j),
+            1.0 / model.focal_lengths_px[batch.pairs].min(axis=1),
+            directions.directions[rows],
+            directions.covariance[rows],
+            1.4826 * directions.median_residual_px[rows],
+            options.inlier_threshold_px,
+        )
+    return errors[usable]
+
+
+def _evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
     """Return what the matches say of the cameras beyond the usable directions."""
     usable = directions.usable()
     against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
@@ -229,6 +261,7 @@ def _evidence(directions: PairDirections) -> Evidence:
         support=directions.num_matches[usable],
         contradicting=directions.pairs[against].reshape(-1, 2),
         contradicting_support=directions.num_matches[against],
+        errors=errors,
     )
 
 

@@ -58,6 +58,9 @@ class Evidence:
     """(q, 2) other pairs, whose matches contradict the given rotations."""
     contradicting_support: IntArray
     """(q,) their number of matches."""
+    errors: FloatArray | None = None
+    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that share
+    keypoints (`shared_noise`); the pairs' errors are independent if None."""
 
     def restricted_to(self, edges: IntArray, cameras: IntArray, num_cameras: int) -> "Evidence":
         """Return the evidence for a graph of some of the edges and cameras, renumbered.
@@ -75,6 +78,7 @@ class Evidence:
             support=self.support[edges],
             contradicting=pairs[kept],
             contradicting_support=self.contradicting_support[kept],
+            errors=None if self.errors is None else self.errors[edges],
         )
 
 

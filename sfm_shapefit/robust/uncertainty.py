@@ -16,6 +16,10 @@ orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
 F is the centroid and the scale of the cameras that are held; cameras that nearly nothing holds would
 otherwise lend their uncertainty to all others.
 
+Directions whose errors are correlated (`shared_noise`) do not have the covariance A^-1. For them the errors
+are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and the
+standard deviations are those of the samples.
+
 The leverage of a direction is trace(Lambda_e Cov(B_e^T (t_i - t_j) / l_e)) / (d - 1), in [0, 1]: the share of
 its own fitted value that it decides itself. The leverages of all directions add up to the number of unknowns
 over d - 1. Where it is 1 no other direction checks it, and its residual is 0 whatever was measured
@@ -30,6 +34,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
+from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.solver.program import differences
 
@@ -51,9 +56,14 @@ class Uncertainty:
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
 
+    samples: FloatArray | None = None
+    """(n, d, s) errors of the locations for samples of correlated direction errors."""
+
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations along the axes, (n, d)."""
+        if self.samples is not None:
+            return np.sqrt(np.mean(self.samples**2, axis=2))
         variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
         return np.sqrt(np.maximum(variances, 0.0))
 
@@ -63,6 +73,7 @@ def propagate(
     edges: IntArray,
     information: FloatArray,
     num_cameras: int | None = None,
+    errors: FloatArray | None = None,
 ) -> Uncertainty:
     """Return the uncertainty of locations from the information of the directions.
 
@@ -71,6 +82,8 @@ def propagate(
         edges: (m, 2) pairs that make the nodes rigid, none of length 0.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
         num_cameras: the first so many nodes may decide the gauge; all if None.
+        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
+            information if None.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
@@ -89,7 +102,30 @@ def propagate(
     leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _held(factor, inverse, locations, is_camera)
-    return Uncertainty(covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge)
+    samples = None
+    if errors is not None:
+        forces = (across @ errors.transpose(0, 2, 1)) / np.maximum(lengths, _SHORTEST * lengths.max())[
+            :, None, None
+        ]
+        samples = _moved(factor, locations, edges, forces, gauge)
+    return Uncertainty(
+        covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge, samples=samples
+    )
+
+
+def _moved(
+    factor: CholeskyFactor, locations: FloatArray, edges: IntArray, forces: FloatArray, gauge: BoolArray
+) -> FloatArray:
+    """Return S A^-1 D^T f for each of the samples in the forces f (m, d, s), shape (n, d, s)."""
+    n, d = locations.shape
+    right = np.zeros((n, d, forces.shape[2]))
+    flat = apply_incidence_transposed(edges, np.ascontiguousarray(forces.reshape(len(edges), -1)), n)
+    right[:] = flat.reshape(right.shape)
+    moved = factor.solve(right)
+    null, fixed = _gauge_pair(locations, gauge)
+    drift = np.einsum("nak,nas->ks", fixed, moved)
+    result: FloatArray = moved - np.einsum("nak,ks->nas", null, drift)
+    return result
 
 
 def _across(information: FloatArray, units: FloatArray) -> FloatArray:
@@ -147,14 +183,7 @@ def _in_gauge(
     factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, gauge: BoolArray
 ) -> FloatArray:
     """Return the diagonal blocks of S A^-1 S^T with centroid and scale of the nodes in `gauge` fixed."""
-    n, d = locations.shape
-    centred = locations - locations[gauge].mean(axis=0)
-    null = np.zeros((n, d, d + 1))
-    null[:, range(d), range(d)] = 1.0
-    null[:, :, d] = centred
-    fixed = np.where(gauge[:, None, None], null, 0.0)  # F before it is scaled so that F^T N = I
-    fixed[:, :, :d] /= np.sum(gauge)
-    fixed[:, :, d] /= np.sum(centred[gauge] ** 2)
+    null, fixed = _gauge_pair(locations, gauge)
     product = factor.solve(fixed)  # A^-1 F
     middle = np.einsum("nak,nal->kl", fixed, product)
     cross = null @ product.transpose(0, 2, 1)
@@ -162,3 +191,16 @@ def _in_gauge(
         inverse.nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1)
     )
     return covariances
+
+
+def _gauge_pair(locations: FloatArray, gauge: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return N and F, (n, d, d + 1): shifts and scale, and what reads them off the nodes in `gauge`."""
+    n, d = locations.shape
+    centred = locations - locations[gauge].mean(axis=0)
+    null = np.zeros((n, d, d + 1))
+    null[:, range(d), range(d)] = 1.0
+    null[:, :, d] = centred
+    fixed = np.where(gauge[:, None, None], null, 0.0)
+    fixed[:, :, :d] /= np.sum(gauge)
+    fixed[:, :, d] /= np.sum(centred[gauge] ** 2)
+    return null, fixed

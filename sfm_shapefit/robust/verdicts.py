@@ -114,8 +114,11 @@ def assess(
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
     bases = tangent_bases(graph.directions)
+    errors = None
+    if evidence is not None and evidence.errors is not None:
+        errors = _with_excess(evidence.errors, excess) @ bases.transpose(0, 2, 1)
     sigmas, leverages = _propagated(
-        graph, locations, inliers, bases @ information @ bases.transpose(0, 2, 1), k
+        graph, locations, inliers, bases @ information @ bases.transpose(0, 2, 1), k, errors
     )
     angles = np.linalg.norm(residuals, axis=1)
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
@@ -207,8 +210,18 @@ def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wa
     return high
 
 
+def _with_excess(errors: FloatArray, excess: float) -> FloatArray:
+    """Add independent normal errors of the excess to samples (m, s, d - 1)."""
+    return errors + excess * np.random.default_rng(0).standard_normal(errors.shape)
+
+
 def _propagated(
-    graph: ViewGraph, locations: FloatArray, inliers: BoolArray, information: FloatArray, num_cameras: int
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    errors: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations (n, d) and the leverages (m,).
 
@@ -223,7 +236,8 @@ def _propagated(
     if cameras < _SMALLEST_RIGID:
         return sigmas, leverages
     try:
-        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras)
+        samples = None if errors is None else errors[rows]
+        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
     except UnsolvableError:  # singular in spite of the ridge: nothing is known
         return sigmas, leverages
     extent = np.ptp(locations[held], axis=0).max()
