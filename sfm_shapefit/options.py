@@ -45,8 +45,8 @@ class LocateOptions:
     bundle_adjust: bool = False
     """Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."""
     min_trust: float = 0.6
-    """Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. A trust of
-    1/2 means no evidence either way; see the column trust of cameras.csv."""
+    """Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. See the
+    column trust of cameras.csv."""
     threads: int = 0
     """Threads to use; 0 means one per core. The answer does not depend on it."""
 

@@ -231,7 +231,7 @@ def _shared_errors(
     source: Source,
     options: LocateOptions,
 ) -> FloatArray | None:
-    """Return samples of the usable directions' errors, which share keypoints; None where that is not known."""
+    """Return samples of the usable directions' errors, which share keypoints; None if not known."""
     usable = directions.usable()
     if source == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
         return None

@@ -54,7 +54,7 @@ def place(
         graph: any view graph with at least one edge; what its largest rigid piece leaves out is not placed.
         options: settings of the solver; defaults if None.
         covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
-        evidence: support of the graph's edges, and pairs whose matches contradict the rotations, see `assess`.
+        evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.

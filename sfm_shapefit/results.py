@@ -250,6 +250,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "num_points": found.reconstruction.num_points3D(),
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
         "residual_level_deg": placement.assessment.level_deg,
+        "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
         "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
         "solve": solve_summary(found.solve),
@@ -273,6 +274,7 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "num_pairs": placement.graph.num_edges,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "residual_level_deg": placement.assessment.level_deg,
+        "loose_groups": _loose_groups(placement),
         "pieces": [asdict(row) for row in piece_rows(placement, _SOLVER_SCALE)],
         "solve": solve_summary(placement.solve),
         "timings_s": found.timings_s,
@@ -305,14 +307,28 @@ def _not_trusted(found: LocateResult) -> dict[str, str]:
     }
 
 
+def _loose_groups(placement: Placement) -> list[dict[str, Any]]:
+    """Return the groups of cameras that are rigid by the graph but loose by the geometry."""
+    return [
+        {
+            "cameras": [_name(placement.graph, int(placement.cameras[k])) for k in group.cameras.tolist()],
+            "cause": group.cause.value,
+        }
+        for group in placement.assessment.loose_groups
+    ]
+
+
 def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
     """Yield which cameras are left out for want of trust, if any are."""
     lost = np.flatnonzero(~kept)
     if len(lost):
         worst = int(lost[np.argmin(placement.assessment.trust[lost])])
+        name, reason = (
+            _name(placement.graph, int(placement.cameras[worst])),
+            placement.assessment.reasons[worst],
+        )
         yield (
-            f"{len(lost)} cameras are left out because they are not trusted, above all "
-            f"{_name(placement.graph, int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]}); "
+            f"{len(lost)} cameras are left out because they are not trusted, above all {name} ({reason}); "
             "--min-trust 0 keeps them"
         )
 
@@ -322,6 +338,8 @@ def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     extent = float(np.linalg.norm(np.ptp(placement.solve.locations, axis=0)))
     largest = placement.assessment.sigmas.max(axis=1)
     uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
+    if np.isnan(largest).any():
+        yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if uncertain and len(placement.cameras) >= _SMALLEST_PIECE:
         worst = _name(placement.graph, int(placement.cameras[np.argmax(largest)]))
         yield (

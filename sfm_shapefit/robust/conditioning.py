@@ -1,9 +1,9 @@
 """What is rigid by its graph and yet loose by its geometry.
 
-The test of rigidity (`rigidity`) takes positions to be general. At the solution they need not be: cameras on a
-line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly parallel,
-the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees all of these.
-Here its loose cameras are put into groups that move together, with what makes them loose:
+The test of rigidity (`rigidity`) takes positions to be general. At the solution they need not be: cameras on
+a line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly
+parallel, the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees
+all of these. Here its loose cameras are put into groups that move together, with what makes them loose:
 
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
@@ -48,7 +48,7 @@ class LooseGroup:
     cause: Looseness
     """Of most of them."""
     sigma: float
-    """Largest standard deviation among them, in the units of the locations; infinite if nothing holds them."""
+    """Largest standard deviation among them, in the locations' units; infinite if nothing holds them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -1,9 +1,9 @@
 """Errors of directions that share keypoints: samples of them, for the uncertainty of the locations.
 
-The noise of a keypoint enters every pair that matches it. A track of m images gives 2 m - 3 constraints on the
-cameras, its m (m - 1) / 2 matches many more; pairs taken as independent promise up to several times too small
-standard deviations. So the directions' errors are sampled together: every keypoint gets a random sign along
-each axis of its image, a match's residual follows from its two keypoints, the Sampson error to first order,
+The noise of a keypoint enters every pair that matches it. A track of m images gives 2 m - 3 constraints on
+the cameras, its m (m - 1) / 2 matches many more; pairs taken as independent promise up to several times too
+small standard deviations. So the directions' errors are sampled together: every keypoint gets a random sign
+along each axis of its image, a match's residual follows from its two keypoints, to first order
 
     r = (e_a . (b x v) + e_b . (v x a)) / sqrt(|a x v|^2 + |b x v|^2),
 
@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.jit import kernel
 
@@ -57,7 +57,7 @@ def sample_direction_errors(
         (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
     scores = np.zeros((len(pairs), NUM_SAMPLES, 3))
-    known = np.isfinite(directions).all(axis=1)
+    known: BoolArray = np.isfinite(directions).all(axis=1)
     v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
     _add_scores(
         pairs,

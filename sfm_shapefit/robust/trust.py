@@ -2,18 +2,19 @@
 
     trust = min(1, agreement / usual) * hold
 
-agreement    the share of the camera's matches with the main body of cameras that agree with the solution, with a
-             prior of a few matches for and as many against. A pair agrees if its direction lies within
-             3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts if the direction
+agreement    the share of the camera's matches with the main body of cameras that agree with the solution, with
+             a prior of a few matches for and as many against. A pair agrees if its direction lies within 3
+             degrees, or 5 of its standard deviations, of the solved baseline. It contradicts if the direction
              lies farther off, or if it has none because most of its matches contradict the given rotations.
              A pair counts with its number of matches, up to a limit.
-usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere, having its
-             part of them says nothing against a camera.
-hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median distance of
-             the cameras from their median: 1 where the pairs hold the camera, 1/2 where they leave 10 % open.
+usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere, having
+             its part of them says nothing against a camera.
+hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median distance
+             of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they leave 10 % open.
 
-So 1 means that much evidence agrees and nothing is loose, 1/2 that there is no evidence either way, and
-below that more speaks against the camera than for it.
+So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. In a clean scene 2/3
+means that there is no evidence either way; a camera whose matches speak against it as much as for it has
+1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
 
 Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
 symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
@@ -39,6 +40,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _AGREEING_ANGLE_RAD = np.radians(3.0)
 _AGREEING_SIGMAS = 5.0
+_MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
 _PRIOR = 15.0  # matches for the camera, and as many against
 _MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
@@ -59,8 +61,8 @@ class Evidence:
     contradicting_support: IntArray
     """(q,) their number of matches."""
     errors: FloatArray | None = None
-    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that share
-    keypoints (`shared_noise`); the pairs' errors are independent if None."""
+    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
+    share keypoints (`shared_noise`); the pairs' errors are independent if None."""
 
     def restricted_to(self, edges: IntArray, cameras: IntArray, num_cameras: int) -> "Evidence":
         """Return the evidence for a graph of some of the edges and cameras, renumbered.
@@ -119,7 +121,10 @@ def judge_cameras(
     """
     num_cameras = len(conditioning.num_pairs)
     votes = _votes(graph, angles, sigmas_of_pairs, evidence)
-    body = main_body(graph.num_cameras, votes.pairs, np.where(votes.agrees, votes.weights, -votes.weights))
+    body: BoolArray = np.ones(graph.num_cameras, dtype=np.bool_)
+    if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
+        signed = np.where(votes.agrees, votes.weights, -votes.weights)
+        body = main_body(graph.num_cameras, votes.pairs, signed)
     agreement = _shares(votes, body)[:num_cameras]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
@@ -128,9 +133,7 @@ def judge_cameras(
     reasons = [""] * num_cameras
     for k in np.flatnonzero(trust < _LOW).tolist():
         reasons[k] = _reason(float(agreement[k]), usual, conditioning.causes[k], bool(few[k]))
-    return CameraTrust(
-        trust=trust, agreement=agreement, body=body[:num_cameras], reasons=tuple(reasons)
-    )
+    return CameraTrust(trust=trust, agreement=agreement, body=body[:num_cameras], reasons=tuple(reasons))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -218,11 +221,11 @@ def _contract(
 
 
 def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
-    """Return tau^2 / (tau^2 + sigma^2) of each camera."""
+    """Return tau^2 / (tau^2 + sigma^2) of each camera, 1 where sigma is not known."""
     tau = _HOLD_SHARE * median_spread(centers)
     if not tau > 0.0:
-        return np.where(np.isfinite(largest_sigmas), 1.0, 0.0)
-    return np.asarray(1.0 / (1.0 + (largest_sigmas / tau) ** 2))
+        return np.where(np.isinf(largest_sigmas), 0.0, 1.0)
+    return np.asarray(1.0 / (1.0 + (np.nan_to_num(largest_sigmas, nan=0.0, posinf=np.inf) / tau) ** 2))
 
 
 def _reason(agreement: float, usual: float, cause: Looseness | None, few: bool) -> str:

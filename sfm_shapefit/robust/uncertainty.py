@@ -11,7 +11,7 @@ orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
     A = H + K K^T with one camera grounded and one baseline's length held is regular and as sparse as H;
     A^-1 at the nodes and edges comes from its Cholesky factor (`laplacian.selected`);
     C = S A^-1 S^T with S = I - N F^T is the covariance with F^T t held fixed, N spanning the null space and
-    F^T N = I (the S-transformation: Baarda 1973; Teunissen 1985, "Zero order design"): a change of rank d + 1.
+    F^T N = I (the S-transformation: Baarda 1973; Teunissen 1985, "Zero order design"), of rank d + 1.
 
 F is the centroid and the scale of the cameras that are held; cameras that nearly nothing holds would
 otherwise lend their uncertainty to all others.
@@ -36,11 +36,13 @@ from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.solver.program import differences
 
 _RIDGES = (1e-12, 1e-10, 1e-8)  # of each block's trace: what nothing holds becomes large, not singular
 _LOOSE = 0.2  # standard deviation, in spreads, from which a camera may not decide the gauge
 _LOOSENING_ROUNDS = 20
+_MAX_BYTES = 2_000_000_000  # of the factor; beyond, standard deviations are left out
 _SHORTEST = 1e-12  # of the longest baseline
 
 
@@ -63,7 +65,7 @@ class Uncertainty:
     def sigmas(self) -> FloatArray:
         """Standard deviations along the axes, (n, d)."""
         if self.samples is not None:
-            return np.sqrt(np.mean(self.samples**2, axis=2))
+            return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
         variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
         return np.sqrt(np.maximum(variances, 0.0))
 
@@ -74,7 +76,7 @@ def propagate(
     information: FloatArray,
     num_cameras: int | None = None,
     errors: FloatArray | None = None,
-) -> Uncertainty:
+) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
     Args:
@@ -85,6 +87,9 @@ def propagate(
         errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
             information if None.
 
+    Returns:
+        None if the factor would take more than 2 GB: about a hundred thousand cameras in space.
+
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
     """
@@ -94,7 +99,10 @@ def propagate(
     units = baselines / np.maximum(lengths, _SHORTEST * lengths.max())[:, None]
     across = _across(information, units)
     blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
-    factor = _grounded_factor(n, edges, blocks, units, lengths, locations)
+    plan = analyse(n, edges, coordinates=locations)
+    if plan.num_bytes(d) > _MAX_BYTES:
+        return None
+    factor = _grounded_factor(plan, blocks, units, lengths)
     inverse = selected_inverse(factor, edges)
 
     i, j = edges.T
@@ -136,28 +144,22 @@ def _across(information: FloatArray, units: FloatArray) -> FloatArray:
 
 
 def _grounded_factor(
-    n: int,
-    edges: IntArray,
-    blocks: FloatArray,
-    units: FloatArray,
-    lengths: FloatArray,
-    locations: FloatArray,
+    plan: SymbolicFactor, blocks: FloatArray, units: FloatArray, lengths: FloatArray
 ) -> CholeskyFactor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
     d = units.shape[1]
     traces = np.trace(blocks, axis1=1, axis2=2)
     longest = int(np.argmax(lengths))
-    plan = analyse(n, edges, coordinates=locations)
-    failure: UnsolvableError | None = None
+    held = traces[longest] * np.outer(units[longest], units[longest])
     for ridge in _RIDGES:
-        held = blocks + ridge * traces[:, None, None] * np.eye(d)
-        held[longest] += traces[longest] * np.outer(units[longest], units[longest])
+        regular = blocks + ridge * traces[:, None, None] * np.eye(d)
+        regular[longest] += held
         try:
-            return factorise(plan, held)
-        except UnsolvableError as error:
-            failure = error
-    assert failure is not None
-    raise failure
+            return factorise(plan, regular)
+        except UnsolvableError:
+            if ridge == _RIDGES[-1]:
+                raise
+    raise AssertionError("unreachable")
 
 
 def _held(

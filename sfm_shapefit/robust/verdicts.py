@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
 from sfm_shapefit.rigidity import parallel_rigid_pieces
@@ -75,7 +75,8 @@ class Assessment:
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     sigmas: FloatArray
     """(n, d) standard deviation of each location in the units of `locations`, with centroid and scale
-    of the cameras held fixed; infinite for nodes outside the largest rigid piece of the inlier pairs."""
+    of the cameras held fixed; infinite for nodes outside the largest rigid piece of the inlier pairs; NaN,
+    all of them, where the graph is too large for its factor."""
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""
@@ -138,7 +139,7 @@ def assess(
 
 
 def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> FloatArray:
-    """Return the residual angles as vectors (m, d - 1) in the tangent bases; pi long where cameras coincide."""
+    """Return the residual angles as vectors (m, d - 1) in tangent bases; pi long where cameras coincide."""
     units = normalized(baselines)
     angles = np.radians(angle_between_deg(directions, units))
     tangential = np.einsum("edk,ed->ek", tangent_bases(directions), units)
@@ -235,11 +236,14 @@ def _propagated(
     cameras = int(np.sum(held < num_cameras))
     if cameras < _SMALLEST_RIGID:
         return sigmas, leverages
+    unknown = np.full(locations.shape, np.nan), np.where(inliers, np.nan, 0.0)
     try:
         samples = None if errors is None else errors[rows]
         found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
-    except UnsolvableError:  # singular in spite of the ridge: nothing is known
-        return sigmas, leverages
+    except UnsolvableError:  # singular in spite of the ridge
+        return unknown
+    if found is None:
+        return unknown
     extent = np.ptp(locations[held], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
     sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
