@@ -35,8 +35,9 @@ class CameraRow:
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
-    """How far it is to be trusted, in [0, 1]: the share of its matches with well-tied cameras that agree with
-    the solution, compared with what is usual in the scene, and lowered where it is loose. See `robust.trust`."""
+    """How far it is to be trusted, in [0, 1]: the share of its matches with the main body of cameras that
+    agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
+    `robust.trust`."""
     sigma: tuple[float, ...] = ()
     """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""

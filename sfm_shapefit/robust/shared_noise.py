@@ -57,7 +57,7 @@ def sample_direction_errors(
         (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
     scores = np.zeros((len(pairs), NUM_SAMPLES, 3))
-    known: BoolArray = np.isfinite(directions).all(axis=1)
+    known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
     v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
     _add_scores(
         pairs,

@@ -2,15 +2,16 @@
 
     trust = min(1, agreement / usual) * hold
 
-agreement    the share of the camera's matches with the main body of cameras that agree with the solution, with
-             a prior of a few matches for and as many against. A pair agrees if its direction lies within 3
-             degrees, or 5 of its standard deviations, of the solved baseline. It contradicts if the direction
-             lies farther off, or if it has none because most of its matches contradict the given rotations.
-             A pair counts with its number of matches, up to a limit.
-usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere, having
-             its part of them says nothing against a camera.
-hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median distance
-             of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they leave 10 % open.
+agreement    the share of the camera's matches with the main body of cameras that agree with the
+             solution, with a prior of a few matches for and as many against. A pair agrees if its direction
+             lies within 3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts
+             if the direction lies farther off, or if it has none because most of its matches contradict
+             the given rotations. A pair counts with its number of matches, up to a limit.
+usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere,
+             having its part of them says nothing against a camera.
+hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median
+             distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
+             leave 10 % open.
 
 So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. In a clean scene 2/3
 means that there is no evidence either way; a camera whose matches speak against it as much as for it has
