@@ -64,7 +64,7 @@ def test_a_camera_that_hardly_anything_holds_does_not_decide_the_gauge_of_the_ot
     assert np.flatnonzero(~found.gauge).tolist() == [7]
     assert found.sigmas[7].min() > 1.0
     undisturbed = propagate(problem.locations, problem.edges, isotropic(len(problem.edges)))
-    # The pairs of camera 7 are lost to the others, 3 % of all; infected, they would be off by its 1e2 or more.
+    # The others lose the pairs of camera 7, 3 % of all; infected, they would be off by its 1e2 or more.
     np.testing.assert_allclose(found.sigmas[others], undisturbed.sigmas[others], rtol=1.0)
 
 
@@ -124,7 +124,15 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
 
     covariances = np.linalg.inv(bases.transpose(0, 2, 1) @ information(first, second) @ bases)  # of 1 px
     sampled = sample_direction_errors(
-        scene.pairs, scene.match_offsets, scene.matches, (first, second), pixels, v, covariances, pixels**0, 2.0
+        scene.pairs,
+        scene.match_offsets,
+        scene.matches,
+        (first, second),
+        pixels,
+        v,
+        covariances,
+        pixels**0,
+        2.0,
     )
     sampled = sampled.transpose(1, 0, 2).reshape(len(sampled[0]), -1)
 
@@ -140,7 +148,7 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
     # Away from the image's centre a pixel is a smaller angle, in a real scene a smaller noise.
     measured /= np.mean(np.diag(measured))
     assert np.mean(np.diag(predicted)) == pytest.approx(1.0, abs=0.05)
-    # Entries scatter by 0.10 (96 samples) and 0.05 (400 draws); independent pairs would have 0 off the blocks.
+    # Entries scatter by 0.10 (96 samples) and 0.05 (400 draws); independent pairs have 0 off the blocks.
     between = np.kron(np.eye(scene.num_pairs), np.ones((2, 2))) == 0
     assert np.corrcoef(predicted[between], measured[between])[0, 1] > 0.8
     assert np.polyfit(measured[between], predicted[between], 1)[0] == pytest.approx(1.0, abs=0.15)

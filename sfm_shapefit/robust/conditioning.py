@@ -7,7 +7,7 @@ all of these. Here its loose cameras are put into groups that move together, wit
 
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
-    on a line   the group and its neighbours lie on a line, along which nothing fixes their spacing
+    on a line   the group lies on a line, along which nothing fixes their spacing
     together    each camera is held well by its neighbours, the group is not held by the rest
 """
 
@@ -26,6 +26,7 @@ LOOSE_SHARE = 0.05
 """Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
 FEW_PAIRS = 2
 _PARALLEL = 0.02  # least over largest eigenvalue of sum I - u u^T: directions within about 8 degrees
+_SMALLEST_LINE = 3  # cameras
 _ON_A_LINE = 0.02  # second over first singular value of the positions
 
 
@@ -92,7 +93,7 @@ def condition(
     groups = []
     for label in np.unique(labels[loose]).tolist():
         members = np.flatnonzero(loose & (labels == label))
-        if _is_straight(locations, used, members):
+        if _is_straight(locations[members]):
             for camera in members.tolist():
                 causes[camera] = Looseness.ON_A_LINE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
@@ -133,13 +134,11 @@ def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:
     return Looseness.TOGETHER if np.isfinite(sigma) else Looseness.UNTIED
 
 
-def _is_straight(locations: FloatArray, edges: IntArray, members: IntArray) -> bool:
-    """Return whether a loose group of three or more lies on a line, its neighbours included."""
-    if len(members) < 3:
+def _is_straight(positions: FloatArray) -> bool:
+    """Return whether the positions of a loose group, three or more, lie on a line."""
+    if len(positions) < _SMALLEST_LINE:
         return False
-    near = edges[np.isin(edges, members).any(axis=1)]
-    around = locations[np.unique(np.concatenate([near.ravel(), members]))]
-    values = np.linalg.svd(around - around.mean(axis=0), compute_uv=False)
+    values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
     return bool(values[1] < _ON_A_LINE * values[0])
 
 

@@ -13,8 +13,8 @@ orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
     C = S A^-1 S^T with S = I - N F^T is the covariance with F^T t held fixed, N spanning the null space and
     F^T N = I (the S-transformation: Baarda 1973; Teunissen 1985, "Zero order design"), of rank d + 1.
 
-F is the centroid and the scale of the cameras that are held; cameras that nearly nothing holds would
-otherwise lend their uncertainty to all others.
+F is the centroid and the scale of the cameras that are held and stand among the others; one that nearly
+nothing holds would lend its uncertainty to all, and one that stands far off would set the scale alone.
 
 Directions whose errors are correlated (`shared_noise`) do not have the covariance A^-1. For them the errors
 are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and the
@@ -41,6 +41,7 @@ from sfm_shapefit.solver.program import differences
 
 _RIDGES = (1e-12, 1e-10, 1e-8)  # of each block's trace: what nothing holds becomes large, not singular
 _LOOSE = 0.2  # standard deviation, in spreads, from which a camera may not decide the gauge
+_FAR = 10.0  # spreads from the cameras' median, beyond which a camera may not either
 _LOOSENING_ROUNDS = 20
 _MAX_BYTES = 2_000_000_000  # of the factor; beyond, standard deviations are left out
 _SHORTEST = 1e-12  # of the longest baseline
@@ -166,7 +167,7 @@ def _held(
     factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the covariances in the gauge of the cameras that are held, and which these are."""
-    gauge = is_camera.copy()
+    gauge = is_camera & _is_near(locations, is_camera)
     least = max(3, int(np.sum(is_camera)) // 2)
     for _ in range(_LOOSENING_ROUNDS):
         covariances = _in_gauge(factor, inverse, locations, gauge)
@@ -179,6 +180,14 @@ def _held(
             break
         gauge = kept
     return covariances, gauge
+
+
+def _is_near(locations: FloatArray, is_camera: BoolArray) -> BoolArray:
+    """Return which nodes stand within a few spreads of the cameras' median."""
+    cameras = locations[is_camera]
+    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
+    near: BoolArray = distances <= _FAR * median_spread(cameras)
+    return near
 
 
 def _in_gauge(

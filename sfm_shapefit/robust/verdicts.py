@@ -6,10 +6,11 @@ errors of the given rotations:
 
     chi2_e = r_e^T (Sigma_e + s^2 I)^-1 r_e,    r_e in the tangent plane of v_e.
 
-s makes the median of chi2 over the agreeing pairs what it should be. A residual is smaller than its error,
-because the solution bends towards the measurement: over least squares by the redundancy
-1 - unknowns / equations, while a sum of norms fits as many directions exactly as it has unknowns, and leaves
-the others alone. The locations tell which of the two they come from.
+s makes the median of chi2 over the agreeing pairs what it should be. Whether a pair agrees is judged with the
+level of all residuals in place of s, which is more: neither covariances nor locations are exact. A residual
+is smaller than its error, because the solution bends towards the measurement: over least squares by the
+redundancy 1 - unknowns / equations, while a sum of norms fits as many directions exactly as it has unknowns,
+and leaves the others alone. The locations tell which of the two they come from.
 
 How uncertain the locations are, and how much a pair decides for itself, is `uncertainty`; what all pairs of a
 camera say together is `trust`.
@@ -33,14 +34,15 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
 _LARGEST_FITTED_SHARE = 0.3  # keeps the quantile below 0.65, so that a third of the pairs may be wrong
+_LARGEST_SHARE = 0.9  # of the equations taken up by unknowns: beyond, residuals hardly speak
 _EXACTLY_FITTED = 1e-3  # of the median residual; a normal residual is below it once in a million times
 _MIN_FITTED_SHARE = 0.02  # of the pairs: then the locations come from a sum of norms
 _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
 _BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
-_UNCHECKED_LEVERAGE = 0.95
-"""Leverage from which agreement means nothing: an error shows in the residual with 5 % of its size."""
+_UNCHECKED_LEVERAGE = 0.99
+"""Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size."""
 
 
 class Verdict(enum.Enum):
@@ -162,10 +164,10 @@ def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[
 def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
     """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
     share, is_exact = _fitted_share(angles, num_unknowns, freedom)
-    share = min(share, _LARGEST_FITTED_SHARE)
+    share = min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE)
     median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
     quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
-    shrunk = 1.0 if is_exact else np.sqrt(1.0 - share)
+    shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
     return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
 
 
@@ -179,20 +181,20 @@ def _excess(
     squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
     limit = chdtri(freedom, _OUTLIER_PROBABILITY)
     used: BoolArray = np.ones(len(angles), dtype=np.bool_)
-    excess = _MIN_LEVEL_RAD
+    inliers = used
     for _ in range(_LEVEL_ROUNDS):
-        share, is_exact = _fitted_share(angles[used], num_unknowns, freedom)
-        share = min(share, _LARGEST_FITTED_SHARE) if is_exact else min(share, 0.9)
-        rank = (1.0 + share) / 2.0 if is_exact else 0.5
-        wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
-        excess = _matching_excess(squares[used], values[used], rank, wanted)
-        chi2 = np.sum(squares / (values + excess**2), axis=1)
-        agreeing = (chi2 <= limit) & ~behind
-        if not agreeing.any() or np.array_equal(agreeing, used):
+        level = _level(angles[used], num_unknowns, freedom)
+        inliers = (np.sum(squares / (values + level**2), axis=1) <= limit) & ~behind
+        if not inliers.any():
+            return level, inliers
+        if np.array_equal(inliers, used):
             break
-        used = agreeing
-    chi2 = np.sum(squares / (values + excess**2), axis=1)
-    return excess, (chi2 <= limit) & ~behind
+        used = inliers
+    share, is_exact = _fitted_share(angles[inliers], num_unknowns, freedom)
+    share = min(share, _LARGEST_FITTED_SHARE) if is_exact else min(share, _LARGEST_SHARE)
+    rank = (1.0 + share) / 2.0 if is_exact else 0.5
+    wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
+    return _matching_excess(squares[inliers], values[inliers], rank, wanted), inliers
 
 
 def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wanted: float) -> float:
