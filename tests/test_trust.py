@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from scenes import COURTYARD, real_scene
 
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
@@ -11,6 +10,7 @@ from sfm_shapefit.robust.trust import Evidence, main_body
 from sfm_shapefit.robust.verdicts import assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import COURTYARD, real_scene
 
 WRONG_OF_LEGO = {f"train_r_{k}.png" for k in (4, 15, 22, 25, 74)}
 
