@@ -92,8 +92,8 @@ def locate(
         with clock("solve"):
             graph = _view_graph(model, directions)
             known = directions.covariance[directions.usable()]
-            errors = _shared_errors(model, matches, directions, inputs.source, options)
-            placement = place(graph, options.for_solver(), known, _evidence(directions, errors))
+            errors = shared_errors(model, matches, directions, inputs.source, options)
+            placement = place(graph, options.for_solver(), known, evidence_of(directions, errors))
             kept = _trusted(placement, options.min_trust)
             locations = placement.solve.locations[kept]
             gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
@@ -224,7 +224,7 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def _shared_errors(
+def shared_errors(
     model: PosedModel,
     matches: MatchDatabase | None,
     directions: PairDirections,
@@ -253,7 +253,7 @@ def _shared_errors(
     return errors[usable]
 
 
-def _evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
+def evidence_of(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
     """Return what the matches say of the cameras beyond the usable directions."""
     usable = directions.usable()
     against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]

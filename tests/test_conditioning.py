@@ -67,7 +67,7 @@ def test_a_camera_on_two_pairs_of_nearly_one_direction_says_how_few_they_are():
 def test_a_group_on_a_narrow_bridge_moves_together():
     rng = np.random.default_rng(5)
     block = rng.standard_normal((12, 3))
-    group = rng.standard_normal((8, 3)) + [40.0, 0.0, 0.0]
+    group = rng.standard_normal((8, 3)) + np.array([40.0, 0.0, 0.0])
     edges = all_pairs(12) + [(12 + i, 12 + j) for i, j in all_pairs(8)]
     edges += [(0, 12), (1, 13), (2, 14)]
     found = judged(np.concatenate([block, group]), np.array(edges))
