@@ -1,8 +1,9 @@
 """Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognised?
 
 Calibration: scenes of known truth, directions with known or unknown covariances, and photographed scenes
-through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are. They are those of the refined system,
-so the limits hold for locations refined by robust least squares; the program's own optimum is less exact.
+through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are.
+They are those of the refined system, so the limits hold for locations refined by robust least squares; the
+program's own optimum is less exact.
 
 Ranking: graphs in which some cameras are worse than others, for one of three reasons. A camera is bad if its
 error is more than three times the median; the area under the curve (AUC) is the probability that a bad camera
