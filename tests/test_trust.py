@@ -40,19 +40,19 @@ def test_cameras_of_a_clean_graph_are_fully_trusted_without_reasons():
 
 def test_a_group_that_agrees_only_with_itself_is_not_trusted():
     t, edges, v = clean(30, 1)
-    group = edges < 5
+    group = edges < 7
     crossing = group.any(axis=1) & ~group.all(axis=1)
     rng = np.random.default_rng(1)
     v[crossing] = normalized(rng.standard_normal((int(crossing.sum()), 3)))
-    support = np.where(group.all(axis=1), 1500, 60)  # its own pairs have most of all matches
+    support = np.where(group.all(axis=1), 1500, 30)  # its own pairs have most of all matches
     evidence = Evidence(
         support=support,
         contradicting=np.zeros((0, 2), dtype=np.int64),
         contradicting_support=np.zeros(0, dtype=np.int64),
     )
     found = assess(ViewGraph(30, edges, v), t, evidence=evidence)
-    assert found.trust[:5].max() < 0.3
-    assert found.trust[5:].min() > 0.9
+    assert found.trust[:7].max() < 0.3
+    assert found.trust[7:].min() > 0.9
     assert "rotation" in found.reasons[0]
 
 
@@ -74,6 +74,18 @@ def test_where_a_part_of_the_pairs_is_wrong_everywhere_nobody_is_blamed():
     bad = rng.random(len(edges)) < 0.35
     v[bad] = normalized(rng.standard_normal((int(bad.sum()), 3)))
     assert assess(ViewGraph(40, edges, v), t, evidence=supported(len(edges))).trust.min() > 0.7
+
+
+def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
+    t, edges, v = clean(40, 4, density=0.3)
+    against = np.sort(np.random.default_rng(4).integers(40, size=(3 * len(edges), 2)), axis=1)
+    against = against[against[:, 0] != against[:, 1]]
+    evidence = Evidence(
+        support=np.full(len(edges), 60),
+        contradicting=against,
+        contradicting_support=np.full(len(against), 60),
+    )
+    assert assess(ViewGraph(40, edges, v), t, evidence=evidence).trust.min() > 0.6
 
 
 def test_evidence_follows_its_cameras_and_pairs():
