@@ -7,9 +7,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import graph_peers, real, scale, solver
+from benchmarks import graph_peers, real, scale, solver, trust
 
-SUBCOMMANDS = {"real": real, "solver": solver, "scale": scale, "peers-graphs": graph_peers}
+SUBCOMMANDS = {"real": real, "solver": solver, "scale": scale, "peers-graphs": graph_peers, "trust": trust}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

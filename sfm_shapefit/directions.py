@@ -52,6 +52,10 @@ class DirectionStatus(enum.Enum):
     ROTATION_MISMATCH = "the relative rotation contradicts the given rotations"
 
 
+CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MISMATCH)
+"""The reasons that speak against the given rotations."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DirectionOptions:
     """What a pair must show before its direction is believed."""

@@ -57,6 +57,9 @@ class LocateOptions:
     """3D points seen under a smaller angle are dropped."""
     bundle_adjust: bool = False
     """Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."""
+    min_trust: float = 0.6
+    """Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. See the
+    column trust of cameras.csv."""
     threads: int = 0
     """Threads to use; 0 means one per core. The answer does not depend on it."""
 
@@ -73,6 +76,8 @@ class LocateOptions:
             choices = get_args(kind)
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        if not 0.0 <= self.min_trust <= 1.0:
+            raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
         self.for_placement()

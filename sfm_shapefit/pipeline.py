@@ -6,7 +6,7 @@ Each stage is one function from values to a new value; the input is never change
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
 from sfm_shapefit.directions import (
+    CONTRADICTIONS,
     DirectionStatus,
     PairDirections,
     concatenate,
@@ -32,8 +33,10 @@ from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement, place
-from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings
+from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings, trust_warnings
 from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.tracks import JointGraph, build_tracks, covering_set, join_points
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -41,6 +44,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_FEWEST_KEPT = 3  # cameras; fewer trusted ones are no result
+_MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -86,13 +91,18 @@ def locate(
         with clock("directions"):
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("solve"):
-            graph = _joint_graph(model, matches, directions, options)
-            placement = place(graph.graph, options.for_placement(), graph.covariance, graph.num_cameras)
-            locations = placement.locations
-            gauge = choose_gauge(locations, model.centers[placement.cameras], options.scale)
+            joint = _joint_graph(model, matches, directions, options)
+            errors = shared_errors(model, matches, directions, inputs.source, options)
+            evidence = _with_points(evidence_of(directions, errors), joint)
+            placement = place(
+                joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras
+            )
+            kept = _trusted(placement, options.min_trust)
+            locations = placement.locations[kept]
+            gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
-            seed, tracks = _seed_and_tracks(model, matches, placement, centers, clock)
+            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock)
             adjusted = None
             if not options.bundle_adjust:  # which triangulates at the seed's poses itself
                 seeded = triangulate(seed, tracks, options.for_structure())
@@ -110,10 +120,11 @@ def locate(
         model=model,
         directions=directions,
         placement=placement,
+        kept=kept,
         gauge=gauge,
         adjusted=adjusted,
         timings_s=clock.seconds,
-        warnings=tuple(_warnings(matches, placement, gauge, seeded.num_points3D())),
+        warnings=tuple(_warnings(matches, placement, kept, gauge, seeded.num_points3D())),
     )
 
 
@@ -230,18 +241,81 @@ def _joint_graph(
     return join_points(graph, covariance, chosen, pixel_angles)
 
 
+def shared_errors(
+    model: PosedModel,
+    matches: MatchDatabase | None,
+    directions: PairDirections,
+    source: Source,
+    options: LocateOptions,
+) -> FloatArray | None:
+    """Return samples of the usable directions' errors, which share keypoints; None if not known."""
+    usable = directions.usable()
+    if source == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
+        return None
+    row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
+    errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
+    for batch in track_matches(model, 1) if matches is None else matches.iter_matches(1):
+        rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
+        errors[rows] = sample_direction_errors(
+            batch.pairs,
+            batch.offsets,
+            batch.keypoints,
+            (batch.rays_i, batch.rays_j),
+            1.0 / model.focal_lengths_px[batch.pairs].min(axis=1),
+            directions.directions[rows],
+            directions.covariance[rows],
+            1.4826 * directions.median_residual_px[rows],
+            options.inlier_threshold_px,
+        )
+    return errors[usable]
+
+
+def evidence_of(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
+    """Return what the matches say of the cameras beyond the usable directions."""
+    usable = directions.usable()
+    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
+    return Evidence(
+        support=directions.num_matches[usable],
+        contradicting=directions.pairs[against].reshape(-1, 2),
+        contradicting_support=directions.num_matches[against],
+        errors=errors,
+    )
+
+
+def _with_points(evidence: Evidence, joint: JointGraph) -> Evidence:
+    """Return the evidence with a row for each direction to a point: one match, errors of their own."""
+    own = joint.covariance[len(evidence.support) :]
+    support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
+    if evidence.errors is None:
+        return replace(evidence, support=support)
+    draws = np.random.default_rng(0).standard_normal((len(own), *evidence.errors.shape[1:]))
+    sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    errors = np.concatenate([evidence.errors, sigmas[:, None, :] * draws])
+    return replace(evidence, support=support, errors=errors)
+
+
+def _trusted(placement: Placement, min_trust: float) -> BoolArray:
+    """Return which of the placed cameras are trusted enough; all, if hardly any is."""
+    kept: BoolArray = placement.assessment.trust >= min_trust
+    return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
+
+
 def _seed_and_tracks(
     model: PosedModel,
     matches: MatchDatabase | None,
     placement: Placement,
-    centers: FloatArray,
+    located: tuple[BoolArray, FloatArray],
     clock: _Clock,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
-    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
+    """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
+
+    `located` says which of the placement's cameras are kept, and where those are in the output's units.
+    """
+    kept, centers = located
     placed = np.zeros(model.num_images, dtype=np.bool_)
-    placed[placement.cameras] = True
+    placed[placement.cameras[kept]] = True
     all_centers = np.full((model.num_images, 3), np.nan)
-    all_centers[placement.cameras] = centers
+    all_centers[placement.cameras[kept]] = centers
     if matches is None:
         return build_seed(model, placed, all_centers), model.reconstruction
     seed = build_seed(model, placed, all_centers, matches.keypoints)
@@ -277,10 +351,11 @@ def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterat
 
 
 def _warnings(
-    matches: MatchDatabase | None, placement: Placement, gauge: Gauge, num_points: int
+    matches: MatchDatabase | None, placement: Placement, kept: BoolArray, gauge: Gauge, num_points: int
 ) -> Iterator[str]:
     """Yield what the user should know beyond the tables."""
     yield from quality_warnings(placement)
+    yield from trust_warnings(placement, kept)
     if gauge.warning:
         yield gauge.warning
     if num_points == 0:

@@ -9,6 +9,7 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
 from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.solve import solve
@@ -78,6 +79,7 @@ def place(
     graph: ViewGraph,
     options: PlacementOptions | None = None,
     covariance: FloatArray | None = None,
+    evidence: Evidence | None = None,
     num_cameras: int | None = None,
 ) -> Placement:
     """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
@@ -86,6 +88,7 @@ def place(
         graph: any view graph with at least one edge; what its largest rigid piece leaves out is not placed.
         options: settings; defaults if None.
         covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
+        evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
         num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
 
     Raises:
@@ -102,27 +105,18 @@ def place(
     piece, _ = graph.restricted_to(pieces[0].edges)
     known = None if covariance is None else covariance[pieces[0].edges]
     classes = np.max(graph.edges[pieces[0].edges] >= num_cameras, axis=1).astype(np.int64)
+    heard = evidence and evidence.restricted_to(pieces[0].edges, pieces[0].cameras, graph.num_cameras)
     solved = solve(piece, options)
     finished = finish(piece, solved, options, known, classes)
+    placed = int(np.sum(pieces[0].cameras < num_cameras))
     return Placement(
         graph=graph,
         num_cameras=num_cameras,
         pieces=pieces,
         solve=solved,
         finish=finished,
-        assessment=assess(piece, finished.locations, _with_levels(piece, finished, known, classes)),
+        assessment=assess(piece, finished.locations, known, heard, placed),
     )
-
-
-def _with_levels(
-    graph: ViewGraph, finished: Finish, covariance: FloatArray | None, classes: IntArray
-) -> FloatArray | None:
-    """Return the covariances, with the level of each class added where there are two classes."""
-    if not classes.any():
-        return covariance
-    own = 0.0 if covariance is None else np.nan_to_num(covariance)
-    levels = np.radians(np.array(finished.levels_deg))[classes]
-    return np.asarray(own + levels[:, None, None] ** 2 * np.eye(graph.dimension - 1))
 
 
 def _most_cameras_first(pieces: list[RigidPiece], num_cameras: int) -> list[RigidPiece]:

@@ -27,7 +27,7 @@ class CameraRow:
     name: str
     placed: bool = False
     reason: str = ""
-    """Why it is not placed."""
+    """Why it is not placed or, if it is, why its trust is low."""
     piece: int | None = None
     """The parallel-rigid piece it belongs to, 0 the solved one; None outside every piece of 3 cameras."""
     center: tuple[float, ...] = ()
@@ -35,7 +35,9 @@ class CameraRow:
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
-    """Share of its pairs that agree with the solution, in [0, 1]."""
+    """How far it is to be trusted, in [0, 1]: the share of its matches with the main body of cameras that
+    agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
+    `robust.trust`."""
     sigma: tuple[float, ...] = ()
     """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
@@ -57,6 +59,8 @@ class PairRow:
     """Angle between the direction and the solved baseline."""
     dual_norm: float = math.nan
     """||y_e|| / w_e of the certificate; below 1 for directions that the solution fits exactly."""
+    leverage: float = math.nan
+    """Share of its own fitted direction that it decides itself, in [0, 1]; 0 for outliers."""
     verdict: str = Verdict.UNDETERMINED.value
     """inlier, outlier, or undetermined."""
     reason: str = ""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit import __version__
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.seed import write_model
@@ -42,6 +42,7 @@ _SMALLEST_PIECE = 3  # cameras; two cameras of one pair are no piece worth a lin
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
 _ALARMING_LEVEL_DEG = 5.0
 _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
+_UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 
 
@@ -74,6 +75,8 @@ class LocateResult:
     placement: Placement
     """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
     largest rigid piece solved, and the evidence for it, in the solver's units."""
+    kept: BoolArray
+    """Which of the placement's cameras are in the output; the others are not trusted enough."""
     gauge: Gauge
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
@@ -96,9 +99,10 @@ class LocateResult:
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        placed_ids = self.model.image_ids[self.placement.cameras].tolist()
-        images = [self.reconstruction.image(image_id) for image_id in placed_ids]
-        centers = np.array([image.projection_center() for image in images])
+        kept_ids = self.model.image_ids[self.placement.cameras[self.kept]].tolist()
+        images = [self.reconstruction.image(image_id) for image_id in kept_ids]
+        centers = np.full((len(self.kept), 3), np.nan)
+        centers[self.kept] = [image.projection_center() for image in images]
         rows = camera_rows(self.placement, centers, self.gauge.similarity.scale)
         for camera, reason in _without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
@@ -150,7 +154,8 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
 
     Args:
         placement: the graph and its solution.
-        centers: (k, d) centres of the placed cameras in the output's units.
+        centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
+            because they are not trusted.
         scale: the output's units in one unit of the solver.
     """
     graph = placement.graph
@@ -166,12 +171,15 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
         if k is None:
             rows.append(replace(row, reason=reasons[camera]))
             continue
+        kept = bool(np.isfinite(centers[k]).all())
+        trust, reason = float(placement.assessment.trust[k]), placement.assessment.reasons[k]
         rows.append(
             replace(
                 row,
-                placed=True,
-                center=tuple(centers[k].tolist()),
-                trust=float(placement.assessment.trust[k]),
+                placed=kept,
+                reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
+                center=tuple(centers[k].tolist()) if kept else (),
+                trust=trust,
                 sigma=tuple(sigmas[k].tolist()),
             )
         )
@@ -196,13 +204,15 @@ def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
         if e is None:
             rows.append(replace(row, reason="outside the piece that is solved"))
             continue
-        verdict = Verdict.INLIER if assessment.inliers[e] else Verdict.OUTLIER
+        verdict = assessment.verdict(e)
         rows.append(
             replace(
                 row,
                 residual_deg=float(assessment.residuals_deg[e]),
                 dual_norm=float(dual_norms[e]),
+                leverage=float(assessment.leverages[e]),
                 verdict=verdict.value,
+                reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
             )
         )
     return rows
@@ -234,7 +244,8 @@ def summary(found: LocateResult) -> dict[str, Any]:
         },
         "options": asdict(found.options),
         "num_images": len(_all_names(found)),
-        "num_placed": len(placement.cameras),
+        "num_placed": int(np.sum(found.kept)),
+        "not_trusted": _not_trusted(found),
         "num_pairs": len(found.directions.pairs),
         "num_pairs_rejected": num_unusable + len(placement.rejected_pairs),
         "pairs": {status.name.lower(): count for status, count in found.directions.counts().items()}
@@ -243,6 +254,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "residual_level_deg": placement.assessment.level_deg,
+        "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
         "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
         "solve": solve_summary(found.solve),
@@ -267,6 +279,7 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "residual_level_deg": placement.assessment.level_deg,
+        "loose_groups": _loose_groups(placement),
         "pieces": [asdict(row) for row in piece_rows(placement, _SOLVER_SCALE)],
         "solve": solve_summary(placement.solve),
         "finish": _finish_summary(placement.finish),
@@ -304,11 +317,48 @@ def _collapse(finish: Finish) -> Iterator[str]:
     )
 
 
+def _not_trusted(found: LocateResult) -> dict[str, str]:
+    """Return the reason for each camera that is left out because it is not trusted."""
+    placement = found.placement
+    return {
+        _name(placement.graph, int(placement.cameras[k])): placement.assessment.reasons[k]
+        for k in np.flatnonzero(~found.kept).tolist()
+    }
+
+
+def _loose_groups(placement: Placement) -> list[dict[str, Any]]:
+    """Return the groups of cameras that are rigid by the graph but loose by the geometry."""
+    return [
+        {
+            "cameras": [_name(placement.graph, int(placement.cameras[k])) for k in group.cameras.tolist()],
+            "cause": group.cause.value,
+        }
+        for group in placement.assessment.loose_groups
+    ]
+
+
+def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
+    """Yield which cameras are left out for want of trust, if any are."""
+    lost = np.flatnonzero(~kept)
+    if len(lost):
+        worst = int(lost[np.argmin(placement.assessment.trust[lost])])
+        name, reason = (
+            _name(placement.graph, int(placement.cameras[worst])),
+            placement.assessment.reasons[worst],
+        )
+        yield (
+            f"{len(lost)} cameras are left out because they are not trusted, above all {name} ({reason}); "
+            "--min-trust 0 keeps them"
+        )
+
+
 def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
     extent = float(np.linalg.norm(np.ptp(placement.locations, axis=0)))
     largest = placement.assessment.sigmas[: len(placement.cameras)].max(axis=1)
     uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
+    if np.isnan(largest).any():
+        yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if uncertain and len(placement.cameras) >= _SMALLEST_PIECE:
         worst = _name(placement.graph, int(placement.cameras[np.argmax(largest)]))
         yield (

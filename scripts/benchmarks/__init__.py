@@ -9,6 +9,7 @@
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
+    trust.py     subcommand `trust`: standard deviations and trust against errors
     graph_peers.py    subcommand `peers-graphs`: pytheia and gtsam on bare graphs
 
 A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.

@@ -269,7 +269,7 @@ def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, gloma
         num_posed=found.model.num_images,
         num_placed=len(found.placement.cameras),
         num_pairs=len(found.directions.pairs),
-        num_pairs_used=len(found.pieces[0].edges),
+        num_pairs_used=len(found.placement.pairs),
         errors=_errors(found.reconstruction, folder / scene.truth),
         gap=found.solve.gap,
         converged=found.solve.status.name == "CONVERGED",

@@ -1,37 +1,48 @@
 """What the solved locations say of each pair and camera: residual, verdict, uncertainty, trust.
 
-The residual of a pair is the angle between its measured direction and the solved baseline. It is
-judged against its own covariance and the level s of all residuals together, which carries what a
-pair cannot know of itself, above all errors of the given rotations:
+The residual of a pair is the angle between its measured direction and the solved baseline. It is judged
+against its own covariance and an excess s that all pairs share and that no pair can know of itself, above all
+errors of the given rotations:
 
     chi2_e = r_e^T (Sigma_e + s^2 I)^-1 r_e,    r_e in the tangent plane of v_e.
 
-The covariance of the locations is the inverse of H = D^T diag(B_e (Sigma_e + s^2 I)^-1 B_e^T / l_e^2) D
-over the inlier pairs, l_e the length of the baseline, in the gauge of fixed centroid and scale.
+s makes the median of chi2 over the agreeing pairs what it should be. Whether a pair agrees is judged with the
+level of all residuals in place of s, which is more: neither covariances nor locations are exact. A residual
+is smaller than its error, because the solution bends towards the measurement: over least squares by the
+redundancy 1 - unknowns / equations, while a sum of norms fits as many directions exactly as it has unknowns,
+and leaves the others alone. The locations tell which of the two they come from.
+
+How uncertain the locations are, and how much a pair decides for itself, is `uncertainty`; what all pairs of a
+camera say together is `trust`.
 """
 
 import enum
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import eye_array
-from scipy.sparse.linalg import splu
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
-from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
 from sfm_shapefit.rigidity import parallel_rigid_pieces
-from sfm_shapefit.solver.program import adjoint, along, differences
+from sfm_shapefit.robust.conditioning import LooseGroup, condition
+from sfm_shapefit.robust.trust import Evidence, judge_cameras
+from sfm_shapefit.robust.uncertainty import propagate
+from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
 _LARGEST_FITTED_SHARE = 0.3  # keeps the quantile below 0.65, so that a third of the pairs may be wrong
+_LARGEST_SHARE = 0.9  # of the equations taken up by unknowns: beyond, residuals hardly speak
+_EXACTLY_FITTED = 1e-3  # of the median residual; a normal residual is below it once in a million times
+_MIN_FITTED_SHARE = 0.02  # of the pairs: then the locations come from a sum of norms
 _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
+_LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
+_BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
-_DENSE_UNKNOWNS = 1500
-_RIDGE = 1e-12  # of the largest diagonal entry: a camera that nothing holds becomes infinite, not singular
-_SAMPLES = 200  # standard deviations from 200 samples are right to 5 %
+_UNCHECKED_LEVERAGE = 0.99
+"""Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size."""
 
 
 class Verdict(enum.Enum):
@@ -40,7 +51,7 @@ class Verdict(enum.Enum):
     INLIER = "inlier"
     OUTLIER = "outlier"
     UNDETERMINED = "undetermined"
-    """One of its cameras is not placed, so nothing can be said."""
+    """One of its cameras is not placed, or no other pair checks it, so nothing can be said."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -51,16 +62,39 @@ class Assessment:
     """(m,) angle between the measured direction and the solved baseline, in [0, 180]."""
     inliers: BoolArray
     """(m,) whether the pair agrees with the solution."""
+    leverages: FloatArray
+    """(m,) share of its own fitted direction that an agreeing pair decides itself, in [0, 1]; 0 for outliers,
+    NaN for agreeing pairs outside the largest rigid piece of those."""
     level_deg: float
     """Standard deviation, per axis, of the residuals of all pairs together (from their median)."""
+    excess_deg: float
+    """The part of it, per axis, that the pairs' own covariances do not explain."""
     trust: FloatArray
-    """(n,) share of the camera's pairs that agree with the solution."""
+    """(k,) of each camera, in [0, 1], see `trust.judge_cameras`."""
+    reasons: tuple[str, ...]
+    """k sentences that say why a trust is low; empty where it is not."""
+    loose_groups: tuple[LooseGroup, ...]
+    """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     sigmas: FloatArray
     """(n, d) standard deviation of each location in the units of `locations`, with centroid and scale
-    held fixed; infinite for cameras outside the largest rigid piece of the inlier pairs."""
+    of the cameras held fixed; infinite for nodes outside the largest rigid piece of the inlier pairs; NaN,
+    all of them, where the graph is too large for its factor."""
+
+    def verdict(self, pair: int) -> Verdict:
+        """Return what the solution says of a pair."""
+        if not self.inliers[pair]:
+            return Verdict.OUTLIER
+        checked = self.leverages[pair] < _UNCHECKED_LEVERAGE
+        return Verdict.INLIER if checked else Verdict.UNDETERMINED
 
 
-def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray | None = None) -> Assessment:
+def assess(
+    graph: ViewGraph,
+    locations: FloatArray,
+    covariance: FloatArray | None = None,
+    evidence: Evidence | None = None,
+    num_cameras: int | None = None,
+) -> Assessment:
     """Judge pairs and cameras by a solution.
 
     Args:
@@ -68,100 +102,152 @@ def assess(graph: ViewGraph, locations: FloatArray, covariance: FloatArray | Non
         locations: (n, d) its locations.
         covariance: (m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`,
             rad^2; NaN where it is unknown, None where all are.
+        evidence: support of the pairs, and pairs that have no direction because their matches contradict the
+            given rotations; unknown if None.
+        num_cameras: k, the first so many nodes are cameras and the others points; all if None.
     """
     freedom = graph.dimension - 1
-    own = 0.0 if covariance is None else np.nan_to_num(covariance)
+    k = graph.num_cameras if num_cameras is None else num_cameras
+    own = np.zeros((graph.num_edges, freedom, freedom)) if covariance is None else np.nan_to_num(covariance)
     baselines = differences(locations, graph.edges)
-    residuals_deg = angle_between_deg(graph.directions, normalized(baselines))
-    residuals_deg = np.where(np.isnan(residuals_deg), 180.0, residuals_deg)  # coincident cameras
-    level = _residual_level(graph, np.radians(residuals_deg))
-    information = np.linalg.inv(
-        own + level**2 * np.broadcast_to(np.eye(freedom), (graph.num_edges, freedom, freedom))
-    )
+    residuals = _tangential_residuals(graph.directions, baselines)
+    behind = along(baselines, graph.directions) <= 0.0
+    num_unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    excess, inliers = _excess(residuals, own, behind, num_unknowns)
+    information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
     bases = tangent_bases(graph.directions)
-    tangential = np.einsum("edk,ed->ek", bases, normalized(baselines))
-    tangential = normalized(tangential) * np.radians(residuals_deg)[:, None]  # angle, also beyond 90 deg
-    chi2 = np.einsum("ek,ekl,el->e", *(np.nan_to_num(tangential), information, np.nan_to_num(tangential)))
-    behind = along(baselines, graph.directions) <= 0.0
-    inliers: BoolArray = (chi2 <= chdtri(freedom, _OUTLIER_PROBABILITY)) & ~behind
-
-    agreeing = np.bincount(graph.edges[inliers].ravel(), minlength=graph.num_cameras)
+    errors = None
+    if evidence is not None and evidence.errors is not None:
+        errors = _with_excess(evidence.errors, excess) @ bases.transpose(0, 2, 1)
+    sigmas, leverages = _propagated(
+        graph, locations, inliers, bases @ information @ bases.transpose(0, 2, 1), k, errors
+    )
+    angles = np.linalg.norm(residuals, axis=1)
+    sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k)
+    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, evidence)
     return Assessment(
-        residuals_deg=residuals_deg,
+        residuals_deg=np.degrees(angles),
         inliers=inliers,
-        level_deg=float(np.degrees(level)),
-        trust=agreeing / np.maximum(graph.degrees(), 1),
-        sigmas=_location_sigmas(graph, locations, inliers, bases @ information @ bases.transpose(0, 2, 1)),
+        leverages=leverages,
+        level_deg=float(np.degrees(_level(angles, num_unknowns, freedom))),
+        excess_deg=float(np.degrees(excess)),
+        trust=judged.trust,
+        reasons=judged.reasons,
+        loose_groups=conditioning.groups,
+        sigmas=sigmas,
     )
 
 
-def _residual_level(graph: ViewGraph, residuals: FloatArray) -> float:
-    """Return the standard deviation per axis that the (m,) residual angles in radians speak of.
+def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> FloatArray:
+    """Return the residual angles as vectors (m, d - 1) in tangent bases; pi long where cameras coincide."""
+    units = normalized(baselines)
+    angles = np.radians(angle_between_deg(directions, units))
+    tangential = np.einsum("edk,ed->ek", tangent_bases(directions), units)
+    vectors = normalized(tangential) * angles[:, None]  # the angle, also beyond 90 deg
+    lost = ~np.isfinite(vectors).all(axis=1)  # no tangential part: an angle of 0 or pi, or no baseline
+    angles = np.where(np.isnan(angles), np.pi, angles)
+    vectors[lost] = 0.0
+    vectors[lost, 0] = angles[lost]
+    return vectors
 
-    The solution of a sum of norms fits as many equations exactly as there are unknowns. The median of the
-    other residuals stands at the (1 + share) / 2 quantile of all.
-    """
-    freedom = graph.dimension - 1
-    unknowns = graph.dimension * (graph.num_cameras - 1) - 1
-    share = min(unknowns / (freedom * graph.num_edges), _LARGEST_FITTED_SHARE)
+
+def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[float, bool]:
+    """Return unknowns / equations, and whether the residuals are those of a sum of norms."""
+    share = num_unknowns / max(freedom * len(angles), 1)
+    middle = float(np.median(angles[angles > 0.0])) if np.any(angles > 0.0) else 0.0
+    fitted = float(np.mean(angles <= _EXACTLY_FITTED * middle))
+    return share, fitted > min(_MIN_FITTED_SHARE, 0.5 * share)
+
+
+def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
+    """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
+    share, is_exact = _fitted_share(angles, num_unknowns, freedom)
+    share = min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE)
     median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
-    return max(float(np.quantile(residuals, (1.0 + share) / 2.0) / median_length), _MIN_LEVEL_RAD)
+    quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
+    shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
+    return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
 
 
-def _location_sigmas(
-    graph: ViewGraph, locations: FloatArray, inliers: BoolArray, information: FloatArray
-) -> FloatArray:
-    """Return the standard deviations of the locations from the (m, d, d) information of the directions.
+def _excess(
+    residuals: FloatArray, own: FloatArray, behind: BoolArray, num_unknowns: int
+) -> tuple[float, BoolArray]:
+    """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
+    freedom = residuals.shape[1]
+    angles = np.linalg.norm(residuals, axis=1)
+    values, vectors = np.linalg.eigh(own)
+    squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
+    limit = chdtri(freedom, _OUTLIER_PROBABILITY)
+    used: BoolArray = np.ones(len(angles), dtype=np.bool_)
+    inliers = used
+    for _ in range(_LEVEL_ROUNDS):
+        level = _level(angles[used], num_unknowns, freedom)
+        inliers = (np.sum(squares / (values + level**2), axis=1) <= limit) & ~behind
+        if not inliers.any():
+            return level, inliers
+        if np.array_equal(inliers, used):
+            break
+        used = inliers
+    share, is_exact = _fitted_share(angles[inliers], num_unknowns, freedom)
+    share = min(share, _LARGEST_FITTED_SHARE) if is_exact else min(share, _LARGEST_SHARE)
+    rank = (1.0 + share) / 2.0 if is_exact else 0.5
+    wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
+    return _matching_excess(squares[inliers], values[inliers], rank, wanted), inliers
+
+
+def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wanted: float) -> float:
+    """Return s, at least the rounding level, at which a quantile of the chi-squares is as wanted."""
+
+    def too_large(excess: float) -> bool:
+        chi2 = np.sum(squares / (np.maximum(variances, 0.0) + excess**2), axis=1)
+        return float(np.quantile(chi2, rank)) > wanted
+
+    low, high = _MIN_LEVEL_RAD, np.pi
+    if not too_large(low):
+        return low
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if too_large(middle) else (low, middle)
+    return high
+
+
+def _with_excess(errors: FloatArray, excess: float) -> FloatArray:
+    """Add independent normal errors of the excess to samples (m, s, d - 1)."""
+    return errors + excess * np.random.default_rng(0).standard_normal(errors.shape)
+
+
+def _propagated(
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    errors: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations (n, d) and the leverages (m,).
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
     """
     sigmas = np.full(locations.shape, np.inf)
+    leverages = np.where(inliers, np.nan, 0.0)
     pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], graph.dimension)
     rows = np.flatnonzero(inliers)[pieces == 0]
     held, edges = np.unique(graph.edges[rows], return_inverse=True)
-    if len(held) < _SMALLEST_RIGID:
-        return sigmas
-    edges, t = edges.reshape(-1, 2), locations[held]
-    lengths = np.linalg.norm(differences(t, edges), axis=1)
-    blocks = information[rows] / np.maximum(lengths, 1e-12 * lengths.max())[:, None, None] ** 2
-    variances_of = _dense_variances if t.size <= _DENSE_UNKNOWNS else _sampled_variances
-    variances = variances_of(len(held), edges, blocks, _gauge_directions(t))
-    found = np.sqrt(np.maximum(variances, 0.0)).reshape(t.shape)
-    is_loose = (found > np.ptp(t, axis=0).max()).any(axis=1)
-    sigmas[held] = np.where(is_loose[:, None], np.inf, found)
-    return sigmas
-
-
-def _gauge_directions(locations: FloatArray) -> FloatArray:
-    """Return an orthonormal basis (n d, d + 1) of what the program fixes: the shifts and the scale."""
-    n, d = locations.shape
-    centred = (locations - locations.mean(axis=0)).ravel()
-    return np.column_stack([np.tile(np.eye(d), (n, 1)) / np.sqrt(n), centred / np.linalg.norm(centred)])
-
-
-def _dense_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
-    """Return the diagonal of the inverse of H on the complement of the gauge, shape (n d,)."""
-    hessian = assemble(laplacian_pattern(n, edges), blocks).toarray()
-    size = float(hessian.diagonal().max())
-    hessian += size * gauge @ gauge.T + _RIDGE * size * np.eye(len(hessian))
-    inverse = np.linalg.inv(hessian)
-    return np.asarray(np.diagonal(inverse) - np.sum(gauge**2, axis=1) / size)
-
-
-def _sampled_variances(n: int, edges: IntArray, blocks: FloatArray, gauge: FloatArray) -> FloatArray:
-    """Estimate the same diagonal from samples H^-1 b with b of covariance H, shape (n d,)."""
-    hessian = assemble(laplacian_pattern(n, edges), blocks)
-    ridge = _RIDGE * float(hessian.diagonal().max())
-    regular = (hessian + ridge * eye_array(hessian.shape[0], format="csc")).tocsc()
-    factor = splu(regular, permc_spec="MMD_AT_PLUS_A")
-    values, vectors = np.linalg.eigh(blocks)
-    roots = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-    rng = np.random.default_rng(0)
-    total = np.zeros(len(gauge))
-    for _ in range(_SAMPLES):
-        noise = np.einsum("eab,eb->ea", roots, rng.standard_normal(blocks.shape[:2]))
-        sample = factor.solve(adjoint(noise, edges, n).ravel())
-        sample -= gauge @ (gauge.T @ sample)
-        total += sample**2
-    return total / _SAMPLES
+    cameras = int(np.sum(held < num_cameras))
+    if cameras < _SMALLEST_RIGID:
+        return sigmas, leverages
+    unknown = np.full(locations.shape, np.nan), np.where(inliers, np.nan, 0.0)
+    try:
+        samples = None if errors is None else errors[rows]
+        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
+    except UnsolvableError:  # singular in spite of the ridge
+        return unknown
+    if found is None:
+        return unknown
+    extent = np.ptp(locations[held], axis=0).max()
+    is_loose = (found.sigmas > extent).any(axis=1)
+    sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
+    leverages[rows] = found.leverages
+    return sigmas, leverages

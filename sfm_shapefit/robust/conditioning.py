@@ -1,0 +1,147 @@
+"""What is rigid by its graph and yet loose by its geometry.
+
+The test of rigidity (`rigidity`) takes positions to be general. At the solution they need not be: cameras on
+a line see each other along it and nothing fixes their spacing, the pairs of a far camera are nearly
+parallel, the triangles of a distant group are skinny. The covariance of the locations (`uncertainty`) sees
+all of these. Here its loose cameras are put into groups that move together, with what makes them loose:
+
+    few pairs   two agreeing pairs or fewer
+    parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
+    on a line   the group lies on a line, along which nothing fixes their spacing
+    together    each camera is held well by its neighbours, the group is not held by the rest
+"""
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import median_spread, normalized
+from sfm_shapefit.solver.program import differences
+
+LOOSE_SHARE = 0.05
+"""Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
+FEW_PAIRS = 2
+_PARALLEL = 0.02  # least over largest eigenvalue of sum I - u u^T: directions within about 8 degrees
+_SMALLEST_LINE = 3  # cameras
+_ON_A_LINE = 0.02  # second over first singular value of the positions
+
+
+class Looseness(enum.Enum):
+    """Why cameras are loose; the value is what reports say."""
+
+    UNTIED = "no agreeing pairs tie it to the others rigidly"
+    FEW_PAIRS = "two agreeing pairs or fewer hold it"
+    PARALLEL = "the directions of its agreeing pairs are nearly parallel"
+    ON_A_LINE = "it stands on a straight stretch, along which nothing fixes the spacing"
+    TOGETHER = "it moves with its neighbours, which the rest does not hold"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LooseGroup:
+    """Cameras that are loose together."""
+
+    cameras: IntArray
+    """Ascending."""
+    cause: Looseness
+    """Of most of them."""
+    sigma: float
+    """Largest standard deviation among them, in the locations' units; infinite if nothing holds them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Conditioning:
+    """How well the agreeing pairs hold each camera."""
+
+    num_pairs: IntArray
+    """(k,) agreeing pairs of each camera."""
+    narrowness: FloatArray
+    """(k,) least over largest eigenvalue of the sum of I - u u^T over its agreeing pairs, in [0, 1]: how far
+    their directions are from parallel; 0 without pairs."""
+    causes: tuple[Looseness | None, ...]
+    """k causes; None where a camera is not loose."""
+    groups: tuple[LooseGroup, ...]
+    """The largest standard deviation first."""
+
+
+def condition(
+    locations: FloatArray, edges: IntArray, inliers: BoolArray, sigmas: FloatArray, num_cameras: int
+) -> Conditioning:
+    """Find the cameras that the pairs leave loose at the solution, and why.
+
+    Args:
+        locations: (n, d).
+        edges: (m, 2).
+        inliers: (m,) pairs that agree with the solution.
+        sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
+        num_cameras: k; nodes beyond are points.
+    """
+    n = len(locations)
+    used = edges[inliers]
+    num_pairs = np.bincount(used.ravel(), minlength=n)
+    narrowness = _narrowness(locations, used)
+    largest = sigmas.max(axis=1)
+    loose = largest > LOOSE_SHARE * median_spread(locations[:num_cameras])
+    loose[num_cameras:] = False
+    labels = _groups(n, used, loose)
+    causes: list[Looseness | None] = [None] * num_cameras
+    for camera in np.flatnonzero(loose).tolist():
+        causes[camera] = _cause(int(num_pairs[camera]), float(narrowness[camera]), float(largest[camera]))
+    groups = []
+    for label in np.unique(labels[loose]).tolist():
+        members = np.flatnonzero(loose & (labels == label))
+        if _is_straight(locations[members]):
+            for camera in members.tolist():
+                causes[camera] = Looseness.ON_A_LINE
+        cause = _most_frequent([causes[camera] for camera in members.tolist()])
+        groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
+    return Conditioning(
+        num_pairs=num_pairs[:num_cameras].astype(np.int64),
+        narrowness=narrowness[:num_cameras],
+        causes=tuple(causes),
+        groups=tuple(sorted(groups, key=lambda group: (-group.sigma, int(group.cameras[0])))),
+    )
+
+
+def _narrowness(locations: FloatArray, edges: IntArray) -> FloatArray:
+    """Return least over largest eigenvalue of the sum of I - u u^T at each node, 0 without pairs."""
+    n, d = locations.shape
+    u = normalized(differences(locations, edges))
+    projectors = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :]).reshape(-1, d * d)
+    sums = np.stack(
+        [np.bincount(edges.ravel(), np.repeat(column, 2), minlength=n) for column in projectors.T], axis=1
+    )
+    values = np.linalg.eigvalsh(sums.reshape(n, d, d))
+    return np.asarray(values[:, 0] / np.maximum(values[:, -1], 1e-300))
+
+
+def _groups(n: int, edges: IntArray, loose: BoolArray) -> IntArray:
+    """Return the connected component of each node among the loose ones."""
+    i, j = edges[loose[edges].all(axis=1)].T
+    found = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1]
+    return np.asarray(found, dtype=np.int64)
+
+
+def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:
+    """Return what makes a single camera loose."""
+    if num_pairs <= FEW_PAIRS:
+        return Looseness.FEW_PAIRS
+    if narrowness < _PARALLEL:
+        return Looseness.PARALLEL
+    return Looseness.TOGETHER if np.isfinite(sigma) else Looseness.UNTIED
+
+
+def _is_straight(positions: FloatArray) -> bool:
+    """Return whether the positions of a loose group, three or more, lie on a line."""
+    if len(positions) < _SMALLEST_LINE:
+        return False
+    values = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)
+    return bool(values[1] < _ON_A_LINE * values[0])
+
+
+def _most_frequent(causes: list[Looseness | None]) -> Looseness:
+    """Return the cause that most have, the first declared of equals."""
+    return max(Looseness, key=lambda cause: (causes.count(cause), -list(Looseness).index(cause)))

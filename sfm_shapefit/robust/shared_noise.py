@@ -1,0 +1,151 @@
+"""Errors of directions that share keypoints: samples of them, for the uncertainty of the locations.
+
+The noise of a keypoint enters every pair that matches it. A track of m images gives 2 m - 3 constraints on
+the cameras, its m (m - 1) / 2 matches many more; pairs taken as independent promise up to several times too
+small standard deviations. So the directions' errors are sampled together: every keypoint gets a random sign
+along each axis of its image, a match's residual follows from its two keypoints, to first order
+
+    r = (e_a . (b x v) + e_b . (v x a)) / sqrt(|a x v|^2 + |b x v|^2),
+
+and a pair's direction from its inlier matches, theta = Sigma B^T sum (a x b) r / (...), with the pair's own
+covariance Sigma and noise. Random signs have the variance of the noise, and cost no memory: they are the bits
+of a hash of the keypoint (the wild bootstrap in parametric form: Liu 1988; clusters: Cameron et al. 2008).
+
+The given rotations are taken as exact: their errors leave no trace in the residuals.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import tangent_bases
+from sfm_shapefit.jit import kernel
+
+NUM_SAMPLES = 96
+"""Standard deviations from so many samples are right to 7 %."""
+_SIGNS_PER_HASH = 32  # two of the 64 bits of a hash make one sample
+
+
+def sample_direction_errors(
+    pairs: IntArray,
+    offsets: IntArray,
+    keypoints: IntArray,
+    rays: tuple[FloatArray, FloatArray],
+    pixel_angles: FloatArray,
+    directions: FloatArray,
+    covariances: FloatArray,
+    noise_px: FloatArray,
+    threshold_px: float,
+) -> FloatArray:
+    """Return samples of the errors of directions whose pairs share keypoints.
+
+    The samples of one keypoint are the same in every call, so batches of pairs may be sampled one by one.
+
+    Args:
+        pairs: (k, 2) image indices.
+        offsets: (k + 1,) rows of the matches of pair p are offsets[p] to offsets[p + 1].
+        keypoints: (M, 2) keypoint of each match in its two images.
+        rays: two (M, 3) unit rays of the matches in world axes.
+        pixel_angles: (k,) angle of one pixel in radians.
+        directions: (k, 3) unit directions; NaN for pairs without one.
+        covariances: (k, 2, 2) in `tangent_bases(directions)`, rad^2.
+        noise_px: (k,) standard deviation of the Sampson errors behind the covariances.
+        threshold_px: largest Sampson error of an inlier.
+
+    Returns:
+        (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
+    """
+    scores = np.zeros((len(pairs), NUM_SAMPLES, 3))
+    known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
+    v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
+    _add_scores(
+        pairs,
+        offsets,
+        np.ascontiguousarray(keypoints),
+        np.ascontiguousarray(rays[0]),
+        np.ascontiguousarray(rays[1]),
+        pixel_angles,
+        known,
+        v,
+        threshold_px,
+        scores,
+    )
+    bases = tangent_bases(v)
+    gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
+    errors: FloatArray = scores @ gain.transpose(0, 2, 1)
+    return errors
+
+
+@kernel(exact=True)
+def _add_scores(
+    pairs: Any,
+    offsets: Any,
+    keypoints: Any,
+    rays_i: Any,
+    rays_j: Any,
+    pixel_angles: Any,
+    known: Any,
+    directions: Any,
+    threshold_px: float,
+    scores: Any,
+) -> None:
+    """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
+    factors = np.empty(4)
+    score = np.empty(3)
+    for p in range(len(pairs)):
+        if not known[p]:
+            continue
+        v = directions[p]
+        for k in range(offsets[p], offsets[p + 1]):
+            a, b = rays_i[k], rays_j[k]
+            across_a, across_b = np.cross(v, a), np.cross(b, v)
+            square = np.sum(across_a * across_a) + np.sum(across_b * across_b)
+            normal = np.cross(a, b) / pixel_angles[p]
+            error = np.sum(normal * v)
+            if error * error > threshold_px * threshold_px * square or square < 1e-12:
+                continue
+            _tangential(a, across_b, factors[:2])
+            _tangential(b, across_a, factors[2:])
+            score[:] = normal / square
+            _add_samples(pairs[p], keypoints[k], factors, score, scores[p])
+
+
+@kernel(exact=True)
+def _tangential(ray: Any, vector: Any, out: Any) -> None:
+    """Write the components of a vector along two axes across a ray that depend on the ray alone."""
+    axis = np.zeros(3)
+    axis[np.argmin(np.abs(ray))] = 1.0
+    first = np.cross(ray, axis)
+    first /= np.sqrt(np.sum(first * first))
+    out[0] = np.sum(first * vector)
+    out[1] = np.sum(np.cross(ray, first) * vector)
+
+
+@kernel(exact=True)
+def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -> None:
+    """Add the score of one match times its residual in each sample."""
+    for first in range(0, len(scores), _SIGNS_PER_HASH):
+        bits_i = _hash(pair[0], match[0], first)
+        bits_j = _hash(pair[1], match[1], first)
+        for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
+            residual = factors[0] if bits_i & np.uint64(1) else -factors[0]
+            residual += factors[1] if bits_i & np.uint64(2) else -factors[1]
+            residual += factors[2] if bits_j & np.uint64(1) else -factors[2]
+            residual += factors[3] if bits_j & np.uint64(2) else -factors[3]
+            bits_i >>= np.uint64(2)
+            bits_j >>= np.uint64(2)
+            for c in range(3):
+                scores[k, c] += residual * score[c]
+
+
+@kernel(exact=True)
+def _hash(image: int, keypoint: int, sample: int) -> Any:
+    """Return 64 random bits of a keypoint (the finaliser of SplitMix64: Steele et al. 2014)."""
+    x = np.uint64(image) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(keypoint)
+    x = x * np.uint64(0xD1B54A32D192ED03) + np.uint64(sample + 1) * np.uint64(0x9E3779B97F4A7C15)
+    for _ in range(2):
+        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        x ^= x >> np.uint64(31)
+    return x

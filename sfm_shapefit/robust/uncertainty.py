@@ -1,0 +1,217 @@
+"""How uncertain the locations are, and how much each direction decides for itself.
+
+Near the solution a direction with error e_ij in the tangent plane of the baseline u_ij, length l_ij, sees the
+locations through B_ij^T (t_i - t_j) / l_ij. The information about the locations is the block Laplacian
+
+    H = D^T diag(B_e Lambda_e B_e^T / l_e^2) D,          Lambda_e = information of the direction, rad^-2,
+
+and their covariance its inverse. H has the shifts and the scale as its null space, exactly, since B_e is
+orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
+
+    A = H + K K^T with one camera grounded and one baseline's length held is regular and as sparse as H;
+    A^-1 at the nodes and edges comes from its Cholesky factor (`laplacian.selected`);
+    C = S A^-1 S^T with S = I - N F^T is the covariance with F^T t held fixed, N spanning the null space and
+    F^T N = I (the S-transformation: Baarda 1973; Teunissen 1985, "Zero order design"), of rank d + 1.
+
+F is the centroid and the scale of the cameras that are held and stand among the others; one that nearly
+nothing holds would lend its uncertainty to all, and one that stands far off would set the scale alone.
+
+Directions whose errors are correlated (`shared_noise`) do not have the covariance A^-1. For them the errors
+are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and the
+standard deviations are those of the samples.
+
+The leverage of a direction is trace(Lambda_e Cov(B_e^T (t_i - t_j) / l_e)) / (d - 1), in [0, 1]: the share of
+its own fitted value that it decides itself. The leverages of all directions add up to the number of unknowns
+over d - 1. Where it is 1 no other direction checks it, and its residual is 0 whatever was measured
+(Cook and Weisberg 1982, "Residuals and Influence in Regression", section 2.1).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
+from sfm_shapefit.laplacian.operators import apply_incidence_transposed
+from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.solver.program import differences
+
+_RIDGES = (1e-12, 1e-10, 1e-8)  # of each block's trace: what nothing holds becomes large, not singular
+_LOOSE = 0.2  # standard deviation, in spreads, from which a camera may not decide the gauge
+_FAR = 10.0  # spreads from the cameras' median, beyond which a camera may not either
+_LOOSENING_ROUNDS = 20
+_MAX_BYTES = 2_000_000_000  # of the factor; beyond, standard deviations are left out
+_SHORTEST = 1e-12  # of the longest baseline
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Uncertainty:
+    """Covariances of the locations and leverages of the directions of a rigid graph."""
+
+    covariances: FloatArray
+    """(n, d, d) covariance of each location, in squared units of the locations; centroid and scale of the
+    cameras in `gauge` held fixed."""
+    leverages: FloatArray
+    """(m,) in [0, 1]."""
+    gauge: BoolArray
+    """(n,) the nodes whose centroid and scale are held fixed."""
+
+    samples: FloatArray | None = None
+    """(n, d, s) errors of the locations for samples of correlated direction errors."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviations along the axes, (n, d)."""
+        if self.samples is not None:
+            return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
+        variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
+        return np.sqrt(np.maximum(variances, 0.0))
+
+
+def propagate(
+    locations: FloatArray,
+    edges: IntArray,
+    information: FloatArray,
+    num_cameras: int | None = None,
+    errors: FloatArray | None = None,
+) -> Uncertainty | None:
+    """Return the uncertainty of locations from the information of the directions.
+
+    Args:
+        locations: (n, d) at the solution; nodes beyond `num_cameras` are points.
+        edges: (m, 2) pairs that make the nodes rigid, none of length 0.
+        information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
+        num_cameras: the first so many nodes may decide the gauge; all if None.
+        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
+            information if None.
+
+    Returns:
+        None if the factor would take more than 2 GB: about a hundred thousand cameras in space.
+
+    Raises:
+        UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
+    """
+    n, d = locations.shape
+    baselines = differences(locations, edges)
+    lengths = np.linalg.norm(baselines, axis=1)
+    units = baselines / np.maximum(lengths, _SHORTEST * lengths.max())[:, None]
+    across = _across(information, units)
+    blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
+    plan = analyse(n, edges, coordinates=locations)
+    if plan.num_bytes(d) > _MAX_BYTES:
+        return None
+    factor = _grounded_factor(plan, blocks, units, lengths)
+    inverse = selected_inverse(factor, edges)
+
+    i, j = edges.T
+    relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
+    leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
+    is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
+    covariances, gauge = _held(factor, inverse, locations, is_camera)
+    samples = None
+    if errors is not None:
+        forces = (across @ errors.transpose(0, 2, 1)) / np.maximum(lengths, _SHORTEST * lengths.max())[
+            :, None, None
+        ]
+        samples = _moved(factor, locations, edges, forces, gauge)
+    return Uncertainty(
+        covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge, samples=samples
+    )
+
+
+def _moved(
+    factor: CholeskyFactor, locations: FloatArray, edges: IntArray, forces: FloatArray, gauge: BoolArray
+) -> FloatArray:
+    """Return S A^-1 D^T f for each of the samples in the forces f (m, d, s), shape (n, d, s)."""
+    n, d = locations.shape
+    right = np.zeros((n, d, forces.shape[2]))
+    flat = apply_incidence_transposed(edges, np.ascontiguousarray(forces.reshape(len(edges), -1)), n)
+    right[:] = flat.reshape(right.shape)
+    moved = factor.solve(right)
+    null, fixed = _gauge_pair(locations, gauge)
+    drift = np.einsum("nak,nas->ks", fixed, moved)
+    result: FloatArray = moved - np.einsum("nak,ks->nas", null, drift)
+    return result
+
+
+def _across(information: FloatArray, units: FloatArray) -> FloatArray:
+    """Return P Lambda P with P = I - u u^T: the scale stays exactly free."""
+    projector = np.eye(units.shape[1]) - units[:, :, None] * units[:, None, :]
+    product: FloatArray = projector @ information @ projector
+    return product
+
+
+def _grounded_factor(
+    plan: SymbolicFactor, blocks: FloatArray, units: FloatArray, lengths: FloatArray
+) -> CholeskyFactor:
+    """Factor H with its last camera grounded and the length of its longest baseline held."""
+    d = units.shape[1]
+    traces = np.trace(blocks, axis1=1, axis2=2)
+    longest = int(np.argmax(lengths))
+    held = traces[longest] * np.outer(units[longest], units[longest])
+    for ridge in _RIDGES:
+        regular = blocks + ridge * traces[:, None, None] * np.eye(d)
+        regular[longest] += held
+        try:
+            return factorise(plan, regular)
+        except UnsolvableError:
+            if ridge == _RIDGES[-1]:
+                raise
+    raise AssertionError("unreachable")
+
+
+def _held(
+    factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the covariances in the gauge of the cameras that are held, and which these are."""
+    gauge = is_camera & _is_near(locations, is_camera)
+    least = max(3, int(np.sum(is_camera)) // 2)
+    for _ in range(_LOOSENING_ROUNDS):
+        covariances = _in_gauge(factor, inverse, locations, gauge)
+        sizes = np.sqrt(np.maximum(np.trace(covariances, axis1=1, axis2=2), 0.0))
+        largest = float(sizes[gauge].max())
+        if largest <= _LOOSE * median_spread(locations[gauge]):
+            break
+        kept = gauge & (sizes < 0.5 * largest)
+        if np.sum(kept) < least:
+            break
+        gauge = kept
+    return covariances, gauge
+
+
+def _is_near(locations: FloatArray, is_camera: BoolArray) -> BoolArray:
+    """Return which nodes stand within a few spreads of the cameras' median."""
+    cameras = locations[is_camera]
+    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
+    near: BoolArray = distances <= _FAR * median_spread(cameras)
+    return near
+
+
+def _in_gauge(
+    factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, gauge: BoolArray
+) -> FloatArray:
+    """Return the diagonal blocks of S A^-1 S^T with centroid and scale of the nodes in `gauge` fixed."""
+    null, fixed = _gauge_pair(locations, gauge)
+    product = factor.solve(fixed)  # A^-1 F
+    middle = np.einsum("nak,nal->kl", fixed, product)
+    cross = null @ product.transpose(0, 2, 1)
+    covariances: FloatArray = (
+        inverse.nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1)
+    )
+    return covariances
+
+
+def _gauge_pair(locations: FloatArray, gauge: BoolArray) -> tuple[FloatArray, FloatArray]:
+    """Return N and F, (n, d, d + 1): shifts and scale, and what reads them off the nodes in `gauge`."""
+    n, d = locations.shape
+    centred = locations - locations[gauge].mean(axis=0)
+    null = np.zeros((n, d, d + 1))
+    null[:, range(d), range(d)] = 1.0
+    null[:, :, d] = centred
+    fixed = np.where(gauge[:, None, None], null, 0.0)
+    fixed[:, :, :d] /= np.sum(gauge)
+    fixed[:, :, d] /= np.sum(centred[gauge] ** 2)
+    return null, fixed

@@ -1,0 +1,41 @@
+"""The entries of an inverse that belong to nodes and edges, against the whole inverse."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.laplacian.cholesky import analyse, factorise
+from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
+from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
+
+
+def blocks(rng, count, b):
+    roots = rng.standard_normal((count, b, b))
+    return roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(b)
+
+
+@pytest.mark.parametrize("problem", [box_graph_problem, trajectory_graph_problem])
+@pytest.mark.parametrize("b", [2, 3])
+def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
+    rng = np.random.default_rng(b)
+    n, edges = 150, problem(150, 10.0, seed=b).edges
+    edges = np.where(rng.random(len(edges))[:, None] < 0.5, edges, edges[:, ::-1])  # either way round
+    weights = blocks(rng, len(edges), b)
+    factor = factorise(analyse(n, edges), weights, ground=7.0)
+    found = selected_inverse(factor, edges)
+
+    matrix = assemble(laplacian_pattern(n, edges), weights).toarray().reshape(n, b, n, b)
+    last = factor.symbolic.permutation[-1]
+    matrix[last, :, last, :] += 7.0 * np.eye(b)
+    whole = np.linalg.inv(matrix.reshape(n * b, n * b)).reshape(n, b, n, b)
+    nodes = np.arange(n)
+    limit = 1e-10 * np.abs(whole).max()  # condition numbers here stay below 1e4
+    np.testing.assert_allclose(found.nodes, whole[nodes, :, nodes, :], atol=limit)
+    np.testing.assert_allclose(found.edges, whole[edges[:, 0], :, edges[:, 1], :], atol=limit)
+
+
+def test_a_single_precision_factor_is_refused():
+    edges = box_graph_problem(20, 8.0).edges
+    factor = factorise(analyse(20, edges), np.tile(np.eye(3), (len(edges), 1, 1)), dtype=np.float32)
+    with pytest.raises(ValueError, match="float64"):
+        selected_inverse(factor, edges)
