@@ -38,9 +38,10 @@ from sfm_shapefit.geometry import mean_rotation_l1, median_spread
 _SCALES_PX = (8.0, 3.0, 1.0)  # of the Cauchy loss, one after the other
 _FINAL_PX = _SCALES_PX[-1]
 _FIRST_LEVEL_RAD = np.radians(1.0)  # before anything is known of the turns
-_LEAST_LEVEL_RAD = 1e-6
+_LEAST_LEVEL_RAD = np.radians(0.3)  # what averaged rotations are off, on good sets; smaller turns need little
 _MEDIAN_OF_LENGTH = 1.538  # of a vector of three unit normal components
 _FLOOR_PX = 0.05  # residuals below this are as good as any; keeps the ratios of exact matches sober
+_NU = 2.0  # residuals that the matches of a pair are worth
 _MIN_PAIRS = 3
 _MIN_GAINING_SHARE = 2.0 / 3.0
 _CENTER_STEPS = 12
@@ -114,7 +115,7 @@ def _judged(matches: RayMatches, state: State, level: float) -> tuple[FloatArray
     floor = 0.5 * _FLOOR_PX**2 * np.diff(matches.offsets)
     camera = np.concatenate([pairs[:, 0], pairs[:, 1]])
     kept, now = np.concatenate([kept_i, kept_j]), np.tile(refined.costs, 2)
-    gained = np.log((kept + np.tile(floor, 2)) / (now + np.tile(floor, 2)))
+    gained = 0.5 * _NU * np.log((kept + np.tile(floor, 2)) / (now + np.tile(floor, 2)))
     degree = np.bincount(camera, minlength=n)
     gaining = np.bincount(camera[gained > 0.0], minlength=n)
     asked = 2.0 * np.log1p(np.sum(turn_vectors(state.turns) ** 2, axis=1) / level**2)
