@@ -306,7 +306,7 @@ def _step(
     gradient[~free, :3] = 0.0
     diagonal[~free, :3] = 0.0
     diagonal[~free, :, :3] = 0.0
-    diagonal[np.ix_(~free, range(3), range(3))] = np.eye(3)
+    diagonal[np.ix_(~free, np.arange(3), np.arange(3))] = np.eye(3)
     return -_solve_blocks(diagonal, coupling, pairs, gradient)
 
 

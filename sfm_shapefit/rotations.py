@@ -4,7 +4,7 @@
 wrong and sure of itself: matches of one pair share their errors (calibration, repeated structure), so that a
 thousand of them are not a thousand witnesses. The unit of evidence is therefore the pair. For camera i let
 
-    w_i        how far it turned, relative to the median turn of all, the level
+    w_i        how far it turned; the level is what such turns are like, from their median, at least 0.3 deg
     kept_p     cost of its pair p with the given rotation of i, and the centre of i placed anew
     refined_p  cost of the pair with the refined one; the other cameras refined in both.
 
@@ -38,10 +38,9 @@ from sfm_shapefit.geometry import mean_rotation_l1, median_spread
 _SCALES_PX = (8.0, 3.0, 1.0)  # of the Cauchy loss, one after the other
 _FINAL_PX = _SCALES_PX[-1]
 _FIRST_LEVEL_RAD = np.radians(1.0)  # before anything is known of the turns
-_LEAST_LEVEL_RAD = np.radians(0.3)  # what averaged rotations are off, on good sets; smaller turns need little
+_LEAST_LEVEL_RAD = np.radians(0.3)  # averaged rotations are off by that; most cameras less, a few more
 _MEDIAN_OF_LENGTH = 1.538  # of a vector of three unit normal components
 _FLOOR_PX = 0.05  # residuals below this are as good as any; keeps the ratios of exact matches sober
-_NU = 2.0  # residuals that the matches of a pair are worth
 _MIN_PAIRS = 3
 _MIN_GAINING_SHARE = 2.0 / 3.0
 _CENTER_STEPS = 12
@@ -104,7 +103,7 @@ def _without_common_turn(state: State) -> State:
 def _level(turns: FloatArray) -> float:
     """Return the standard deviation per axis, in radians, that the turns speak of."""
     lengths = np.linalg.norm(turn_vectors(turns), axis=1)
-    return max(float(np.median(lengths)) / _MEDIAN_OF_LENGTH, _LEAST_LEVEL_RAD)
+    return float(max(np.median(lengths) / _MEDIAN_OF_LENGTH, _LEAST_LEVEL_RAD))
 
 
 def _judged(matches: RayMatches, state: State, level: float) -> tuple[FloatArray, BoolArray]:
@@ -115,7 +114,7 @@ def _judged(matches: RayMatches, state: State, level: float) -> tuple[FloatArray
     floor = 0.5 * _FLOOR_PX**2 * np.diff(matches.offsets)
     camera = np.concatenate([pairs[:, 0], pairs[:, 1]])
     kept, now = np.concatenate([kept_i, kept_j]), np.tile(refined.costs, 2)
-    gained = 0.5 * _NU * np.log((kept + np.tile(floor, 2)) / (now + np.tile(floor, 2)))
+    gained = np.log((kept + np.tile(floor, 2)) / (now + np.tile(floor, 2)))
     degree = np.bincount(camera, minlength=n)
     gaining = np.bincount(camera[gained > 0.0], minlength=n)
     asked = 2.0 * np.log1p(np.sum(turn_vectors(state.turns) ** 2, axis=1) / level**2)
