@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     import pycolmap
 
 _REFINEMENT_ROUNDS = 2
+_REFINEMENT_RESIDUAL_DEG = 5.0  # of a direction; beyond it no error of rotations is to blame
 _REFINEMENT_MATCHES = 4_000_000  # in all; 200 MB
 _MATCHES_PER_PAIR = (50, 2000)  # at least and at most; more were no better on any real scene
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
@@ -252,7 +253,8 @@ def _refined_rotations(
                 options.for_solver(),
                 directions.covariance[directions.usable()],
             )
-            rays = _rays_of_pairs(model, given, directions.usable()[placement.edges], placement.cameras)
+            near = placement.assessment.residuals_deg <= _REFINEMENT_RESIDUAL_DEG
+            rays = _rays_of_pairs(model, given, directions.usable()[placement.edges[near]], placement.cameras)
         refined = refine_rotations(rays, placement.solve.locations, turns[placement.cameras])
         turns[placement.cameras], turned_deg[placement.cameras] = refined.turns, refined.angles_deg
         turned = with_turned_cameras(model, turns)

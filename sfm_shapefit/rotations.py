@@ -128,8 +128,8 @@ def _judged(matches: RayMatches, state: State, level: float) -> tuple[FloatArray
 def _rotation_sigmas(normal: NormalEquations, matches: RayMatches, num_cameras: int) -> FloatArray:
     """Return (n,) each camera's least certain standard deviation in radians at 1 px, the others held."""
     blocks = camera_blocks(normal, matches.pairs, num_cameras)[0]
-    size = np.maximum(blocks[:, range(6), range(6)].max(axis=1), 1e-300)
-    centre = blocks[:, 3:, 3:] + 1e-12 * size[:, None, None] * np.eye(3)
+    ridge = 1e-12 * float(blocks[:, range(3, 6), range(3, 6)].max())  # a camera may have no pair
+    centre = blocks[:, 3:, 3:] + ridge * np.eye(3)
     solved = np.linalg.solve(centre, blocks[:, 3:, :3])
     information = np.linalg.eigvalsh(blocks[:, :3, :3] - blocks[:, :3, 3:] @ solved)[:, 0]
     return np.asarray(1.0 / np.sqrt(np.maximum(information, 1e-300)))
@@ -175,6 +175,6 @@ def _center_steps(
     for end, sign, normal in zip(matches.pairs.T, (1.0, -1.0), normals, strict=True):
         np.add.at(hessian, end, normal.matrices[:, 6:, 6:])
         np.add.at(gradient, end, sign * normal.vectors[:, 6:])
-    size = np.maximum(hessian[:, range(3), range(3)].max(axis=1), 1e-300)
-    hessian += (damping * size)[:, None, None] * np.eye(3)
+    size = hessian[:, range(3), range(3)].max(axis=1)
+    hessian += (damping * np.maximum(size, 1e-12 * size.max()))[:, None, None] * np.eye(3)
     return np.asarray(np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0])
