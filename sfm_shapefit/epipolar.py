@@ -91,13 +91,13 @@ def _add_pair(
     """Add a pair's matches to its normal matrix (9, 9) and gradient (9,); return the sum of Cauchy losses."""
     length = np.sqrt(baseline[0] ** 2 + baseline[1] ** 2 + baseline[2] ** 2)
     d = baseline / max(length, 1e-300)
-    jacobian, p, q = np.empty(9), np.empty(3), np.empty(3)
+    jacobian, p, q, work = np.empty(9), np.empty(3), np.empty(3), np.empty((3, 3))
     cost = 0.0
     for k in range(len(a)):
         for c in range(3):
             p[c] = turn_i[c, 0] * a[k, 0] + turn_i[c, 1] * a[k, 1] + turn_i[c, 2] * a[k, 2]
             q[c] = turn_j[c, 0] * b[k, 0] + turn_j[c, 1] * b[k, 1] + turn_j[c, 2] * b[k, 2]
-        residual = _residual_and_gradient(p, q, d, length, pixel_angle, jacobian)
+        residual = _residual_and_gradient(p, q, d, length, pixel_angle, jacobian, work)
         loss = 1.0 + (residual / scale_px) ** 2
         cost += 0.5 * scale_px**2 * np.log(loss)
         for row in range(9):
@@ -121,13 +121,19 @@ def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
 
 @kernel(exact=True)
 def _residual_and_gradient(
-    p: FloatArray, q: FloatArray, d: FloatArray, length: float, pixel_angle: float, jacobian: FloatArray
+    p: FloatArray,
+    q: FloatArray,
+    d: FloatArray,
+    length: float,
+    pixel_angle: float,
+    jacobian: FloatArray,
+    work: FloatArray,
 ) -> float:
     """Return the Sampson error in px of rays p and q, and fill its derivatives by w_i, w_j, C_i - C_j."""
     along_p = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
     along_q = q[0] * d[0] + q[1] * d[1] + q[2] * d[2]
     square = max(2.0 - along_p * along_p - along_q * along_q, 1e-12)
-    normal, q_d, d_p = np.empty(3), np.empty(3), np.empty(3)
+    normal, q_d, d_p = work[0], work[1], work[2]
     _cross(p, q, normal)
     _cross(q, d, q_d)
     _cross(d, p, d_p)

@@ -239,7 +239,7 @@ def _refined_rotations(
     """
     turns = np.tile(np.eye(3), (model.num_images, 1, 1))
     turned, turned_deg = model, np.zeros(model.num_images)
-    for _ in range(_REFINEMENT_ROUNDS):
+    for repeat in range(_REFINEMENT_ROUNDS):
         with ExitStack() as resources:
             given, current = (
                 None
@@ -255,7 +255,9 @@ def _refined_rotations(
             )
             near = placement.assessment.residuals_deg <= _REFINEMENT_RESIDUAL_DEG
             rays = _rays_of_pairs(model, given, directions.usable()[placement.edges[near]], placement.cameras)
-        refined = refine_rotations(rays, placement.solve.locations, turns[placement.cameras])
+        refined = refine_rotations(
+            rays, placement.solve.locations, turns[placement.cameras] if repeat else None
+        )
         turns[placement.cameras], turned_deg[placement.cameras] = refined.turns, refined.angles_deg
         turned = with_turned_cameras(model, turns)
     return turned, turned_deg

@@ -70,14 +70,14 @@ def refine_rotations(
     Args:
         matches: the matches of k pairs of the n cameras, as the given rotations place their rays.
         centers: (n, 3) centres to start from, from the given rotations or refined ones.
-        turns: (n, 3, 3) where to start, refined = turns @ given; the identity if None. The prior stays
-            at the given rotations.
+        turns: (n, 3, 3) where to start, refined = turns @ given, from an earlier refinement: only the
+            narrowest loss is used then. The identity if None. The prior stays at the given rotations.
     """
     n = len(centers)
     start = np.tile(np.eye(3), (n, 1, 1)) if turns is None else turns
     state = State(start, centers / median_spread(centers))
     prior = TurnPrior(float(_FIRST_LEVEL_RAD), np.ones(n, dtype=np.bool_))
-    for scale_px in _SCALES_PX:
+    for scale_px in _SCALES_PX if turns is None else _SCALES_PX[-1:]:
         state = _without_common_turn(minimised(matches, state, scale_px, prior))
     prior = replace(prior, level=_level(state.turns))
     state = _without_common_turn(minimised(matches, state, _FINAL_PX, prior))
@@ -159,11 +159,21 @@ def _kept_costs(matches: RayMatches, state: State) -> tuple[FloatArray, FloatArr
     found = both(centers)
     for _ in range(_CENTER_STEPS):
         candidate = centers - _center_steps(found, matches, damping)
-        better = total(both(candidate)) <= total(found)
+        new = both(candidate)
+        better = total(new) <= total(found)
         centers = np.where(better[:, None], candidate, centers)
         damping = np.where(better, damping / 10.0, damping * 10.0)
-        found = both(centers)
+        found = (_chosen(better[i], new[0], found[0]), _chosen(better[j], new[1], found[1]))
     return found[0].costs, found[1].costs
+
+
+def _chosen(rows: BoolArray, new: NormalEquations, old: NormalEquations) -> NormalEquations:
+    """Return the new equations of some pairs (k,) and the old ones of the others."""
+    return NormalEquations(
+        np.where(rows[:, None, None], new.matrices, old.matrices),
+        np.where(rows[:, None], new.vectors, old.vectors),
+        np.where(rows, new.costs, old.costs),
+    )
 
 
 def _center_steps(
