@@ -13,6 +13,9 @@ sum_p log(kept_p / refined_p); a prior with Cauchy tails asks 2 log(1 + |w_i|^2 
 camera takes its refined rotation if the evidence exceeds that, most of its pairs gain, and it has enough
 pairs and information; else it keeps the given one exactly, and the others are refined again around it.
 
+The floor of the level, nu and the share of pairs that must gain were chosen on five Strecha scenes with
+averaged rotations, against their truth.
+
 Source of the ratio: the likelihood of normal residuals of unknown variance, maximised over it, is
 proportional to (sum of squares)^(-nu / 2).
 """
