@@ -7,9 +7,16 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import graph_peers, real, scale, solver, trust
+from benchmarks import coherent, graph_peers, real, scale, solver, trust
 
-SUBCOMMANDS = {"real": real, "solver": solver, "scale": scale, "peers-graphs": graph_peers, "trust": trust}
+SUBCOMMANDS = {
+    "real": real,
+    "solver": solver,
+    "scale": scale,
+    "peers-graphs": graph_peers,
+    "trust": trust,
+    "coherent": coherent,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

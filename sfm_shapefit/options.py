@@ -51,6 +51,9 @@ class LocateOptions:
     """Least share of a pair's matches that must agree with the given rotations."""
     inlier_threshold_px: float = 2.0
     """Largest Sampson error of an inlier match in pixels."""
+    refine_rotations: bool = False
+    """Refine the given rotations on the matches before cameras are placed, camera by camera where there is
+    evidence. For rotations from averaging; those that went through bundle adjustment are finer already."""
     max_reprojection_error_px: float = 4.0
     """Observations of 3D points with a larger reprojection error are dropped."""
     min_triangulation_angle_deg: float = 1.5
@@ -78,6 +81,8 @@ class LocateOptions:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
         if not 0.0 <= self.min_trust <= 1.0:
             raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
+        if self.refine_rotations and self.directions == "relative-poses":
+            raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
         self.for_placement()

@@ -16,7 +16,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import bundle_adjust
 from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
 from sfm_shapefit.colmap.matches import MatchBatch
-from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches
+from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, with_turned_cameras
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
 from sfm_shapefit.directions import (
@@ -27,6 +27,7 @@ from sfm_shapefit.directions import (
     estimate_directions,
     from_relative_poses,
 )
+from sfm_shapefit.epipolar import RayMatches
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.evaluation import Evaluation, evaluate_poses
 from sfm_shapefit.formats import read_graph
@@ -37,12 +38,17 @@ from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warn
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
+from sfm_shapefit.rotations import refine_rotations
 from sfm_shapefit.tracks import JointGraph, build_tracks, covering_set, join_points
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
     import pycolmap
 
+_REFINEMENT_ROUNDS = 2
+_REFINEMENT_RESIDUAL_DEG = 5.0  # of a direction; beyond it no error of rotations is to blame
+_REFINEMENT_MATCHES = 4_000_000  # in all; 200 MB
+_MATCHES_PER_PAIR = (50, 2000)  # at least and at most; more were no better on any real scene
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
 _FEWEST_KEPT = 3  # cameras; fewer trusted ones are no result
 _MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
@@ -88,6 +94,12 @@ def locate(
             matches = None
             if inputs.database is not None:
                 matches = resources.enter_context(open_database(inputs.database, model))
+        turned_deg = None
+        if options.refine_rotations:
+            with clock("rotations"):
+                model, turned_deg = _refined_rotations(model, inputs, options, clock)
+                if inputs.database is not None:
+                    matches = resources.enter_context(open_database(inputs.database, model))
         with clock("directions"):
             directions = _measure_directions(model, matches, inputs.source, options, clock)
         with clock("solve"):
@@ -125,6 +137,7 @@ def locate(
         adjusted=adjusted,
         timings_s=clock.seconds,
         warnings=tuple(_warnings(matches, placement, kept, gauge, seeded.num_points3D())),
+        turned_deg=turned_deg,
     )
 
 
@@ -298,6 +311,74 @@ def _trusted(placement: Placement, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
     kept: BoolArray = placement.assessment.trust >= min_trust
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
+
+
+def _refined_rotations(
+    model: PosedModel, inputs: Inputs, options: LocateOptions, clock: _Clock
+) -> tuple[PosedModel, FloatArray]:
+    """Return the model with refined rotations, and by how many degrees each camera turned, shape (n,).
+
+    Directions need rotations and the refinement needs centres: cameras are placed, rotations refined, and
+    both once more, for with better rotations more pairs have a direction. What a camera may turn is
+    always judged against its given rotation.
+    """
+    turns = np.tile(np.eye(3), (model.num_images, 1, 1))
+    turned, turned_deg = model, np.zeros(model.num_images)
+    for repeat in range(_REFINEMENT_ROUNDS):
+        with ExitStack() as resources:
+            given, current = (
+                None
+                if inputs.database is None
+                else resources.enter_context(open_database(inputs.database, m))
+                for m in (model, turned)
+            )
+            directions = _measure_directions(turned, current, inputs.source, options, clock)
+            joint = _joint_graph(turned, current, directions, options)
+            placement = place(
+                joint.graph, options.for_placement(), joint.covariance, num_cameras=joint.num_cameras
+            )
+            residuals = placement.assessment.residuals_deg[placement.pairs]
+            near = placement.edges[placement.pairs[residuals <= _REFINEMENT_RESIDUAL_DEG]]
+            rays = _rays_of_pairs(model, given, directions.usable()[near], placement.cameras)
+        refined = refine_rotations(rays, placement.locations, turns[placement.cameras] if repeat else None)
+        turns[placement.cameras], turned_deg[placement.cameras] = refined.turns, refined.angles_deg
+        turned = with_turned_cameras(model, turns)
+    return turned, turned_deg
+
+
+def _rays_of_pairs(
+    model: PosedModel, matches: MatchDatabase | None, rows: IntArray, cameras: IntArray
+) -> RayMatches:
+    """Return matches of some pairs, evenly picked where a pair has too many.
+
+    Args:
+        model: the images.
+        matches: the database, or None for the model's own tracks.
+        rows: (k,) ascending positions of the pairs among all pairs with matches.
+        cameras: (n,) ascending images that become cameras 0 to n - 1; they hold all ends of the pairs.
+    """
+    limit = int(np.clip(_REFINEMENT_MATCHES // max(len(rows), 1), *_MATCHES_PER_PAIR))
+    parts, first = [], 0
+    for batch in track_matches(model, 1) if matches is None else matches.iter_matches(1):
+        chosen = rows[(rows >= first) & (rows < first + len(batch.pairs))] - first
+        first += len(batch.pairs)
+        counts = np.diff(batch.offsets)[chosen]
+        picked = [
+            start + np.arange(min(count, limit)) * count // min(count, limit)
+            for start, count in zip(batch.offsets[chosen].tolist(), counts.tolist(), strict=True)
+        ]
+        kept = np.concatenate([np.zeros(0, dtype=np.int64), *picked])
+        pairs = batch.pairs[chosen]
+        angles = 1.0 / model.focal_lengths_px[pairs].min(axis=1)
+        parts.append((pairs, np.minimum(counts, limit), batch.rays_i[kept], batch.rays_j[kept], angles))
+    pairs, counts, rays_i, rays_j, angles = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return RayMatches(
+        pairs=np.searchsorted(cameras, pairs),
+        offsets=np.append(0, np.cumsum(counts)),
+        rays_i=rays_i,
+        rays_j=rays_j,
+        pixel_angles=angles,
+    )
 
 
 def _seed_and_tracks(

@@ -69,7 +69,7 @@ class LocateResult:
     inputs: Inputs
     options: LocateOptions
     model: PosedModel
-    """The input as read; camera k below is its image k."""
+    """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
     directions: PairDirections
     """All pairs that were looked at, with their support."""
     placement: Placement
@@ -85,6 +85,9 @@ class LocateResult:
     """Wall-clock seconds per stage."""
     warnings: tuple[str, ...]
     """What the user should know, a sentence each."""
+    turned_deg: FloatArray | None = None
+    """(n,) by how much each rotation of the input was refined, exactly 0 where it was kept; None if
+    rotations were not to be refined."""
 
     @property
     def solve(self) -> SolverResult:
@@ -259,6 +262,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
         "solve": solve_summary(found.solve),
         "finish": _finish_summary(placement.finish),
+        "rotation_refinement": _refinement_summary(found.turned_deg),
         "bundle_adjustment": found.adjusted and _adjustment_summary(found.adjusted),
         "timings_s": found.timings_s,
         "warnings": list(found.warnings),
@@ -466,4 +470,16 @@ def _adjustment_summary(adjusted: Adjusted) -> dict[str, Any]:
         "iterations": adjusted.iterations,
         "initial_error_px": adjusted.initial_error_px,
         "final_error_px": adjusted.final_error_px,
+    }
+
+
+def _refinement_summary(turned_deg: FloatArray | None) -> dict[str, Any] | None:
+    if turned_deg is None:
+        return None
+    changed = turned_deg[turned_deg > 0.0]
+    return {
+        "num_updated": len(changed),
+        "num_kept": len(turned_deg) - len(changed),
+        "median_change_deg": float(np.median(changed)) if len(changed) else 0.0,
+        "max_change_deg": float(changed.max(initial=0.0)),
     }

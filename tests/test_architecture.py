@@ -23,6 +23,8 @@ LAYERS = [
     "solver",
     "directions",
     "robust",
+    "epipolar",
+    "rotations",
     "placement",
     "gauge",
     "evaluation",

@@ -237,7 +237,13 @@ def test_sets_without_a_target_have_no_checks():
 
 def test_the_recorded_command_repeats_the_run_and_shows_no_path(tmp_path):
     args = argparse.Namespace(
-        sets=["lego100"], repeats=2, bundle_adjust=True, glomap=False, data=tmp_path, out=tmp_path
+        sets=["lego100"],
+        repeats=2,
+        bundle_adjust=True,
+        glomap=False,
+        averaged=False,
+        data=tmp_path,
+        out=tmp_path,
     )
     expected = "python scripts/benchmark.py real --sets lego100 --repeats 2 --bundle-adjust"
     assert real.command_line(args) == expected

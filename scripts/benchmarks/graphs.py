@@ -27,11 +27,11 @@ class GraphSpec:
         return f"{self.family} {self.n}, sigma {self.sigma:g}"
 
 
-def draw(spec: GraphSpec) -> "GraphProblem":
-    """Return the problem, always the same one."""
+def draw(spec: GraphSpec, **changes: Any) -> "GraphProblem":
+    """Return the problem, always the same one; `changes` are further arguments of the family."""
     from sfm_shapefit import synthetic
 
-    noise: dict[str, Any] = {"sigma": spec.sigma, "q": spec.q, "seed": SEED}
+    noise: dict[str, Any] = {"sigma": spec.sigma, "q": spec.q, "seed": SEED} | changes
     if spec.family == "er2":
         return synthetic.random_graph_problem(spec.n, 0.5, **noise)
     families = {

@@ -44,6 +44,8 @@ class Scene:
     """Median and mean before bundle adjustment."""
     adjusted_reference: float | None = None
     """Mean error of the better of COLMAP incremental and GLOMAP, both after bundle adjustment."""
+    averaged_limits: tuple[float, float] | None = None
+    """Median and mean on rotations from averaging."""
     limit_s: float | None = None
     """End-to-end seconds without bundle adjustment."""
 
@@ -51,11 +53,24 @@ class Scene:
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene(name="fountain-P11", unit="m", limits=(0.0025, 0.0026), adjusted_reference=0.0023),
+        Scene(
+            name="fountain-P11",
+            unit="m",
+            limits=(0.0025, 0.0026),
+            adjusted_reference=0.0023,
+            averaged_limits=(0.007, 0.010),
+        ),
         Scene(name="Herz-Jesus-P8", unit="m"),
         Scene(name="Herz-Jesus-P25", unit="m", limits=(0.0060, 0.0062), adjusted_reference=0.0053),
         Scene(name="castle-P19", unit="m", limits=(0.030, 0.095), adjusted_reference=0.0263),
-        Scene(name="castle-P30", unit="m", limits=(0.031, 0.036), adjusted_reference=0.0232, limit_s=12.0),
+        Scene(
+            name="castle-P30",
+            unit="m",
+            limits=(0.031, 0.036),
+            adjusted_reference=0.0232,
+            limit_s=12.0,
+            averaged_limits=(0.08, 0.11),
+        ),
         Scene(name="lego100", unit="scene units", limits=(0.0055, 0.36)),
         Scene(name="liberty", unit="reference units", truth="sparse/0", limits=(0.008, 0.03)),
         Scene(name="liberty-calibrated", unit="reference units", truth="sparse/0"),
@@ -87,6 +102,19 @@ class Peer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Averaged:
+    """One run on rotations from averaging."""
+
+    refined: bool
+    """Whether `locate` refined the rotations."""
+    errors: Errors
+    rotation_deg: tuple[float, float, float]
+    """Median, mean and maximum of the rotation errors."""
+    num_turned: int
+    cpu_s: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Measured:
     """What one set gave; seconds are wall-clock unless they say CPU."""
 
@@ -109,6 +137,7 @@ class Measured:
     peers: tuple[Peer, ...] = ()
     adjusted: Errors | None = None
     adjustment_s: float = math.nan
+    averaged: tuple[Averaged, ...] = ()
 
 
 QUANTITIES = (
@@ -183,6 +212,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--repeats", type=_positive, default=3, help="warm runs per set (default 3)")
     parser.add_argument("--bundle-adjust", action="store_true", help="also run with bundle adjustment, once")
     parser.add_argument(
+        "--averaged",
+        action="store_true",
+        help="also run on rotations from averaging, as they are and with --refine-rotations, once each",
+    )
+    parser.add_argument(
         "--glomap", action="store_true", help="also run GLOMAP's positioning, once per setting"
     )
     parser.add_argument(
@@ -232,7 +266,9 @@ def command_line(args: argparse.Namespace) -> str:
     """Return the command that repeats the measurement, without paths."""
     sets = "" if args.sets == list(SCENES) else f" --sets {','.join(args.sets)}"
     flags = "".join(
-        f" --{name.replace('_', '-')}" for name in ("bundle_adjust", "glomap") if getattr(args, name)
+        f" --{name.replace('_', '-')}"
+        for name in ("bundle_adjust", "averaged", "glomap")
+        if getattr(args, name)
     )
     return f"python scripts/benchmark.py real{sets} --repeats {args.repeats}{flags}"
 
@@ -244,10 +280,13 @@ def _in_fresh_process(scene: Scene, args: argparse.Namespace) -> Measured:
     """Call `measure` in a new process, which starts without anything imported."""
     with ProcessPoolExecutor(max_workers=1, mp_context=multiprocessing.get_context("spawn")) as pool:
         folder = args.data / scene.name
-        return pool.submit(measure, scene, folder, args.repeats, args.bundle_adjust, args.glomap).result()
+        extras = (args.bundle_adjust, args.glomap, args.averaged)
+        return pool.submit(measure, scene, folder, args.repeats, *extras).result()
 
 
-def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, glomap: bool) -> Measured:
+def measure(
+    scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, glomap: bool, averaged: bool = False
+) -> Measured:
     """Measure one set; to be called once per process."""
     start = time.perf_counter()
     from sfm_shapefit import LocateOptions
@@ -283,7 +322,32 @@ def measure(scene: Scene, folder: Path, repeats: int, bundle_adjust: bool, gloma
         peers=peers,
         adjusted=adjusted,
         adjustment_s=adjustment_s,
+        averaged=_measure_averaged(folder, folder / scene.truth) if averaged else (),
     )
+
+
+def _measure_averaged(folder: Path, truth: Path) -> "tuple[Averaged, ...]":
+    """Locate on rotations from averaging, as they are and refined."""
+    from benchmarks.averaging import averaged_model
+    from sfm_shapefit import LocateOptions, evaluate, locate
+
+    model = averaged_model(folder / "database.db", folder / "sparse" / "0")
+    measured = []
+    for refine in (False, True):
+        start = time.process_time()
+        found = locate(model, folder / "database.db", LocateOptions(refine_rotations=refine))
+        rotation = evaluate(found.reconstruction, truth).rotation_deg
+        turned = 0 if found.turned_deg is None else int((found.turned_deg > 0.0).sum())
+        measured.append(
+            Averaged(
+                refined=refine,
+                errors=_errors(found.reconstruction, truth),
+                rotation_deg=(rotation.median, rotation.mean, rotation.max),
+                num_turned=turned,
+                cpu_s=time.process_time() - start,
+            )
+        )
+    return tuple(measured)
 
 
 def _timed_locate(model: Path, options: "LocateOptions") -> "tuple[LocateResult, float, float]":
@@ -393,6 +457,8 @@ def section(measured: Sequence[Measured], about: str, absent: Sequence[str]) -> 
             f"### After bundle adjustment (intrinsics fixed)\n\n{_ADJUSTED_NOTE}",
             _adjusted_table(measured),
         ]
+    if any(one.averaged for one in measured):
+        parts += [f"### Rotations from averaging\n\n{_AVERAGED_NOTE}", _averaged_table(measured)]
     if any(one.peers for one in measured):
         parts += [f"### GLOMAP's positioning, same rotations\n\n{_GLOMAP_NOTE}", _glomap_table(measured)]
     parts += ["### What the columns mean", legend(QUANTITIES), _CAVEATS]
@@ -403,6 +469,12 @@ _ADJUSTED_NOTE = (
     "The reference is the mean error of the better of COLMAP incremental and GLOMAP (its better setting of"
     " min_num_matches) after their own bundle adjustment, as recorded for the data, not run again here; the"
     " limit is 15 % above it. One run, one thread; lower is better."
+)
+_AVERAGED_NOTE = (
+    "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15 matches or"
+    " more), intrinsics of sparse/0, no centres; position error median / mean / max and rotation error in"
+    " degrees, once with the rotations kept and once with `--refine-rotations`. The target is that of the"
+    " kept rotations."
 )
 _GLOMAP_NOTE = (
     "Positions straight after `run_global_positioning`, no bundle adjustment, once per setting and in the"
@@ -509,6 +581,45 @@ def _adjusted_table(measured: Sequence[Measured]) -> str:
         )
     header = ["set", "median / mean / max", "reference mean", "mean / reference", "verdict", "adjustment, s"]
     return table(header, rows)
+
+
+def _averaged_table(measured: Sequence[Measured]) -> str:
+    rows = []
+    for one in measured:
+        limits = SCENES[one.name].averaged_limits
+        for run in one.averaged:
+            rows.append(
+                [
+                    f"{one.name} ({SCENES[one.name].unit})",
+                    f"refined, {run.num_turned} cameras" if run.refined else "kept",
+                    _error_cell(run.errors),
+                    numbers(run.rotation_deg),
+                    "-" if limits is None else numbers(limits),
+                    verdict(_averaged_checks(one.name, run)),
+                    number(run.cpu_s),
+                ]
+            )
+    header = [
+        "set",
+        "rotations",
+        "median / mean / max",
+        "rotation error, deg",
+        "to reach, median / mean",
+        "verdict",
+        "CPU, s",
+    ]
+    return table(header, rows)
+
+
+def _averaged_checks(name: str, run: Averaged) -> list[Check]:
+    """Return the checks of accuracy on averaged rotations."""
+    limits = SCENES[name].averaged_limits
+    if limits is None:
+        return []
+    return [
+        Check(name="median", value=run.errors.median, limit=limits[0]),
+        Check(name="mean", value=run.errors.mean, limit=limits[1]),
+    ]
 
 
 def _ratio_cell(peer: Errors | None, ours: Errors) -> str:

@@ -88,6 +88,24 @@ def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
+def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
+    """Return the model with cameras that turn about their centres; the input is not touched.
+
+    Args:
+        model: the posed images.
+        turns: (n, 3, 3) rotations of the cameras in world axes: cam_from_world becomes R turn^T. Where one is
+            exactly the identity the rotation keeps its bits.
+    """
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
+        image = copy.image(int(model.image_ids[index]))
+        rotation = pycolmap.Rotation3d(model.rotations[index] @ turns[index].T)
+        translation = -(rotation.matrix() @ model.centers[index])
+        pose = pycolmap.Rigid3d(rotation, translation)
+        copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
+    return read_model(copy)
+
+
 def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     """Return the unit rays R^T f(xy) of pixels in world axes.
 

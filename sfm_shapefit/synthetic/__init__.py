@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from sfm_shapefit.synthetic.graphs import (
+        Corruption,
         GraphProblem,
         box_graph_problem,
         community_graph_problem,
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "graphs": (
+        "Corruption",
         "GraphProblem",
         "box_graph_problem",
         "community_graph_problem",
@@ -33,6 +35,7 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "Corruption",
     "GraphProblem",
     "Scene",
     "SceneOptions",

@@ -6,13 +6,23 @@
     trajectory   a video: each camera joined to the next ones, and a few loop closures
     community    an internet collection: clusters with hubs, loosely joined
 
-Each direction is replaced by a uniformly random unit vector with probability q, and is else the true one plus
-sigma times a random unit vector, normalised.
+Each direction is the true one plus sigma times a random unit vector, normalised, or with probability q a
+wrong one. What wrong directions are like is the corruption:
+
+    uniform           each a uniformly random unit vector: the model of the theorems
+    self-consistent   noisy directions of one second configuration of all cameras, as where facades repeat:
+                      they contradict the truth, and never one another
+    concentrated      uniform ones, on pairs of cameras with few pairs: the odds are in proportion to the
+                      smaller degree's inverse, and q is the share over all pairs
+
+With self-consistent corruption no method can succeed from q = 0.5 on: at that share, truth and the second
+configuration explain the graph equally well.
 
 Source of the random model: Hand, Lee, Voroninski (2015), arXiv 1506.01437, section 4.
 """
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +31,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
 
 Seed = int | np.random.Generator
+Corruption = Literal["uniform", "self-consistent", "concentrated"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -34,11 +45,19 @@ class GraphProblem:
     directions: FloatArray
     """(m, d) measured unit directions of t_i - t_j."""
     corrupted: BoolArray
-    """(m,) True where the direction is a random one."""
+    """(m,) True where the direction is a wrong one."""
+    false_locations: FloatArray | None = None
+    """(n, d) the configuration that self-consistent wrong directions agree on; None for other corruption."""
 
 
 def random_graph_problem(
-    n: int, p: float = 0.5, d: int = 3, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+    n: int,
+    p: float = 0.5,
+    d: int = 3,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
 ) -> GraphProblem:
     """Return the random model of the paper: locations N(0, I_d), an Erdos-Renyi graph G(n, p).
 
@@ -47,8 +66,9 @@ def random_graph_problem(
         p: probability of each pair.
         d: dimension, at least 2.
         sigma: size of the noise of the directions that are not corrupted.
-        q: probability that a direction is replaced by a uniformly random unit vector.
+        q: probability that a direction is a wrong one.
         seed: an integer, or a Generator to draw from.
+        corruption: what wrong directions are like; the other families take it as well.
 
     Source: Hand, Lee, Voroninski (2015), section 4.
     """
@@ -57,21 +77,31 @@ def random_graph_problem(
     i, j = np.triu_indices(n, k=1)
     present = rng.random(len(i)) < p
     edges = np.stack([i[present], j[present]], axis=1).astype(np.int64)
-    return _measured(locations, edges, sigma, q, rng)
+    return _measured(locations, edges, sigma, q, rng, corruption)
 
 
 def expander_graph_problem(
-    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
 ) -> GraphProblem:
     """Return locations N(0, I) and n degree / 2 pairs drawn uniformly; repeated draws are merged."""
     rng = np.random.default_rng(seed)
     locations = rng.standard_normal((n, 3))
     i, j = rng.integers(n, size=(2, round(n * degree / 2.0)))
-    return _measured(locations, _unique_pairs(i, j), sigma, q, rng)
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
 
 
 def box_graph_problem(
-    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
 ) -> GraphProblem:
     """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
 
@@ -82,11 +112,16 @@ def box_graph_problem(
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
     neighbours = _nearest(locations, round(degree / 1.25))
     camera = np.repeat(np.arange(n), neighbours.shape[1])
-    return _measured(locations, _unique_pairs(camera, neighbours.ravel()), sigma, q, rng)
+    return _measured(locations, _unique_pairs(camera, neighbours.ravel()), sigma, q, rng, corruption)
 
 
 def trajectory_graph_problem(
-    n: int, degree: float = 20.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
 ) -> GraphProblem:
     """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
 
@@ -103,11 +138,16 @@ def trajectory_graph_problem(
     closing = rng.integers(n, size=len(i) // 50)
     closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
     edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
-    return _measured(locations, edges, sigma, q, rng)
+    return _measured(locations, edges, sigma, q, rng, corruption)
 
 
 def community_graph_problem(
-    n: int, degree: float = 30.0, sigma: float = 0.0, q: float = 0.0, seed: Seed = 0
+    n: int,
+    degree: float = 30.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
 ) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
@@ -138,19 +178,51 @@ def community_graph_problem(
     backbone = [(np.arange(n - step), np.arange(step, n)) for step in range(1, min(5, n))]
     i = np.concatenate([i, *(a for a, _ in backbone)])
     j = np.concatenate([j, *(b for _, b in backbone)])
-    return _measured(locations, _unique_pairs(i, j), sigma, q, rng)
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
 
 
 def _measured(
-    locations: FloatArray, edges: IntArray, sigma: float, q: float, rng: np.random.Generator
+    locations: FloatArray,
+    edges: IntArray,
+    sigma: float,
+    q: float,
+    rng: np.random.Generator,
+    corruption: Corruption,
 ) -> GraphProblem:
-    """Return the directions of `edges` with the noise and the corruption of the paper."""
-    true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
-    noisy = normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
-    random = normalized(rng.standard_normal(true.shape))
-    corrupted = rng.random(len(edges)) < q
-    directions = np.where(corrupted[:, None], random, noisy)
-    return GraphProblem(locations=locations, edges=edges, directions=directions, corrupted=corrupted)
+    """Return the directions of `edges` with noise and corruption."""
+    if corruption not in get_args(Corruption):
+        raise ValueError(f"corruption must be one of {', '.join(get_args(Corruption))}, got {corruption!r}")
+
+    def noisy(t: FloatArray) -> FloatArray:
+        true = normalized(t[edges[:, 0]] - t[edges[:, 1]])
+        return normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
+
+    right = noisy(locations)
+    wrong = normalized(rng.standard_normal(right.shape))
+    odds = np.full(len(edges), q) if corruption != "concentrated" else _odds_by_degree(edges, q)
+    corrupted = rng.random(len(edges)) < odds
+    false_locations = None
+    if corruption == "self-consistent":  # drawn last: what is corrupted is the same for all models
+        false_locations = locations[rng.permutation(len(locations))]
+        wrong = noisy(false_locations)
+    return GraphProblem(
+        locations=locations,
+        edges=edges,
+        directions=np.where(corrupted[:, None], wrong, right),
+        corrupted=corrupted,
+        false_locations=false_locations,
+    )
+
+
+def _odds_by_degree(edges: IntArray, q: float) -> FloatArray:
+    """Return (m,) odds of corruption min(1, c / smaller degree), c such that their mean is q."""
+    inverse = 1.0 / np.bincount(edges.ravel())[edges].min(axis=1)
+    low, high = 0.0, 1.0 / float(inverse.min())
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if np.minimum(1.0, middle * inverse).mean() < q else (low, middle)
+    odds: FloatArray = np.minimum(1.0, high * inverse)
+    return odds
 
 
 def _nearest(locations: FloatArray, k: int) -> IntArray:

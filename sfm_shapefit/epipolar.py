@@ -1,0 +1,331 @@
+"""Rotations and centres refined together on the matches themselves, without 3D points.
+
+A match of pair (i, j) is two unit rays a, b in world axes, as the given rotations place them. A camera that
+turns by the small rotation vector w_i turns its rays, a -> exp([w_i]) a. With the baseline
+d = (C_i - C_j) / |C_i - C_j| the residual of the match is its Sampson error in pixels,
+
+    r = e / (sigma s),   e = <a x b, d>,   s^2 = |a x d|^2 + |b x d|^2 = 2 - <a, d>^2 - <b, d>^2,
+
+with sigma the angle of one pixel, as in `directions`. Its derivatives, all exact:
+
+    e by w_i:  a x (b x d)        s^2 / 2 by w_i:  -<a, d> (a x d)
+    e by w_j:  b x (d x a)        s^2 / 2 by w_j:  -<b, d> (b x d)
+    e by d:    a x b              s^2 / 2 by d:    -<a, d> a - <b, d> b
+
+and d moves with C_i - C_j by (I - d d^T) / |C_i - C_j|. One pass over the matches sums, for each pair, the
+9 x 9 normal matrix of (w_i, w_j, C_i - C_j); memory is that of the pairs. The sum of Cauchy losses, its scale
+falling 8, 3, 1 px, plus a soft prior on the w_i, is minimised by Levenberg-Marquardt steps over 6 unknowns
+per camera. The prior fixes the common rotation; the damping takes care of shift and scale. Which of the
+refined rotations to believe is decided in `rotations`.
+
+Sources: Sampson error: Hartley and Zisserman, "Multiple View Geometry", 2nd ed., section 11.4.3;
+Levenberg-Marquardt with robust weights: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999,
+section 6; Cauchy weights: Zhang, "Parameter estimation techniques", IVC 1997, table 1.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.sparse import bsr_array
+from scipy.sparse.linalg import splu
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.dense import one_blas_thread
+
+_STEPS = 12
+_DAMPING = 1e-4  # of the diagonal, at the start
+_MAX_DAMPING = 1e4
+_ABSOLUTE_DAMPING = 1e-12  # of the largest diagonal entry: gauge directions stay put
+_SETTLED = 1e-6  # relative fall of the cost below which the steps end
+_DENSE_UNKNOWNS = 900
+_OF_I, _OF_J = [0, 1, 2, 6, 7, 8], [3, 4, 5, 6, 7, 8]  # of a pair's 9 unknowns, those that move camera i, j
+_SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])  # C_j enters C_i - C_j with a minus
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RayMatches:
+    """The matches of k camera pairs, one pair after the other, as rays placed by the given rotations."""
+
+    pairs: IntArray
+    """(k, 2) cameras (i, j)."""
+    offsets: IntArray
+    """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
+    rays_i: FloatArray
+    """(M, 3) unit rays of camera i, world axes."""
+    rays_j: FloatArray
+    """(M, 3) unit rays of camera j, world axes."""
+    pixel_angles: FloatArray
+    """(k,) angle of one pixel in radians."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class State:
+    """What is sought: rotations in world axes that turn each camera's rays, and the centres."""
+
+    turns: FloatArray
+    """(n, 3, 3)"""
+    centers: FloatArray
+    """(n, 3)"""
+
+    def moved(self, step: FloatArray) -> "State":
+        """Return the state after a step (n, 6)."""
+        turned = Rotation.from_rotvec(step[:, :3]).as_matrix() @ self.turns
+        return State(turned, self.centers + step[:, 3:])
+
+
+@kernel(exact=True)
+def _add_pair(
+    a: FloatArray,
+    b: FloatArray,
+    turn_i: FloatArray,
+    turn_j: FloatArray,
+    baseline: FloatArray,
+    pixel_angle: float,
+    scale_px: float,
+    matrix: FloatArray,
+    vector: FloatArray,
+) -> float:
+    """Add a pair's matches to its normal matrix (9, 9) and gradient (9,); return the sum of Cauchy losses."""
+    length = np.sqrt(baseline[0] ** 2 + baseline[1] ** 2 + baseline[2] ** 2)
+    d = baseline / max(length, 1e-300)
+    jacobian, p, q, work = np.empty(9), np.empty(3), np.empty(3), np.empty((3, 3))
+    cost = 0.0
+    for k in range(len(a)):
+        for c in range(3):
+            p[c] = turn_i[c, 0] * a[k, 0] + turn_i[c, 1] * a[k, 1] + turn_i[c, 2] * a[k, 2]
+            q[c] = turn_j[c, 0] * b[k, 0] + turn_j[c, 1] * b[k, 1] + turn_j[c, 2] * b[k, 2]
+        residual = _residual_and_gradient(p, q, d, length, pixel_angle, jacobian, work)
+        loss = 1.0 + (residual / scale_px) ** 2
+        cost += 0.5 * scale_px**2 * np.log(loss)
+        for row in range(9):
+            weighted = jacobian[row] / loss
+            vector[row] += weighted * residual
+            for column in range(row + 1):
+                matrix[row, column] += weighted * jacobian[column]
+    for row in range(9):
+        for column in range(row):
+            matrix[column, row] = matrix[row, column]
+    return cost
+
+
+@kernel(exact=True)
+def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with a x b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@kernel(exact=True)
+def _residual_and_gradient(
+    p: FloatArray,
+    q: FloatArray,
+    d: FloatArray,
+    length: float,
+    pixel_angle: float,
+    jacobian: FloatArray,
+    work: FloatArray,
+) -> float:
+    """Return the Sampson error in px of rays p and q, and fill its derivatives by w_i, w_j, C_i - C_j."""
+    along_p = p[0] * d[0] + p[1] * d[1] + p[2] * d[2]
+    along_q = q[0] * d[0] + q[1] * d[1] + q[2] * d[2]
+    square = max(2.0 - along_p * along_p - along_q * along_q, 1e-12)
+    normal, q_d, d_p = work[0], work[1], work[2]
+    _cross(p, q, normal)
+    _cross(q, d, q_d)
+    _cross(d, p, d_p)
+    value = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
+    ratio, size = value / square, 1.0 / (pixel_angle * np.sqrt(square))
+    _cross(p, q_d, jacobian[0:3])
+    _cross(q, d_p, jacobian[3:6])
+    for c in range(3):
+        jacobian[c] = size * (jacobian[c] - ratio * along_p * d_p[c])
+        jacobian[3 + c] = size * (jacobian[3 + c] + ratio * along_q * q_d[c])
+        jacobian[6 + c] = size * (normal[c] + ratio * (along_p * p[c] + along_q * q[c])) / max(length, 1e-300)
+    along = jacobian[6] * d[0] + jacobian[7] * d[1] + jacobian[8] * d[2]
+    for c in range(3):
+        jacobian[6 + c] -= along * d[c]
+    return float(value * size)
+
+
+@kernel(exact=True)
+def _add_pairs(
+    offsets: IntArray,
+    rays_i: FloatArray,
+    rays_j: FloatArray,
+    turns_i: FloatArray,
+    turns_j: FloatArray,
+    baselines: FloatArray,
+    pixel_angles: FloatArray,
+    scale_px: float,
+    matrices: FloatArray,
+    vectors: FloatArray,
+    costs: FloatArray,
+) -> None:
+    """Fill the (k, 9, 9) normal matrices, (k, 9) gradients and (k,) costs of all pairs."""
+    for p in range(len(baselines)):
+        first, last = offsets[p], offsets[p + 1]
+        costs[p] = _add_pair(
+            rays_i[first:last],
+            rays_j[first:last],
+            turns_i[p],
+            turns_j[p],
+            baselines[p],
+            pixel_angles[p],
+            scale_px,
+            matrices[p],
+            vectors[p],
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NormalEquations:
+    """Normal equations of every pair, at what the pair sees of its two cameras."""
+
+    matrices: FloatArray
+    """(k, 9, 9) of (w_i, w_j, C_i - C_j), px^2 per unit squared."""
+    vectors: FloatArray
+    """(k, 9) gradients of the costs."""
+    costs: FloatArray
+    """(k,) sums of Cauchy losses in px^2."""
+
+
+def normal_equations(
+    matches: RayMatches, turns: tuple[FloatArray, FloatArray], baselines: FloatArray, scale_px: float
+) -> NormalEquations:
+    """Sum the matches of each pair in one pass.
+
+    Args:
+        matches: k pairs.
+        turns: for camera i and for camera j of each pair, (k, 3, 3) what turns its rays.
+        baselines: (k, 3) C_i - C_j.
+        scale_px: scale of the Cauchy loss.
+    """
+    k = len(matches.pairs)
+    found = NormalEquations(np.zeros((k, 9, 9)), np.zeros((k, 9)), np.zeros(k))
+    _add_pairs(
+        matches.offsets,
+        matches.rays_i,
+        matches.rays_j,
+        np.ascontiguousarray(turns[0]),
+        np.ascontiguousarray(turns[1]),
+        np.ascontiguousarray(baselines),
+        matches.pixel_angles,
+        scale_px,
+        found.matrices,
+        found.vectors,
+        found.costs,
+    )
+    return found
+
+
+def at_state(matches: RayMatches, state: State, scale_px: float) -> NormalEquations:
+    """Return the normal equations of all pairs at one state."""
+    i, j = matches.pairs.T
+    baselines = state.centers[i] - state.centers[j]
+    return normal_equations(matches, (state.turns[i], state.turns[j]), baselines, scale_px)
+
+
+def camera_blocks(
+    normal: NormalEquations, pairs: IntArray, num_cameras: int
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the normal equations of (w, C) of all cameras.
+
+    Returns:
+        The diagonal blocks (n, 6, 6), each pair's block of camera i by camera j (k, 6, 6), and the
+        gradient (n, 6).
+    """
+    i, j = pairs.T
+    diagonal, gradient = np.zeros((num_cameras, 6, 6)), np.zeros((num_cameras, 6))
+    np.add.at(diagonal, i, normal.matrices[:, _OF_I][:, :, _OF_I])
+    np.add.at(diagonal, j, normal.matrices[:, _OF_J][:, :, _OF_J] * np.outer(_SIGN_J, _SIGN_J))
+    np.add.at(gradient, i, normal.vectors[:, _OF_I])
+    np.add.at(gradient, j, normal.vectors[:, _OF_J] * _SIGN_J)
+    return diagonal, normal.matrices[:, _OF_I][:, :, _OF_J] * _SIGN_J, gradient
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TurnPrior:
+    """A heavy-tailed prior of the turns, px^2: sum 2 log(1 + |w|^2 / level^2), and the cameras that may turn.
+
+    It is the negative logarithm of a Cauchy density in three dimensions: most cameras turn by about the
+    level, a few by as much as their matches demand.
+    """
+
+    level: float
+    """Radians."""
+    free: BoolArray
+    """(n,) the other cameras keep their turns."""
+
+    def cost(self, state: State) -> float:
+        """Return the prior's share of the cost."""
+        return float(2.0 * np.log1p(np.sum(turn_vectors(state.turns) ** 2, axis=1) / self.level**2).sum())
+
+    def add_to(self, state: State, diagonal: FloatArray, gradient: FloatArray) -> None:
+        """Add the prior's normal equations, the curvature as that of reweighted least squares."""
+        vectors = turn_vectors(state.turns)
+        weights = 4.0 / (self.level**2 + np.sum(vectors**2, axis=1))
+        diagonal[:, range(3), range(3)] += weights[:, None]
+        gradient[:, :3] += weights[:, None] * vectors
+
+
+def turn_vectors(turns: FloatArray) -> FloatArray:
+    """Return the rotation vectors (n, 3) of turns (n, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(turns).as_rotvec())
+
+
+def minimised(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> State:
+    """Return the state after Levenberg-Marquardt steps on all matches at one scale of the Cauchy loss."""
+    damping = _DAMPING
+    normal = at_state(matches, state, scale_px)
+    cost = float(normal.costs.sum()) + prior.cost(state)
+    for _ in range(_STEPS):
+        system = camera_blocks(normal, matches.pairs, len(state.centers))
+        prior.add_to(state, system[0], system[2])
+        before = cost
+        while damping <= _MAX_DAMPING:
+            candidate = state.moved(_step(system, matches.pairs, prior.free, damping))
+            new = at_state(matches, candidate, scale_px)
+            new_cost = float(new.costs.sum()) + prior.cost(candidate)
+            if new_cost <= cost:
+                state, normal, cost, damping = candidate, new, new_cost, damping / 10.0
+                break
+            damping *= 10.0
+        if before - cost <= _SETTLED * cost:
+            break
+    return state
+
+
+def _step(
+    system: tuple[FloatArray, FloatArray, FloatArray], pairs: IntArray, free: BoolArray, damping: float
+) -> FloatArray:
+    """Return the damped step (n, 6); cameras that are not free move without turning."""
+    diagonal, coupling, gradient = (block.copy() for block in system)
+    own = diagonal[:, range(6), range(6)]
+    diagonal[:, range(6), range(6)] += damping * own + _ABSOLUTE_DAMPING * own.max(axis=0)
+    i, j = pairs.T
+    coupling[~free[i], :3] = 0.0
+    coupling[~free[j], :, :3] = 0.0
+    gradient[~free, :3] = 0.0
+    diagonal[~free, :3] = 0.0
+    diagonal[~free, :, :3] = 0.0
+    diagonal[np.ix_(~free, np.arange(3), np.arange(3))] = np.eye(3)
+    return -_solve_blocks(diagonal, coupling, pairs, gradient)
+
+
+def _solve_blocks(diagonal: FloatArray, coupling: FloatArray, pairs: IntArray, rhs: FloatArray) -> FloatArray:
+    """Solve the symmetric positive definite block system; right-hand side and answer (n, 6)."""
+    n, (i, j) = len(diagonal), pairs.T
+    rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
+    blocks = np.concatenate([coupling, coupling.transpose(0, 2, 1), diagonal])
+    order = np.lexsort((columns, rows))
+    pointers = np.searchsorted(rows[order], np.arange(n + 1))
+    matrix = bsr_array((blocks[order], columns[order], pointers), shape=(6 * n, 6 * n))
+    with one_blas_thread():
+        if 6 * n <= _DENSE_UNKNOWNS:
+            return np.asarray(cho_solve(cho_factor(matrix.toarray()), rhs.ravel())).reshape(n, 6)
+        factor = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A")
+        return np.asarray(factor.solve(rhs.ravel())).reshape(n, 6)
