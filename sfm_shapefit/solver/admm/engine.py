@@ -152,8 +152,10 @@ class Iteration:
             elif k - best_at > max(_STALL_WINDOW, k // 2):
                 return Outcome(state=state, iterations=k, stop=Stop.STALLED)
             if before is not None:
+                state.scale *= np.sqrt(self._balance(state, before) / _BALANCE)
+                before = None  # its memory is needed for the factor
                 state.anderson = self._accelerator(state)
-                self._renew(state, before, self._floor(settings.renewals.index(k), state.anderson))
+                self._renew(state, self._floor(settings.renewals.index(k), state.anderson))
         return Outcome(state=state, iterations=settings.max_iterations, stop=Stop.MAX_ITERATIONS)
 
     def objective(self, state: State) -> float:
@@ -179,9 +181,7 @@ class Iteration:
 
     def _factor(self, state: State) -> None:
         """Factor the Laplacian of the penalties and solve for the direction of the constraint."""
-        in_graph_order = np.empty_like(state.rho)
-        in_graph_order[self.passes.data.order] = state.rho
-        self.factor.refactor(in_graph_order)
+        self.factor.refactor(self.passes.in_graph_order(state.rho))
         self._factored = 1.0
         if self.c is not None:
             state.unit = self.factor.solve(self.c)
@@ -224,13 +224,12 @@ class Iteration:
         """Return the least residual that penalties take seriously, relative to the mean residual."""
         return _FLOORS[min(renewal, len(_FLOORS) - 1)] if anderson is None else _ANDERSON_FLOOR
 
-    def _renew(self, state: State, before: FloatArray, floor: float) -> None:
+    def _renew(self, state: State, floor: float) -> None:
         """Replace the penalties by w / residual and factor anew; y and the dual rho u stay."""
         passes = self.passes
-        state.scale *= np.sqrt(self._balance(state, before) / _BALANCE)
-        residuals = passes.residuals(state.t)
-        least = floor * _mean(residuals, passes.data.weights)
-        rho = state.scale * _PENALTY * passes.data.weights / np.maximum(residuals, least)
+        rho = passes.residuals(state.t)
+        np.maximum(rho, floor * _mean(rho, passes.data.weights), out=rho)
+        np.divide(state.scale * _PENALTY * passes.data.weights, rho, out=rho)
         passes.change_penalties(state.x, state.rho, rho)
         state.rho, state.previous = rho, np.inf
         self._factor(state)
