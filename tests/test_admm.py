@@ -3,14 +3,19 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, solve_admm, solve_lud
+from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, linear, solve_admm, solve_lud
 from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
 from sfm_shapefit.solver.admm.linear import predict_factor
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.hybrid import solve_hybrid
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.synthetic import box_graph_problem, community_graph_problem, expander_graph_problem
+from sfm_shapefit.synthetic import (
+    box_graph_problem,
+    community_graph_problem,
+    expander_graph_problem,
+    trajectory_graph_problem,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
 
@@ -347,6 +352,17 @@ def test_expanders_are_recognised_before_an_order_is_looked_for_and_other_graphs
     assert tree(expander_graph_problem, 20.0) is None
     assert tree(box_graph_problem, 20.0) is not None
     assert tree(community_graph_problem, 30.0) is not None
+
+
+def test_huge_graphs_with_wide_levels_are_not_ordered_and_long_ones_are(monkeypatch):
+    monkeypatch.setattr(linear, "_HUGE", 3000)
+    monkeypatch.setattr(linear, "_FLOPS_PER_EDGE", 300)  # so that a box of 6000 counts as too much work
+
+    def tree(problem):
+        return predict_factor(ViewGraph(len(problem.locations), problem.edges, problem.directions)).tree
+
+    assert tree(box_graph_problem(6000, 40.0, sigma=0.0, q=0.0, seed=1)) is None
+    assert tree(trajectory_graph_problem(6000, 20.0, sigma=0.0, q=0.0, seed=1)) is not None
 
 
 def test_slow_communities_are_freed_by_smaller_penalties_late():

@@ -314,6 +314,18 @@ def divided(request) -> tuple[npt.NDArray[np.int64], SymbolicFactor]:
     return edges, plan
 
 
+def test_the_widest_level_of_a_grid_is_its_diagonal_and_of_a_box_about_its_separator():
+    rows, columns = np.divmod(np.arange(20 * 30), 30)
+    nodes = np.arange(600)
+    right, down = nodes[columns < 29], nodes[rows < 19]
+    grid = np.concatenate([np.stack([right, right + 1], axis=1), np.stack([down, down + 30], axis=1)])
+    assert ordering.widest_level(adjacency(600, grid)) == 20  # from a corner, levels are the diagonals
+    edges, _ = FAMILIES["geo"](6000, 40.0, 1)
+    plan = analyse(6000, edges, "dissection")
+    root = plan.first[-1] - plan.first[-2]
+    assert 0.5 < root / ordering.widest_level(adjacency(6000, edges)) < 1.0
+
+
 def test_tasks_are_disjoint_subtrees_and_the_rest_is_above_them(divided):
     plan = divided[1]
     covered = np.concatenate([np.arange(*run) for run in (*plan.tasks, *plan.above)])

@@ -253,7 +253,8 @@ class LaplacianOperator:
     def __init__(self, graph: Adjacency, weights: FloatArray, workers: Workers) -> None:
         """Copy the weights, (m,), to the entries of the adjacency."""
         self._graph = graph
-        self._entries = weights.astype(np.float32)[graph.edge_of]
+        self._entries = np.empty(len(graph.edge_of), np.float32)
+        _write_entries(graph.edge_of, weights, self._entries)
         self._workers = workers
         entries = len(graph.neighbours)
         blocks = _ROW_BLOCKS if entries >= _ENTRIES_WORTH_A_THREAD and workers.threads > 1 else 1
@@ -267,9 +268,8 @@ class LaplacianOperator:
 
     def diagonal(self) -> FloatArray:
         """Return the weighted degree of each node, (n,)."""
-        owner = np.repeat(np.arange(self._graph.num_nodes), np.diff(self._graph.pointers))
-        degree: FloatArray = np.zeros(self._graph.num_nodes)
-        degree += np.bincount(owner, weights=self._entries, minlength=self._graph.num_nodes)
+        degree = np.empty(self._graph.num_nodes)
+        _degrees(self._graph.pointers, self._entries, degree)
         return degree
 
     def __call__(self, x: FloatArray) -> FloatArray:
@@ -283,6 +283,21 @@ class LaplacianOperator:
 
         self._workers.run([job(a, b) for a, b in zip(self._bounds, self._bounds[1:], strict=False)])
         return out
+
+
+@kernel(exact=True)
+def _write_entries(edge_of: Any, weights: Any, out: Any) -> None:
+    for p in range(len(out)):
+        out[p] = weights[edge_of[p]]
+
+
+@kernel(exact=True)
+def _degrees(pointers: Any, entries: Any, out: Any) -> None:
+    for i in range(len(out)):
+        total = 0.0
+        for p in range(pointers[i], pointers[i + 1]):
+            total += np.float64(entries[p])
+        out[i] = total
 
 
 @kernel(exact=True)

@@ -120,7 +120,11 @@ def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
         flops = prediction.flops * graph.dimension**3
     if unknowns <= _LARGEST_DENSE and flops > unknowns**3 / 12:
         return dense
-    predicted = f"{flops / 1e9:.2g} Gflop for a sparse factor" if flops < np.inf else "an expander"
+    predicted = (
+        f"{flops / 1e9:.2g} Gflop for a sparse factor"
+        if flops < np.inf
+        else "no order would keep a factor sparse"
+    )
     if asked or flops <= _LARGEST_NEWTON_FLOPS:
         run_sparse = partial(_run_sparse, prediction=prediction)
         return Choice("newton", run_sparse, "asked for" if asked else predicted)

@@ -20,7 +20,7 @@ from sfm_shapefit.laplacian.approximate import (
 )
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
-from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.ordering import best_order, widest_level
 from sfm_shapefit.laplacian.symbolic import EliminationTree, plan_factorisation
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -34,6 +34,7 @@ _FLOPS_PER_EDGE = 150_000
 _REDUCTION = 0.1  # of the residual per solve; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some
 _MAX_STEPS = 60  # approximate Cholesky needs 2-5 for that reduction on every family tried
 _JACOBI_STEPS = 8  # if Jacobi solves a probe to 1e-2 in so many, the graph is an expander
+_HUGE = 400_000  # cameras, whose ordering takes a minute; a rough prediction of the work must do there first
 _LARGE = 5_000  # cameras; the factor of an expander this large takes longer than it saves
 _SEED = 1
 
@@ -94,7 +95,7 @@ class Prediction:
     """What is known of a graph's factor before any number: the order of elimination, if one is of use."""
 
     tree: EliminationTree | None
-    """Of the order with the least work that was found; None on large expanders, which no order helps."""
+    """Of the order with the least work that was found; None where no order would help enough."""
 
     @property
     def flops(self) -> float:
@@ -107,12 +108,18 @@ def predict_factor(graph: ViewGraph, coordinates: FloatArray | None = None) -> P
 
     A graph on which the diagonal is a good preconditioner has a large spectral gap, so no small separators
     (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, and the ordering, which takes longer
-    than a solve by conjugate gradients, is saved.
+    than a solve by conjugate gradients, is saved. So it is on huge graphs whose levels are so wide that the
+    factor would take longer than it saves; some of them may have better separators than their levels, but
+    approximate Cholesky serves them as well.
     """
     neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
     if graph.num_cameras >= _LARGE:
         operator = LaplacianOperator(neighbours, graph.weights, Workers(1))
         if _diagonal_suffices(operator, JacobiPreconditioner(operator.diagonal())):
+            return Prediction(None)
+    if graph.num_cameras >= _HUGE:
+        rough_flops = 4.0 * (0.75 * widest_level(neighbours)) ** 3  # as on boxes of 1e4 and 1e5 cameras
+        if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
             return Prediction(None)
     return Prediction(best_order(neighbours, "auto", coordinates))
 
