@@ -3,11 +3,19 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, solve_admm, solve_lud
+from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, linear, solve_admm, solve_lud
 from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
+from sfm_shapefit.solver.admm.linear import predict_factor
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.hybrid import solve_hybrid
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
+from sfm_shapefit.synthetic import (
+    box_graph_problem,
+    community_graph_problem,
+    expander_graph_problem,
+    trajectory_graph_problem,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
 
@@ -321,3 +329,55 @@ def test_new_penalties_keep_the_split_point_and_the_dual():
     passes.change_penalties(x, rho, other)
     np.testing.assert_allclose(passes.dual(x, other), dual, atol=1e-13)
     np.testing.assert_allclose(x - dual / other[:, None], point, atol=1e-13)
+
+
+def test_edges_that_are_sorted_already_are_shared_with_the_graph_and_others_come_back_in_its_order():
+    problem = community_graph_problem(200, 12.0, sigma=0.01, q=0.1, seed=3)
+    graph = ViewGraph(200, problem.edges, problem.directions)
+    data = edge_data(graph, -np.inf)
+    ascending = np.lexsort(graph.edges.T[::-1])
+    assert (ascending == np.arange(graph.num_edges)).all()
+    assert np.shares_memory(data.directions, graph.directions)
+    shuffled = np.random.default_rng(3).permutation(graph.num_edges)
+    other = ViewGraph(200, problem.edges[shuffled], problem.directions[shuffled])
+    passes = EdgePasses(edge_data(other, -np.inf), 1)
+    np.testing.assert_array_equal(passes.in_graph_order(passes.data.directions), other.directions)
+
+
+def test_expanders_are_recognised_before_an_order_is_looked_for_and_other_graphs_are_not():
+    def tree(make, degree):
+        problem = make(6000, degree, sigma=0.0, q=0.0, seed=1)
+        return predict_factor(ViewGraph(6000, problem.edges, problem.directions)).tree
+
+    assert tree(expander_graph_problem, 20.0) is None
+    assert tree(box_graph_problem, 20.0) is not None
+    assert tree(community_graph_problem, 30.0) is not None
+
+
+def test_huge_graphs_with_wide_levels_are_not_ordered_and_long_ones_are(monkeypatch):
+    monkeypatch.setattr(linear, "_HUGE", 3000)
+    monkeypatch.setattr(linear, "_FLOPS_PER_EDGE", 300)  # so that a box of 6000 counts as too much work
+
+    def tree(problem):
+        return predict_factor(ViewGraph(len(problem.locations), problem.edges, problem.directions)).tree
+
+    assert tree(box_graph_problem(6000, 40.0, sigma=0.0, q=0.0, seed=1)) is None
+    assert tree(trajectory_graph_problem(6000, 20.0, sigma=0.0, q=0.0, seed=1)) is not None
+
+
+def test_slow_communities_are_freed_by_smaller_penalties_late():
+    problem = community_graph_problem(3000, 67.0, sigma=0.01, q=0.2, seed=1)
+    graph = ViewGraph(3000, problem.edges, problem.directions)
+    factor, objectives = laplacian_factor(graph), []
+    solve_admm(graph, 1e-9, 300, factor, on_iteration=lambda info: objectives.append(info.objective))
+    # 117 iterations to 1e-5 with the same balance at every renewal
+    assert objectives[110] <= min(objectives) * (1.0 + 1e-5)
+
+
+@pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])
+def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
+    problem = family(6000, 20.0, sigma=0.01, q=0.1, seed=1)
+    graph = ViewGraph(6000, problem.edges, problem.directions)
+    one, two = (solve_hybrid(graph, 1e-4, 200, threads=threads) for threads in (1, 2))
+    np.testing.assert_array_equal(one.locations, two.locations)
+    np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)

@@ -79,7 +79,7 @@ def jacobi(graph: Adjacency, weights: FloatArray) -> JacobiPreconditioner:
     """Return the Jacobi preconditioner of the graph Laplacian with edge weights (m,)."""
     owner = np.repeat(np.arange(graph.num_nodes), np.diff(graph.pointers))
     degree: FloatArray = np.zeros(graph.num_nodes)
-    np.add.at(degree, owner, weights[graph.edge_of])
+    degree += np.bincount(owner, weights=weights[graph.edge_of], minlength=graph.num_nodes)
     return JacobiPreconditioner(frozen(degree))
 
 

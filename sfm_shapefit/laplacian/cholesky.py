@@ -7,17 +7,23 @@ solution"). For each supernode, children first:
     factor     the square part, L_JJ = chol, and the rows below, L_RJ = A_RJ L_JJ^-T
     update     U = -L_RJ L_RJ^T + what the children leave for later fronts, kept on a stack
 
-What depends on the graph alone is planned once (`analyse`); `refactor` takes new edge weights and neither
-sorts nor allocates. A Laplacian is singular: constants are its null space. The mean weight is added to the
-last pivot instead of removing a row. For right-hand sides orthogonal to the constants the answer is exact,
-the one that is 0 at the last node.
+What depends on the graph alone is planned once (`analyse`); `refactor` takes new edge weights and does not
+sort. Disjoint subtrees are tasks for several threads, in the factorisation and in both substitutions; the
+large fronts above them are factored by strips of columns. Tasks and strips are the same for any number of
+threads, and so is every bit of the answer.
+
+A Laplacian is singular: constants are its null space. The mean weight is added to the last pivot instead of
+removing a row. For right-hand sides orthogonal to the constants the answer is exact, the one that is 0 at
+the last node.
 
 Cholesky does not fail on a singular matrix: rounding makes the zero pivot a tiny number of either sign and
 the answer garbage. Each pivot is therefore compared with the diagonal entry it came from; their smallest
 ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is disconnected or not rigid.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -36,12 +42,16 @@ from sfm_shapefit.laplacian.dense import (
     work_integers,
     work_scalars,
 )
-from sfm_shapefit.laplacian.operators import adjacency, checked_edges
+from sfm_shapefit.laplacian.operators import Workers, adjacency, checked_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
 
 PIVOT_TOLERANCE = 64.0
 """Pivots below this many rounding units of their diagonal entry count as zero."""
+
+_GEMM = 3  # its place in the table of `routine_addresses`
+_STRIP = 256  # columns of a front that are factored at a time
+_LARGE_FRONT = 768  # rows from which a front above the tasks is factored by strips
 
 
 @dataclass(slots=True, eq=False)
@@ -58,7 +68,8 @@ class CholeskyFactor:
     """Least ratio of a pivot to its diagonal entry, in (0, 1]; near the rounding unit if singular."""
     weakest_node: int = -1
     """The node of that pivot."""
-    _stack: npt.NDArray[Any] = field(repr=False, default_factory=lambda: np.empty(0))
+    workers: Workers = field(repr=False, default_factory=lambda: Workers(1))
+    """The threads of `refactor` and `solve`."""
     _diagonal: FloatArray = field(repr=False, default_factory=lambda: np.empty(0))
 
     @property
@@ -124,15 +135,18 @@ def analyse(
 
 
 def allocate_factor(
-    symbolic: SymbolicFactor, block: int = 1, dtype: npt.DTypeLike = np.float64
+    symbolic: SymbolicFactor, block: int = 1, dtype: npt.DTypeLike = np.float64, *, threads: int = 1
 ) -> CholeskyFactor:
-    """Allocate the memory of a factor, `symbolic.num_bytes(block, dtype)` in all."""
+    """Allocate the memory of a factor, `symbolic.num_bytes(block, dtype, threads)` while it is computed.
+
+    Its numbers and answers do not depend on `threads`.
+    """
     area = block * block
     return CholeskyFactor(
         symbolic=symbolic,
         block=block,
         panels=np.empty(int(symbolic.panel_pointers[-1]) * area, dtype=dtype),
-        _stack=np.empty(symbolic.stack_size * area, dtype=dtype),
+        workers=Workers(threads),
         _diagonal=np.empty((symbolic.num_nodes, area)),
     )
 
@@ -162,9 +176,8 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
     traces = diagonal[:, :: b + 1]
     grounding = float(traces.mean()) if ground is None else ground
     traces[-1] += grounding
-    pivot = np.empty(2)
     with one_blas_thread():
-        failed = _run(factor, w, pivot)
+        failed, pivot = _factor_all(factor, w)
     factor.smallest_pivot = float(pivot[0])
     factor.weakest_node = int(plan.permutation[int(pivot[1]) // b])
     if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(factor.dtype).eps:
@@ -174,17 +187,120 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
         )
 
 
-def _run(factor: CholeskyFactor, w: FloatArray, pivot: FloatArray) -> bool:
-    """Call the kernel with everything that it needs."""
+def _factor_all(factor: CholeskyFactor, w: FloatArray) -> tuple[bool, FloatArray]:
+    """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
+    plan, area = factor.symbolic, factor.block**2
+    arenas = min(factor.workers.threads, len(plan.tasks))
+    stack = np.empty((plan.stack_size + arenas * plan.arena_size) * area, dtype=factor.dtype)
+    free = SimpleQueue[int]()
+    for k in range(arenas):
+        free.put(plan.stack_size + k * plan.arena_size)
+    pivots = np.full((len(plan.tasks) + 1, 2), np.inf)
+    failed = np.zeros(len(pivots), np.bool_)
+
+    def task(k: int) -> Callable[[], object]:
+        def run() -> None:
+            begin, end = plan.tasks[k]
+            arena = free.get()
+            try:
+                failed[k] = _run(factor, w, begin, end, stack, arena, pivots[k])
+            finally:
+                free.put(arena)
+
+        return run
+
+    done = 0
+    for begin, end in [*plan.above.tolist(), [plan.num_supernodes] * 2]:
+        ready = int(np.searchsorted(plan.tasks[:, 0], begin))
+        factor.workers.run([task(k) for k in range(done, ready)])
+        done = ready
+        failed[-1] = failed.any() or _factor_above(factor, w, begin, end, stack, pivots[-1])
+        if failed[-1]:
+            break
+    return bool(failed.any()), pivots[np.argmin(pivots[:, 0])]
+
+
+def _run(
+    factor: CholeskyFactor, w: FloatArray, begin: int, end: int, stack: Any, arena: int, pivot: Any
+) -> bool:
+    """Call the kernel on the supernodes begin..end-1 with everything that it needs."""
     plan, b, diagonal = factor.symbolic, factor.block, factor._diagonal
     failed: bool = _factorise(
-        0, plan.num_supernodes, b, plan.first, plan.row_pointers, plan.relative,
-        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets,
+        begin, end, b, plan.first, plan.row_pointers, plan.relative,
+        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets, arena,
         plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
-        w, diagonal, factor.panels, factor._stack, pivot,
+        w, diagonal, factor.panels, stack, pivot,
         routine_addresses(factor.dtype), FLAGS, work_integers(), work_scalars(factor.dtype),
     )  # fmt: skip
     return failed
+
+
+def _factor_above(
+    factor: CholeskyFactor, w: FloatArray, begin: int, end: int, stack: Any, pivot: Any
+) -> bool:
+    """Factor a run of supernodes above the tasks: the large ones by strips, the others as in a task."""
+    plan = factor.symbolic
+    heights = np.diff(plan.first)[begin:end] + np.diff(plan.row_pointers)[begin:end]
+    large = np.flatnonzero(heights * factor.block >= _LARGE_FRONT) + begin
+    at = begin
+    for s in [*large.tolist(), end]:
+        if at < s and _run(factor, w, at, s, stack, 0, pivot):
+            return True
+        if s < end and _factor_large(factor, w, s, stack, pivot):
+            return True
+        at = s + 1
+    return False
+
+
+def _factor_large(factor: CholeskyFactor, w: FloatArray, s: int, stack: Any, pivot: Any) -> bool:
+    """Factor one front by strips of columns, each strip's update of the rest as parallel jobs."""
+    plan, b, panels = factor.symbolic, factor.block, factor.panels
+    width = int(plan.first[s + 1] - plan.first[s]) * b
+    height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
+    offset, update = int(plan.panel_pointers[s]) * b * b, int(plan.update_offsets[s]) * b * b
+    below = height - width
+    routines, scalars = routine_addresses(factor.dtype), work_scalars(factor.dtype)
+    _assemble_front(
+        s, b, plan.first, plan.row_pointers, plan.relative, plan.panel_pointers, plan.child_pointers,
+        plan.children, plan.update_offsets, plan.edge_pointers, plan.edge_index, plan.edge_row,
+        plan.edge_column, w, factor._diagonal, panels, stack,
+    )  # fmt: skip
+
+    def divide(j: int, end: int, row: int) -> Callable[[], object]:
+        return lambda: trsm(
+            routines, FLAGS, work_integers(), scalars, panels, offset + j * (height + 1),
+            offset + j * height + row, min(_STRIP, height - row), end - j, height,
+        )  # fmt: skip
+
+    def subtract(j: int, end: int, row: int, last: int) -> Callable[[], object]:
+        return lambda: _subtract_strip(
+            routines, FLAGS, work_integers(), scalars, panels, offset + j * height + row, height,
+            height - row, last - row, end - j, panels, offset + row * (height + 1), height, True,
+        )  # fmt: skip
+
+    def leave(row: int) -> Callable[[], object]:
+        return lambda: _subtract_strip(
+            routines, FLAGS, work_integers(), scalars, panels, offset + width + row, height,
+            below - row, min(_STRIP, below - row), width, stack, update + row * (below + 1), below, False,
+        )  # fmt: skip
+
+    for j in range(0, width, _STRIP):
+        end = min(j + _STRIP, width)
+        info = potrf(routines, FLAGS, work_integers(), panels, offset + j * (height + 1), end - j, height)
+        if info != 0:
+            pivot[:] = 0.0, plan.first[s] * b + j + info - 1
+            return True
+        factor.workers.run([divide(j, end, row) for row in range(end, height, _STRIP)])
+        rows = range(end, width, _STRIP)
+        factor.workers.run([subtract(j, end, row, min(row + _STRIP, width)) for row in rows])
+    panel = panels[offset : offset + width * height]
+    _check_pivots(panel, height, width, b, int(plan.first[s]), factor._diagonal, pivot)
+    factor.workers.run([leave(row) for row in range(0, below, _STRIP)])
+    _pass_on(
+        s, b, plan.first, plan.row_pointers, plan.relative, plan.child_pointers, plan.children,
+        plan.update_offsets, 0, stack, update,
+    )  # fmt: skip
+    return False
 
 
 @kernel(exact=True)
@@ -217,42 +333,27 @@ def _sum_at_nodes(
 @kernel(exact=True)
 def _factorise(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, relative: Any,
-    panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any,
+    panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any, arena: int,
     edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
     weights: Any, diagonal: Any, panels: Any, stack: Any, pivot: Any,
     routines: Any, flags: Any, integers: Any, scalars: Any,
 ) -> bool:  # fmt: skip
     """Factor the supernodes begin..end-1; return True if a pivot was not positive.
 
-    `pivot` receives the least relative pivot and the row it stands in.
+    A task has its updates in its arena, all but the root's; above the tasks, `arena` is 0. `pivot` is lowered
+    to the least relative pivot and the row it stands in.
     """
-    pivot[0] = np.inf
-    pivot[1] = 0.0
     for s in range(begin, end):
         start, width = first[s], (first[s + 1] - first[s]) * b
         below = (row_pointers[s + 1] - row_pointers[s]) * b
         height = width + below
         offset = panel_pointers[s] * b * b
         panel = panels[offset : offset + width * height]
-        panel[:] = 0.0
-        _assemble_edges(
-            panel,
-            height,
-            b,
-            edge_pointers[s],
-            edge_pointers[s + 1],
-            edge_index,
-            edge_row,
-            edge_column,
-            weights,
-        )
-        _assemble_diagonal(panel, height, b, start, first[s + 1], diagonal)
-        for c in range(child_pointers[s], child_pointers[s + 1]):
-            child = children[c]
-            there = relative[row_pointers[child] : row_pointers[child + 1]]
-            size = len(there) * b
-            update = stack[update_offsets[child] * b * b :][: size * size]
-            _add_update(update, there, b, 0, width // b, panel, height)
+        _assemble_front(
+            s, b, first, row_pointers, relative, panel_pointers, child_pointers, children,
+            update_offsets, edge_pointers, edge_index, edge_row, edge_column, weights, diagonal, panels,
+            stack[arena * b * b :],
+        )  # fmt: skip
         info = potrf(routines, flags, integers, panels, offset, width, height)
         if info != 0:
             pivot[0] = 0.0
@@ -262,19 +363,107 @@ def _factorise(
         if below == 0:
             continue
         trsm(routines, flags, integers, scalars, panels, offset, offset + width, below, width, height)
-        update_start = update_offsets[s] * b * b
+        update = (update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
         syrk(
             routines, flags, integers, scalars, panels, offset + width, height, below, width,
-            stack, update_start, below, False,
+            stack, update, below, False,
         )  # fmt: skip
-        mine = stack[update_start : update_start + below * below]
-        for c in range(child_pointers[s], child_pointers[s + 1]):
-            child = children[c]
-            there = relative[row_pointers[child] : row_pointers[child + 1]]
-            size = len(there) * b
-            update = stack[update_offsets[child] * b * b :][: size * size]
-            _add_update(update, there, b, width // b, height // b, mine, below)
+        _pass_on(
+            s,
+            b,
+            first,
+            row_pointers,
+            relative,
+            child_pointers,
+            children,
+            update_offsets,
+            arena,
+            stack,
+            update,
+        )
     return False
+
+
+@kernel(exact=True)
+def _assemble_front(
+    s: int, b: int, first: Any, row_pointers: Any, relative: Any, panel_pointers: Any, child_pointers: Any,
+    children: Any, update_offsets: Any, edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
+    weights: Any, diagonal: Any, panels: Any, stack: Any,
+) -> None:  # fmt: skip
+    """Write the panel of a supernode before it is factored: edges, diagonal, children's updates."""
+    width = (first[s + 1] - first[s]) * b
+    height = width + (row_pointers[s + 1] - row_pointers[s]) * b
+    offset = panel_pointers[s] * b * b
+    panel = panels[offset : offset + width * height]
+    panel[:] = 0.0
+    _assemble_edges(
+        panel, height, b, edge_pointers[s], edge_pointers[s + 1], edge_index, edge_row, edge_column, weights
+    )
+    _assemble_diagonal(panel, height, b, first[s], first[s + 1], diagonal)
+    for c in range(child_pointers[s], child_pointers[s + 1]):
+        child = children[c]
+        there = relative[row_pointers[child] : row_pointers[child + 1]]
+        size = len(there) * b
+        update = stack[update_offsets[child] * b * b :][: size * size]
+        _add_update(update, there, b, 0, width // b, panel, height)
+
+
+@kernel(exact=True)
+def _pass_on(
+    s: int, b: int, first: Any, row_pointers: Any, relative: Any, child_pointers: Any, children: Any,
+    update_offsets: Any, arena: int, stack: Any, update: int,
+) -> None:  # fmt: skip
+    """Add what the children leave for later fronts to the update of s, which starts at `update`."""
+    width = first[s + 1] - first[s]
+    below = row_pointers[s + 1] - row_pointers[s]
+    mine = stack[update : update + (below * b) ** 2]
+    for c in range(child_pointers[s], child_pointers[s + 1]):
+        child = children[c]
+        there = relative[row_pointers[child] : row_pointers[child + 1]]
+        size = len(there) * b
+        theirs = stack[(update_offsets[child] + arena) * b * b :][: size * size]
+        _add_update(theirs, there, b, width, width + below, mine, below * b)
+
+
+@kernel(exact=True)
+def _subtract_strip(
+    routines: Any, flags: Any, integers: Any, scalars: Any, a: Any, offset: int, leading: int, rows: int,
+    strip: int, columns: int, c: Any, offset_c: int, leading_c: int, accumulate: bool,
+) -> None:  # fmt: skip
+    """Subtract a a^T from the first `strip` columns of the lower triangle of c, or store -a a^T there.
+
+    `a` has so many rows and columns; its first `strip` rows belong to the strip's own columns.
+    """
+    syrk(
+        routines, flags, integers, scalars, a, offset, leading, strip, columns, c, offset_c, leading_c,
+        accumulate,
+    )  # fmt: skip
+    if rows > strip:
+        _multiply(
+            routines, flags, integers, scalars, a, offset + strip, offset, leading, rows - strip, strip,
+            columns, c, offset_c + strip, leading_c, accumulate,
+        )  # fmt: skip
+
+
+@kernel(exact=True)
+def _multiply(
+    routines: Any, flags: Any, integers: Any, scalars: Any, a: Any, left: int, right: int, leading: int,
+    rows: int, columns: int, depth: int, c: Any, offset_c: int, leading_c: int, accumulate: bool,
+) -> None:  # fmt: skip
+    """Subtract the product of two blocks of a, left right^T, from a block of c, or store it negated."""
+    integers[0] = rows
+    integers[1] = columns
+    integers[2] = depth
+    integers[3] = leading
+    integers[4] = leading_c
+    text, ints, one = array_address(flags), array_address(integers), array_address(scalars)
+    size = a.itemsize
+    beta = one if accumulate else one + 2 * size
+    pointers = (
+        text + 3, text + 2, ints, ints + 4, ints + 8, one + size, array_address(a) + left * size, ints + 12,
+        array_address(a) + right * size, ints + 12, beta, array_address(c) + offset_c * size, ints + 16,
+    )  # fmt: skip
+    call_address(routines[_GEMM], pointers)
 
 
 @kernel(exact=True)
@@ -356,16 +545,34 @@ def _solve(factor: CholeskyFactor, rhs: FloatArray) -> FloatArray:
         raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
     given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
     x = np.empty((n * b, 3), dtype=factor.dtype)
-    work = np.empty((3, plan.largest_front * b), dtype=factor.dtype)
     out = np.empty_like(given)
     for k in range(0, given.shape[1], 3):
         _gather(given[:, k : k + 3], plan.permutation, b, x)
-        _substitute(
-            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x, work,
-            _leaves(factor.dtype), np.empty(3, np.int64), np.empty(12, factor.dtype),
-        )  # fmt: skip
+        _substitute(factor, x)
         _scatter(x, plan.permutation, b, out[:, k : k + 3])
     return out.reshape(np.shape(rhs))
+
+
+def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
+    """Solve L L^T y = x in place for three right-hand sides: the tasks, what is above them, and back."""
+    plan, b = factor.symbolic, factor.block
+    outer = np.zeros((len(plan.tasks), *x.shape), dtype=x.dtype)  # what each task leaves for rows above it
+
+    def job(kernel: Any, begin: int, end: int, *rest: Any) -> Callable[[], object]:
+        return lambda: kernel(
+            begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
+            np.empty((3, plan.largest_front * b), x.dtype), _leaves(factor.dtype), np.empty(3, np.int64),
+            np.empty(12, x.dtype), *rest,
+        )  # fmt: skip
+
+    factor.workers.run([job(_descend, *task, outer[k]) for k, task in enumerate(plan.tasks)])
+    for k, (_, end) in enumerate(plan.tasks):
+        _collect(plan.rows[plan.row_pointers[end - 1] : plan.row_pointers[end]], b, outer[k], x)
+    for run in plan.above:
+        job(_descend, *run, x)()
+    for run in plan.above[::-1]:
+        job(_ascend, *run)()
+    factor.workers.run([job(_ascend, *task) for task in plan.tasks])
 
 
 def _leaves(dtype: np.dtype[Any]) -> IntArray:
@@ -393,22 +600,39 @@ def _scatter(x: Any, permutation: Any, b: int, columns: Any) -> None:
 
 
 @kernel(exact=True)
-def _substitute(
-    b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any, x: Any, work: Any,
-    leaves: Any, sizes: Any, numbers: Any,
+def _descend(
+    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
+    x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any, outer: Any,
 ) -> None:  # fmt: skip
-    """Solve L L^T y = x in place for three right-hand sides."""
-    num = len(first) - 1
-    for s in range(num):
+    """Solve with the panels of the supernodes begin..end-1; later rows than theirs are kept in `outer`."""
+    for s in range(begin, end):
         height = _load_front(b, s, first, row_pointers, rows, x, work, False)
         width = (first[s + 1] - first[s]) * b
         _forward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
-        _store_front(b, s, first, row_pointers, rows, x, work, True)
-    for s in range(num - 1, -1, -1):
+        _store_front(b, s, first, x, work)
+        _add_below(b, s, first, row_pointers, rows, first[end], x, outer, work)
+
+
+@kernel(exact=True)
+def _ascend(
+    begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
+    x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any,
+) -> None:  # fmt: skip
+    """Solve with the transposed panels of the supernodes end-1..begin."""
+    for s in range(end - 1, begin - 1, -1):
         height = _load_front(b, s, first, row_pointers, rows, x, work, True)
         width = (first[s + 1] - first[s]) * b
         _backward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
-        _store_front(b, s, first, row_pointers, rows, x, work, False)
+        _store_front(b, s, first, x, work)
+
+
+@kernel(exact=True)
+def _collect(rows: Any, b: int, outer: Any, x: Any) -> None:
+    """Add what a task has left for the rows above it."""
+    for row in rows:
+        for a in range(b):
+            for k in range(3):
+                x[row * b + a, k] += outer[row * b + a, k]
 
 
 @kernel(exact=True)
@@ -431,22 +655,26 @@ def _load_front(
 
 
 @kernel(exact=True)
-def _store_front(
-    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
-) -> None:
-    """Copy a front's own unknowns back to `x`, and add what it leaves to the rows below if `with_below`."""
+def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
+    """Copy a front's own unknowns back to `x`."""
     start, width = first[s] * b, (first[s + 1] - first[s]) * b
     for i in range(width):
         for k in range(3):
             x[start + i, k] = work[k, i]
-    if not with_below:
-        return
-    at = width
+
+
+@kernel(exact=True)
+def _add_below(
+    b: int, s: int, first: Any, row_pointers: Any, rows: Any, limit: int, x: Any, outer: Any, work: Any
+) -> None:
+    """Add what a front leaves to the rows below: to `x` if they are before `limit`, else to `outer`."""
+    at = (first[s + 1] - first[s]) * b
     for p in range(row_pointers[s], row_pointers[s + 1]):
-        row = np.int64(rows[p]) * b
+        row = np.int64(rows[p])
+        target = x if row < limit else outer
         for a in range(b):
             for k in range(3):
-                x[row + a, k] += work[k, at + a]
+                target[row * b + a, k] += work[k, at + a]
         at += b
 
 

@@ -112,6 +112,22 @@ def dissection_order(graph: Adjacency, coordinates: FloatArray | None = None) ->
     return np.asarray(_dissect(graph.pointers, graph.neighbours, given), dtype=np.int64)
 
 
+def widest_level(graph: Adjacency) -> int:
+    """Return how many nodes are at the most frequent graph distance from a far end of a connected graph.
+
+    A level separates what is nearer from what is farther. Where a graph looks the same everywhere, as a
+    geometric one, no separator in halves is much smaller (METIS finds 0.75 of it on boxes of 1e4 and 1e5).
+    """
+    n = graph.num_nodes
+    part, members, queue = np.zeros(n, np.int64), np.arange(n), np.empty(n, np.int64)
+    distance = np.empty(n)
+    start = 0
+    for _ in range(2):  # the second time from the node that was last
+        reached = _distances(graph.pointers, graph.neighbours, part, 0, start, distance, members, queue)
+        start = int(queue[reached - 1])
+    return int(np.bincount(distance[queue[:reached]].astype(np.int64)).max())
+
+
 def _without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
     """Return row pointers and neighbours with each neighbour once, as METIS demands."""
     n = graph.num_nodes

@@ -10,6 +10,9 @@ trees in sparse factorization"). From that:
                     into their parents at the price of some explicit zeros (Ashcraft, Grimes 1989)
     fronts          one dense panel and one dense update matrix per supernode (Duff, Reid 1983); an update
                     waits for its parent on a stack whose every offset is known here, before any number is
+    tasks           disjoint subtrees that can be worked on at the same time, and the few supernodes above
+                    them (Geist, Ng 1989, "Task scheduling for parallel sparse Cholesky factorization"). They
+                    depend on the graph alone, not on the number of threads, so that every sum has one order
 
 All indices count nodes; a block size b enters only as a factor (positions times b, areas times b^2).
 """
@@ -26,6 +29,9 @@ from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
 _MERGE_ALWAYS = 0.03  # a child joins its parent if the merged panel has at most this share of zeros,
 _MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # or this share while it has at most so many columns
+_LARGEST_TASK = 1 / 6  # of all entries: subtrees with more are divided
+_SMALLEST_TASK = 1 / 40  # of all entries: it is left to the part above, with what cannot be divided
+_WORTH_TASKS = 500_000  # entries of the panels; below, handing out work costs more than the work
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,10 +86,18 @@ class SymbolicFactor:
     """Position of each of these rows among all rows of the parent's panel."""
     panel_pointers: IntArray
     """(S + 1,) start of each panel in units of one (block) entry."""
+    tasks: IntArray
+    """(K, 2) supernodes begin..end-1 of each task: disjoint subtrees, end - 1 the root; ascending."""
+    above: IntArray
+    """(r, 2) the runs of supernodes that are in no task; ascending. Their descendants may be tasks. Between
+    two runs the tasks can be worked on at the same time."""
     update_offsets: IntArray
-    """(S,) start of each update matrix in the stack, in units of one (block) entry."""
+    """(S,) start of each update matrix in the stack, in units of one (block) entry. Those inside a task,
+    but for its root's, count from the start of the arena in which the task runs."""
     stack_size: int
-    """(Block) entries of the stack of update matrices."""
+    """(Block) entries of the stack of update matrices, without arenas."""
+    arena_size: int
+    """(Block) entries that a running task needs for itself."""
     largest_front: int
     """Rows of the tallest panel."""
     edge_pointers: IntArray
@@ -114,9 +128,9 @@ class SymbolicFactor:
         """Number of supernodes, S."""
         return len(self.parent)
 
-    def num_bytes(self, block: int = 1, dtype: npt.DTypeLike = np.float64) -> int:
+    def num_bytes(self, block: int = 1, dtype: npt.DTypeLike = np.float64, threads: int = 1) -> int:
         """Return the memory of the numeric factor: its panels, and the stack while it is computed."""
-        entries = int(self.panel_pointers[-1]) + self.stack_size
+        entries = int(self.panel_pointers[-1]) + self.stack_size + threads * self.arena_size
         return entries * block * block * np.dtype(dtype).itemsize
 
 
@@ -161,7 +175,8 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     )  # fmt: skip
     relative = _relative_positions(first, parent, row_pointers, rows)
     sizes = np.diff(first) * (np.diff(first) + below)
-    offsets, stack_size = _stack_plan(parent, below)
+    tasks, above = _tasks(parent, sizes)
+    offsets, stack_size, arena_size = _stack_plan(parent, below, tasks)
     children = np.argsort(parent, kind="stable")[int(np.sum(parent < 0)) :]
     child_pointers = np.searchsorted(parent[children], np.arange(len(parent) + 1))
     slots = _edge_slots(edges, inverse, owner, first, row_pointers, rows)
@@ -177,8 +192,11 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
         rows=frozen(rows),
         relative=frozen(relative),
         panel_pointers=frozen(np.concatenate([[0], np.cumsum(sizes)])),
+        tasks=frozen(tasks),
+        above=frozen(above),
         update_offsets=frozen(offsets),
-        stack_size=int(stack_size),
+        stack_size=stack_size,
+        arena_size=arena_size,
         largest_front=int(np.max(np.diff(first) + below, initial=0)),
         edge_pointers=frozen(edge_pointers),
         edge_index=frozen(edge_index),
@@ -403,9 +421,54 @@ def _relative_positions(first: Any, parent: Any, row_pointers: Any, rows: Any) -
     return relative
 
 
+def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
+    """Cut the supernodes into tasks and what is above them; see `SymbolicFactor`."""
+    num, total = len(parent), int(sizes.sum())
+    none = np.zeros((0, 2), np.int64)
+    if total < _WORTH_TASKS:
+        return none, np.array([[0, num]])
+    begin, weight = _subtrees(parent, sizes)
+    is_root = (parent < 0) | (weight[parent] > _LARGEST_TASK * total)
+    chosen = is_root & (weight <= _LARGEST_TASK * total) & (weight >= _SMALLEST_TASK * total)
+    roots = np.flatnonzero(chosen)
+    tasks = np.stack([begin[roots], roots + 1], axis=1)
+    edges = np.concatenate([[0], tasks.ravel(), [num]]).reshape(-1, 2)
+    return tasks, edges[edges[:, 0] < edges[:, 1]]
+
+
 @kernel()
-def _stack_plan(parent: Any, below: Any) -> Any:
-    """Place each update matrix on one of two stacks that grow towards each other.
+def _subtrees(parent: Any, sizes: Any) -> Any:
+    """Return the first supernode of each subtree and the sum of its sizes."""
+    begin, weight = np.arange(len(parent)), sizes.copy()
+    for s in range(len(parent)):
+        if parent[s] >= 0:
+            weight[parent[s]] += weight[s]
+            begin[parent[s]] = min(begin[parent[s]], begin[s])
+    return begin, weight
+
+
+def _stack_plan(parent: IntArray, below: IntArray, tasks: IntArray) -> tuple[IntArray, int, int]:
+    """Place the update matrices; return their offsets and the sizes of the stack and of an arena.
+
+    On the stack, a task is one leaf with the update of its root: the order of the supernodes above is kept.
+    """
+    offsets = np.zeros(len(parent), np.int64)
+    inside = np.zeros(len(parent), np.bool_)
+    arena = 0
+    for begin, end in tasks:
+        offsets[begin:end], size = _stacked(parent[begin:end] - begin, below[begin:end], end - 1 - begin)
+        arena = max(arena, int(size))
+        inside[begin : end - 1] = True
+    top = np.flatnonzero(~inside)
+    rank = np.cumsum(~inside) - 1
+    above = np.where(parent[top] < 0, -1, rank[parent[top]])
+    offsets[top], stack = _stacked(above, below[top], -1)
+    return offsets, int(stack), arena
+
+
+@kernel()
+def _stacked(parent: Any, below: Any, root: int) -> Any:
+    """Place each update matrix on one of two stacks that grow towards each other; `root`'s is elsewhere.
 
     A front reads its children's updates and writes its own. With the levels of the tree on alternating
     stacks, both are at the top of their stack and nothing is ever copied. Offsets of the second stack
@@ -414,24 +477,24 @@ def _stack_plan(parent: Any, below: Any) -> Any:
     num = len(parent)
     level = np.zeros(num, np.int64)
     for s in range(num - 1, -1, -1):
-        if parent[s] >= 0:
+        if 0 <= parent[s] < num:
             level[s] = 1 - level[parent[s]]
     offsets = np.zeros(num, np.int64)
     top = np.zeros(2, np.int64)
     freed = np.full(num, -1, np.int64)  # where the children's stack stood before the first child
     size = 0
     for s in range(num):
-        side = level[s]
+        side, area = level[s], 0 if s == root else below[s] * below[s]
         offsets[s] = top[side]
-        top[side] += below[s] * below[s]
+        top[side] += area
         size = max(size, top[0] + top[1])
         if freed[s] >= 0:
             top[1 - side] = freed[s]
-        if parent[s] >= 0 and freed[parent[s]] < 0:
+        if 0 <= parent[s] < num and freed[parent[s]] < 0:
             freed[parent[s]] = offsets[s]
     for s in range(num):
         if level[s] == 1:
-            offsets[s] = size - offsets[s] - below[s] * below[s]
+            offsets[s] = size - offsets[s] - (0 if s == root else below[s] * below[s])
     return offsets, size
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.solver.admm import Splitting, Stop, laplacian_factor
-from sfm_shapefit.solver.admm.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor
+from sfm_shapefit.solver.admm.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor, Prediction
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
@@ -66,6 +66,7 @@ def solve_hybrid(
     *,
     threads: int = 1,
     memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    prediction: Prediction | None = None,
     on_iteration: OnIteration | None = None,
 ) -> HybridResult:
     """Solve ShapeFit by splitting, certify, and finish with Newton steps if the gap needs them.
@@ -74,15 +75,16 @@ def solve_hybrid(
         graph: a connected, parallel-rigid view graph whose directions do not cancel.
         tol: the certified gap wanted, in units of the objective.
         max_iterations: limit of iterations of the splitting. Newton steps follow a stall, not this limit.
-        threads: of the passes over edges; the result does not depend on it.
+        threads: of the passes over edges and of the factor; the result does not depend on it.
         memory_bytes: what a factor may take.
+        prediction: of the factor, if it is there already, to save a second ordering.
         on_iteration: called after each iteration and each factorisation; returning False cancels. What
             has been reached is certified all the same.
 
     Raises:
         UnsolvableError: if the graph is not connected.
     """
-    factor = laplacian_factor(graph, memory_bytes)
+    factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
     splitting = Splitting(graph, factor, threads)
     try:
         result = _split(splitting, graph, factor, tol, max_iterations, on_iteration)

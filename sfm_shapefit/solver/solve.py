@@ -2,15 +2,16 @@
 
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, frozen
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.rigidity import is_parallel_rigid
+from sfm_shapefit.solver.admm.linear import Prediction, predict_factor
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
@@ -54,6 +55,7 @@ class Run(NamedTuple):
     """How it ended, where that is not plain from the certificate."""
 
 
+@one_blas_thread()  # more would split, and round, the sums of long vectors differently
 def solve(
     graph: ViewGraph, options: SolverOptions | None = None, on_iteration: OnIteration | None = None
 ) -> SolverResult:
@@ -112,27 +114,48 @@ def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
         return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
     dense = Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
     share = 2.0 * graph.num_edges / (graph.num_cameras * (graph.num_cameras - 1.0))
-    flops = np.inf
+    prediction, flops = None, np.inf
     if unknowns > _LARGEST_DENSE or share < _DENSE_GRAPH:
-        flops = best_order(adjacency(graph.num_cameras, graph.edges)).flops * graph.dimension**3
+        prediction = predict_factor(graph)
+        flops = prediction.flops * graph.dimension**3
     if unknowns <= _LARGEST_DENSE and flops > unknowns**3 / 12:
         return dense
-    predicted = f"{flops / 1e9:.2g} Gflop for a sparse factor"
+    predicted = (
+        f"{flops / 1e9:.2g} Gflop for a sparse factor"
+        if flops < np.inf
+        else "no order would keep a factor sparse"
+    )
     if asked or flops <= _LARGEST_NEWTON_FLOPS:
-        return Choice("newton", _run_sparse, "asked for" if asked else predicted)
-    return Choice("admm", _run_admm, f"{predicted}: splitting is faster")
+        run_sparse = partial(_run_sparse, prediction=prediction)
+        return Choice("newton", run_sparse, "asked for" if asked else predicted)
+    return Choice("admm", partial(_run_admm, prediction=prediction), f"{predicted}: splitting is faster")
 
 
 def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
     return Run(*solve_newton_dense(graph, options.tol, limit, watch))
 
 
-def _run_sparse(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
-    return Run(*solve_newton_sparse(graph, options.tol, limit, watch))
+def _run_sparse(
+    graph: ViewGraph,
+    options: SolverOptions,
+    limit: int,
+    watch: OnIteration | None,
+    prediction: Prediction | None = None,
+) -> Run:
+    tree = None if prediction is None else prediction.tree
+    return Run(*solve_newton_sparse(graph, options.tol, limit, watch, tree=tree))
 
 
-def _run_admm(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
-    found = solve_hybrid(graph, options.tol, limit, threads=options.threads, on_iteration=watch)
+def _run_admm(
+    graph: ViewGraph,
+    options: SolverOptions,
+    limit: int,
+    watch: OnIteration | None,
+    prediction: Prediction | None = None,
+) -> Run:
+    found = solve_hybrid(
+        graph, options.tol, limit, threads=options.threads, prediction=prediction, on_iteration=watch
+    )
     note = "" if found.finish is Finish.CERTIFIED else found.finish.value
     return Run(found.locations, found.certificate.dual, found.iterations, note)
 

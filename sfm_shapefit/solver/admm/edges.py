@@ -49,25 +49,26 @@ class EdgeData:
     """(m,) positive w_e."""
     least: float
     """Least multiple of v_e that costs nothing: -inf for ShapeFit, 1 for LUD."""
-    order: IntArray
-    """(m,) index of each edge in the graph it came from."""
+    order: IntArray | slice
+    """(m,) index of each edge in the graph it came from; slice(None) where the order is the graph's."""
     bounds: tuple[int, ...]
     """Chunk k is the edges bounds[k]:bounds[k + 1]."""
 
 
 def edge_data(graph: ViewGraph, least: float) -> EdgeData:
-    """Return the edges of a graph, sorted and cut into chunks."""
+    """Return the edges of a graph, sorted and cut into chunks; shared with the graph if sorted already."""
     keys = graph.edges[:, 0] * graph.num_cameras + graph.edges[:, 1]
-    order = np.argsort(keys, kind="stable")  # fast where they are sorted already, as they mostly are
+    is_sorted = bool((keys[:-1] <= keys[1:]).all())
+    order = slice(None) if is_sorted else frozen(np.argsort(keys, kind="stable"))
     m = graph.num_edges
     chunks = _CHUNKS if m >= _EDGES_WORTH_A_THREAD else 1
     return EdgeData(
         num_nodes=graph.num_cameras,
-        ends=frozen(graph.edges[order].astype(np.int32)),
-        directions=frozen(graph.directions[order]),
-        weights=frozen(graph.weights[order]),
+        ends=frozen(graph.edges.astype(np.int32)[order]),
+        directions=graph.directions if is_sorted else frozen(graph.directions[order]),
+        weights=graph.weights if is_sorted else frozen(graph.weights[order]),
         least=least,
-        order=frozen(order.astype(np.int64)),
+        order=order,
         bounds=tuple(m * k // chunks for k in range(chunks + 1)),
     )
 
@@ -138,6 +139,14 @@ class EdgePasses:
         out = np.empty_like(x)
         data, run = self.data, _dual(self.data.directions.shape[1])
         self.over_chunks(lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, x, out))
+        return out
+
+    def in_graph_order(self, values: FloatArray) -> FloatArray:
+        """Return an array over edges in the order of the graph; the array itself if that is its order."""
+        if isinstance(self.data.order, slice):
+            return values
+        out = np.empty_like(values)
+        out[self.data.order] = values
         return out
 
     def residuals(self, t: FloatArray) -> FloatArray:

@@ -6,21 +6,22 @@ and conjugate gradients that reduce their residual tenfold count as solved, sinc
 next right-hand side.
 """
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.approximate import (
+    JacobiPreconditioner,
     Preconditioner,
     approximate_cholesky,
     conjugate_gradients,
-    jacobi,
 )
 from sfm_shapefit.laplacian.cholesky import allocate_factor
-from sfm_shapefit.laplacian.operators import Adjacency, adjacency, apply_laplacian
-from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
+from sfm_shapefit.laplacian.ordering import best_order, widest_level
+from sfm_shapefit.laplacian.symbolic import EliminationTree, plan_factorisation
 from sfm_shapefit.viewgraph import ViewGraph
 
 DEFAULT_MEMORY_BYTES = 2_000_000_000
@@ -33,6 +34,8 @@ _FLOPS_PER_EDGE = 150_000
 _REDUCTION = 0.1  # of the residual per solve; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some
 _MAX_STEPS = 60  # approximate Cholesky needs 2-5 for that reduction on every family tried
 _JACOBI_STEPS = 8  # if Jacobi solves a probe to 1e-2 in so many, the graph is an expander
+_HUGE = 400_000  # cameras, whose ordering takes a minute; a rough prediction of the work must do there first
+_LARGE = 5_000  # cameras; the factor of an expander this large takes longer than it saves
 _SEED = 1
 
 
@@ -57,19 +60,17 @@ class IterativeSolver:
     The preconditioner is the diagonal on expanders (random graphs), else an approximate Cholesky factor.
     """
 
-    def __init__(self, graph: Adjacency) -> None:
-        """Keep the graph; `refactor` must come before `solve`."""
+    def __init__(self, graph: Adjacency, threads: int = 1) -> None:
+        """Keep the graph; `refactor` must come before `solve`. The answers do not depend on `threads`."""
         self._graph = graph
-        self._weights = np.ones(len(graph.edge_of) // 2)
-        self._preconditioner: Preconditioner = jacobi(graph, self._weights)
+        self._workers = Workers(threads)
 
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,), and choose the preconditioner by a probe."""
-        self._weights = np.ascontiguousarray(weights)
-        self._preconditioner = jacobi(self._graph, self._weights)
-        probe = np.random.default_rng(_SEED).normal(size=(self._graph.num_nodes, 1))
-        if not self._solve(probe, 1e-2, _JACOBI_STEPS)[1]:
-            self._preconditioner = approximate_cholesky(self._graph, self._weights, _SEED)
+        self._operator = LaplacianOperator(self._graph, weights, self._workers)
+        self._preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
+        if not _diagonal_suffices(self._operator, self._preconditioner):
+            self._preconditioner = approximate_cholesky(self._graph, weights, _SEED)
 
     @property
     def preconditioner(self) -> Preconditioner:
@@ -78,22 +79,58 @@ class IterativeSolver:
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with ||rhs - L x|| at most a tenth of ||rhs||, column by column, (n, d)."""
-        return self._solve(rhs, _REDUCTION, _MAX_STEPS)[0]
+        return conjugate_gradients(
+            self._operator, self._preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
+        ).x
 
-    def _solve(self, rhs: FloatArray, tol: float, max_steps: int) -> tuple[FloatArray, bool]:
-        """Return the solution and whether it is as accurate as asked."""
-        result = conjugate_gradients(
-            lambda x: apply_laplacian(self._graph, self._weights, x, np.empty_like(x)),
-            self._preconditioner,
-            rhs,
-            tol=tol,
-            max_iterations=max_steps,
-        )
-        return result.x, result.converged
+
+def _diagonal_suffices(operator: LaplacianOperator, jacobi: Preconditioner) -> bool:
+    """Return whether the diagonal is so good a preconditioner as only expanders have it."""
+    probe = np.random.default_rng(_SEED).normal(size=(operator.num_nodes, 3))
+    return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """What is known of a graph's factor before any number: the order of elimination, if one is of use."""
+
+    tree: EliminationTree | None
+    """Of the order with the least work that was found; None where no order would help enough."""
+
+    @property
+    def flops(self) -> float:
+        """Operations of the scalar factorisation, infinite where no order was looked for."""
+        return np.inf if self.tree is None else self.tree.flops
+
+
+def predict_factor(graph: ViewGraph, coordinates: FloatArray | None = None) -> Prediction:
+    """Return the order of elimination that `laplacian_factor` would use.
+
+    A graph on which the diagonal is a good preconditioner has a large spectral gap, so no small separators
+    (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, and the ordering, which takes longer
+    than a solve by conjugate gradients, is saved. So it is on huge graphs whose levels are so wide that the
+    factor would take longer than it saves; some of them may have better separators than their levels, but
+    approximate Cholesky serves them as well.
+    """
+    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    if graph.num_cameras >= _LARGE:
+        operator = LaplacianOperator(neighbours, graph.weights, Workers(1))
+        if _diagonal_suffices(operator, JacobiPreconditioner(operator.diagonal())):
+            return Prediction(None)
+    if graph.num_cameras >= _HUGE:
+        rough_flops = 4.0 * (0.75 * widest_level(neighbours)) ** 3  # as on boxes of 1e4 and 1e5 cameras
+        if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
+            return Prediction(None)
+    return Prediction(best_order(neighbours, "auto", coordinates))
 
 
 def laplacian_factor(
-    graph: ViewGraph, memory_bytes: int = DEFAULT_MEMORY_BYTES, coordinates: FloatArray | None = None
+    graph: ViewGraph,
+    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    coordinates: FloatArray | None = None,
+    *,
+    prediction: Prediction | None = None,
+    threads: int = 1,
 ) -> LaplacianFactor:
     """Return a float32 Cholesky factor of the graph's Laplacian, or an iterative solver where that is better.
 
@@ -103,13 +140,16 @@ def laplacian_factor(
         graph: a connected view graph.
         memory_bytes: what the factor may take; predicted before anything is allocated.
         coordinates: (n, k) rough positions that may help to order the nodes.
+        prediction: from `predict_factor` on the same graph, if it is there already.
+        threads: of the factor; its answers do not depend on it.
     """
+    tree = (predict_factor(graph, coordinates) if prediction is None else prediction).tree
     neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
-    tree = best_order(neighbours, "auto", coordinates)
-    too_big = tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes
-    if too_big or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
-        return IterativeSolver(neighbours)
+    if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
+        return IterativeSolver(neighbours, threads)
+    if tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes:
+        return IterativeSolver(neighbours, threads)
     plan = plan_factorisation(neighbours, np.ascontiguousarray(graph.edges), tree)
     if plan.num_bytes(1, np.float32) > memory_bytes:
-        return IterativeSolver(neighbours)
-    return allocate_factor(plan, 1, np.float32)
+        return IterativeSolver(neighbours, threads)
+    return allocate_factor(plan, 1, np.float32, threads=threads)

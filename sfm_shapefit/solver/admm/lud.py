@@ -86,8 +86,7 @@ def solve_lud(
     passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), threads)
     try:
         outcome = Iteration(passes, factor, settings, None, float(graph.weights.sum())).run(on_iteration)
-        dual = np.empty_like(graph.directions)
-        dual[passes.data.order] = passes.dual(outcome.state.x, outcome.state.rho)
+        dual = passes.in_graph_order(passes.dual(outcome.state.x, outcome.state.rho))
     finally:
         passes.close()
     t = outcome.state.t - outcome.state.t.mean(axis=0)

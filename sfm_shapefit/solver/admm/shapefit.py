@@ -67,9 +67,8 @@ class Splitting:
             iteration.settings, tol=tol, absolute_tol=absolute_tol, max_iterations=max_iterations
         )
         outcome = self._outcome = iteration.run(on_iteration, self._outcome)
-        state, order = outcome.state, self._passes.data.order
-        dual = np.empty_like(state.x)
-        dual[order] = self._passes.dual(state.x, state.rho)
+        state = outcome.state
+        dual = self._passes.in_graph_order(self._passes.dual(state.x, state.rho))
         t = state.t - state.t.mean(axis=0)
         return AdmmResult(locations=t, dual=dual, iterations=outcome.iterations, stop=outcome.stop)
 

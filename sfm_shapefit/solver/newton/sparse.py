@@ -20,7 +20,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorisation
 from sfm_shapefit.solver.newton.steps import (
     EDGE_WORK,
     MU_PER_GAP,
@@ -62,6 +62,7 @@ def solve_newton_sparse(
     *,
     start: tuple[FloatArray, FloatArray] | None = None,
     plan: SymbolicFactor | None = None,
+    tree: EliminationTree | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with a sparse Cholesky factor in d x d blocks; as `solve_newton_dense` otherwise.
 
@@ -73,6 +74,7 @@ def solve_newton_sparse(
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorisations.
         plan: of the factorisation of the graph's Laplacian, if it is there already.
+        tree: or at least its order of elimination.
 
     Returns:
         locations (n, d), the dual (m, d), and the number of factorisations.
@@ -83,7 +85,7 @@ def solve_newton_sparse(
     problem, iterate, model, step = allocate(graph)
     if plan is None:
         neighbours = adjacency(graph.num_cameras, graph.edges)
-        plan = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
+        plan = plan_factorisation(neighbours, graph.edges, tree or best_order(neighbours))
     factor = allocate_factor(plan, graph.dimension)
     if start is None:
         system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
