@@ -21,6 +21,7 @@ LAYERS = [
     "rigidity",
     "laplacian",
     "solver",
+    "theory",
     "directions",
     "robust",
     "placement",
