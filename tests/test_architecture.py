@@ -22,6 +22,7 @@ LAYERS = [
     "laplacian",
     "solver",
     "theory",
+    "baselines",
     "directions",
     "robust",
     "placement",
@@ -38,7 +39,7 @@ LAYERS = [
 
 DOORS = {
     "numba": {"jit.py"},
-    "cvxpy": {"solver/conic.py"},
+    "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "cv2": {"synthetic/scenes.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
