@@ -48,6 +48,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     parser.add_argument("--trials", type=int, default=10, help="problems per sigma")
+    parser.add_argument("--seed", type=int, default=1, help="of the problems, the same at every sigma")
     parser.add_argument("--processes", type=int, default=2)
     parser.add_argument("--cache", type=Path, help="npz that keeps results between runs")
     parser.add_argument("--quick", action="store_true", help="four sigmas, two problems each")
@@ -59,6 +60,7 @@ def main(argv: Sequence[str] | None = None) -> None:
         2 if args.quick else args.trials,
         cache=args.cache,
         processes=args.processes,
+        seed=args.seed,
     )
     draw(sigmas, results, args.out)
     print(f"{len(sigmas)} values of sigma in {results.seconds:.0f} s")

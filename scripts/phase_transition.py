@@ -132,11 +132,9 @@ def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
     lines = []
     largest = max(cell.n for cell in cells)
     for cell, trials in zip(cells, values, strict=True):
-        spoken_of = (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3)
-        if spoken_of:
-            lines.append(
-                f"  n = {cell.n}, q = {cell.q:g}: mean error {np.minimum(trials[:, 0], 1.0).mean():.2g}"
-            )
+        if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
+            mean = np.minimum(trials[:, 0], 1.0).mean()
+            lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
             lines += [_failure(t) for t in trials.tolist() if t[0] >= EXACT]
     return lines
 

@@ -1,7 +1,7 @@
 """Many small problems over several processes, resumable: cells x methods x trials of the random model.
 
 A cell is a setting of the paper's model, of which a number of trials are drawn; every method solves the same
-ones. The results are kept in an npz beside the settings that they belong to, so that an interrupted run goes on.
+ones. The results are kept in an npz beside the settings they belong to, so that an interrupted run goes on.
 """
 
 import json
