@@ -21,6 +21,8 @@ LAYERS = [
     "rigidity",
     "laplacian",
     "solver",
+    "theory",
+    "baselines",
     "directions",
     "robust",
     "epipolar",
@@ -40,7 +42,7 @@ LAYERS = [
 
 DOORS = {
     "numba": {"jit.py"},
-    "cvxpy": {"solver/conic.py"},
+    "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "cv2": {"synthetic/scenes.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},

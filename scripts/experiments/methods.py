@@ -1,0 +1,47 @@
+"""The methods that the figures compare, by name: each takes a graph and returns locations."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.baselines import locate_least_squares, locate_lud
+from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.synthetic.graphs import GraphProblem
+from sfm_shapefit.viewgraph import ViewGraph
+
+_TIGHT = SolverOptions(tol=1e-12, uniqueness=False)  # exact recovery means an error below 1e-9
+
+
+def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return solve(graph, _TIGHT).locations
+
+
+def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return solve(graph, SolverOptions(method="conic", tol=1e-9, uniqueness=False)).locations
+
+
+def _lud(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return locate_lud(graph)
+
+
+def _least_squares(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return locate_least_squares(graph)
+
+
+def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
+    """Least squares of the angles of the pairs that are not corrupted: no method can be told more."""
+    clean, cameras = graph.restricted_to(np.flatnonzero(~problem.corrupted))
+    if len(cameras) < graph.num_cameras:
+        return np.full((graph.num_cameras, graph.dimension), np.nan)
+    return locate_least_squares(clean, reweightings=10)
+
+
+METHODS: dict[str, Callable[[ViewGraph, GraphProblem], FloatArray]] = {
+    "ShapeFit": _shapefit,
+    "ShapeFit, conic": _conic,
+    "LUD": _lud,
+    "least squares": _least_squares,
+    "oracle": _oracle,
+}

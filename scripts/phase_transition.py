@@ -1,0 +1,173 @@
+"""Figure 1 of the paper and its extensions: `python scripts/phase_transition.py --out docs/figure1.png`.
+
+Mean relative error over 10 problems of the random model for every number of locations n and probability q of
+corruption, drawn as in the paper: white is 0, black is 1. `--figure` picks what is compared; interrupted runs
+go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
+"""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from experiments.trials import Cell, Results, run
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+EXACT = 1e-9
+NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of a figure: a method on one setting of the model."""
+
+    title: str
+    method: str
+    n: tuple[int, ...]
+    q: tuple[float, ...]
+    sigma: float = 0.0
+    p: float = 0.5
+    d: int = 3
+    corruption: str = "uniform"
+
+    def cells(self) -> list[Cell]:
+        return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
+
+
+def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
+    return tuple(range(low, high + 1, step))
+
+
+def _shares(num: int) -> tuple[float, ...]:
+    return tuple(np.round(np.linspace(0.0, 0.5, num), 4).tolist())
+
+
+def panels(figure: str) -> list[Panel]:
+    """Return the panels of a figure."""
+    fine, coarse = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
+    noises = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
+    if figure == "paper":
+        return [Panel(f"ShapeFit, {words}", "ShapeFit", *fine, sigma=s) for s, words in noises]
+    if figure == "reference":
+        methods = ("ShapeFit", "ShapeFit, conic")
+        return [Panel(f"{m}, {words}", m, *fine, sigma=s) for s, words in noises for m in methods]
+    if figure == "methods":
+        return [
+            Panel(f"{method}, {words}", method, *coarse, sigma=s)
+            for s, words in noises
+            for method in ("ShapeFit", "LUD", "least squares")
+        ]
+    if figure == "density":
+        return [Panel(f"ShapeFit, p = {p}", "ShapeFit", *coarse, p=p) for p in (0.25, 0.5, 0.75)]
+    if figure == "dimension":
+        return [Panel(f"ShapeFit, d = {d}", "ShapeFit", *coarse, d=d) for d in (2, 3, 10)] + [
+            Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50)
+        ]
+    return [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), coarse[1])]
+
+
+FIGURES = ("paper", "reference", "methods", "density", "dimension", "large")
+
+
+def quick(panel: Panel) -> Panel:
+    """Return the panel with few cells: what the tests run."""
+    return Panel(
+        panel.title, panel.method, (10, 30), (0.0, 0.2), panel.sigma, panel.p, panel.d, panel.corruption
+    )
+
+
+def compute(shown: Sequence[Panel], trials: int, cache: Path | None, processes: int) -> Results:
+    """Run all cells of the panels; every method runs on every cell."""
+    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
+    methods = list(dict.fromkeys(panel.method for panel in shown))
+    return run(cells, methods, trials, cache=cache, processes=processes)
+
+
+def image(panel: Panel, results: Results) -> np.ndarray:
+    """Return the mean errors of a panel, rows by n, columns by q."""
+    means = dict(zip(results.cells, results.mean_errors(panel.method), strict=True))
+    return np.array([means[cell] for cell in panel.cells()]).reshape(len(panel.n), len(panel.q))
+
+
+def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
+    """Draw the panels as the paper does."""
+    columns = min(len(shown), 3)
+    rows = -(-len(shown) // columns)
+    figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.9 * rows), dpi=100, squeeze=False)
+    for panel, axis in zip(shown, axes.ravel(), strict=False):
+        picture = axis.pcolormesh(
+            panel.q, panel.n, image(panel, results), cmap="gray_r", vmin=0.0, vmax=1.0, shading="nearest"
+        )
+        axis.set(title=panel.title, xlabel="corruption probability q", ylabel="number of locations n")
+    for axis in axes.ravel()[len(shown) :]:
+        axis.set_axis_off()
+    figure.colorbar(picture, ax=axes, label="mean relative error", fraction=0.03)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, bbox_inches="tight")
+    plt.close(figure)
+
+
+def report(shown: Sequence[Panel], results: Results) -> str:
+    """Say what the paper's text says of its figure, and which camera fails where a large problem does."""
+    lines = [f"{len(results.cells)} cells in {results.seconds:.0f} s"]
+    for panel in shown:
+        rows = {cell: k for k, cell in enumerate(results.cells)}
+        values = results.values[[rows[cell] for cell in panel.cells()], results.methods.index(panel.method)]
+        exact = values[..., 0] < EXACT
+        lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
+        if panel.sigma == 0.0:
+            lines += _failures(panel.cells(), values)
+    if len(results.methods) == 2:
+        apart = np.abs(np.subtract(*(results.mean_errors(m) for m in results.methods))).max()
+        lines.append(f"largest difference of a cell between {' and '.join(results.methods)}: {apart:.1e}")
+    return "\n".join(lines)
+
+
+def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
+    """Describe the cells the paper speaks of: n = 50 at q = 0.25, and the largest n up to q = 0.3."""
+    lines = []
+    largest = max(cell.n for cell in cells)
+    for cell, trials in zip(cells, values, strict=True):
+        if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
+            mean = np.minimum(trials[:, 0], 1.0).mean()
+            lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
+            lines += [_failure(t) for t in trials.tolist() if t[0] >= EXACT]
+    return lines
+
+
+def _failure(trial: Sequence[float]) -> str:
+    error, camera, share, others = trial
+    if camera < 0:
+        return "    a problem that is not parallel rigid"
+    return (
+        f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong; {others:.2g} without it"
+    )
+
+
+def parser() -> argparse.ArgumentParser:
+    described = argparse.ArgumentParser(description=__doc__)
+    described.add_argument("--out", type=Path, required=True, help="PNG to write")
+    described.add_argument("--figure", choices=FIGURES, default="paper")
+    described.add_argument("--trials", type=int, default=10, help="problems per cell")
+    described.add_argument("--processes", type=int, default=2)
+    described.add_argument("--cache", type=Path, help="npz that keeps results between runs")
+    described.add_argument("--quick", action="store_true", help="four cells per panel, two problems each")
+    return described
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    args = parser().parse_args(argv)
+    shown, trials = panels(args.figure), args.trials
+    if args.quick:
+        shown, trials = [quick(panel) for panel in shown], 2
+    results = compute(shown, trials, args.cache, args.processes)
+    draw(shown, results, args.out)
+    print(report(shown, results))
+
+
+if __name__ == "__main__":
+    main()

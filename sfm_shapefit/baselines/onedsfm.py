@@ -1,0 +1,100 @@
+"""1DSfM: pairs that contradict the order of the cameras along many random axes are wrong.
+
+Projected to an axis, a direction says which of its two cameras comes first, the surer the longer its
+projection. An order that most pairs agree with is a minimum feedback arc set of this weighted, directed
+graph, here by the greedy rule of the paper: take next the camera with the most going out for what still
+comes in. A pair collects the length of its projection on each axis where the order contradicts it; the mean
+over axes is its score.
+
+Source: Wilson and Snavely, "Robust global translations with 1DSfM", ECCV 2014, section 4.
+"""
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.viewgraph import ViewGraph
+
+_AXES = 48
+_THRESHOLD = 0.1  # the paper's
+_JITTER = 0.3  # axes are drawn near the directions themselves: others separate no cameras
+
+
+def filter_1dsfm(
+    graph: ViewGraph, num_axes: int = _AXES, threshold: float = _THRESHOLD, seed: int = 0
+) -> BoolArray:
+    """Return the (m,) pairs whose score stays below the threshold.
+
+    Args:
+        graph: any view graph.
+        num_axes: random axes.
+        threshold: largest mean length, per axis, of the projections that contradict the order.
+        seed: of the axes.
+    """
+    kept: BoolArray = onedsfm_scores(graph, num_axes, seed) < threshold
+    return kept
+
+
+def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> FloatArray:
+    """Return each pair's mean projected length on the axes that contradict it, (m,)."""
+    rng = np.random.default_rng(seed)
+    chosen = graph.directions[rng.integers(graph.num_edges, size=num_axes)]
+    axes = normalized(chosen + _JITTER * rng.standard_normal(chosen.shape))
+    scores = np.zeros(graph.num_edges)
+    for axis in axes:
+        ahead = graph.directions @ axis  # positive: camera i comes after camera j
+        place = _greedy_order(graph.num_cameras, graph.edges, ahead)
+        before = place[graph.edges[:, 0]] < place[graph.edges[:, 1]]
+        scores += np.where(before == (ahead > 0.0), np.abs(ahead), 0.0)
+    return scores / num_axes
+
+
+@kernel(exact=True)
+def _greedy_order(n: int, edges: IntArray, ahead: FloatArray) -> IntArray:
+    """Return the place (n,) of each camera in an order that most weight agrees with."""
+    start, other, weight = _arcs(n, edges, ahead)
+    entering, leaving = np.zeros(n), np.zeros(n)
+    for c in range(n):
+        for k in range(start[c], start[c + 1]):
+            if weight[k] > 0.0:
+                leaving[c] += weight[k]
+            else:
+                entering[c] -= weight[k]
+    place = np.full(n, -1)
+    for position in range(n):
+        best, best_ratio = -1, -1.0
+        for c in range(n):
+            if place[c] < 0:
+                ratio = (leaving[c] + 1.0) / (max(entering[c], 0.0) + 1.0)
+                if ratio > best_ratio:
+                    best, best_ratio = c, ratio
+        place[best] = position
+        for k in range(start[best], start[best + 1]):
+            if weight[k] > 0.0:
+                entering[other[k]] -= weight[k]
+            else:
+                leaving[other[k]] += weight[k]
+    return place
+
+
+@kernel(exact=True)
+def _arcs(n: int, edges: IntArray, ahead: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+    """Return the arcs of each camera, one camera after the other: start (n + 1,), other end, weight.
+
+    The weight is positive where the arc leaves the camera, that is, where the camera comes first.
+    """
+    start = np.zeros(n + 1, dtype=np.int64)
+    for e in range(len(edges)):
+        start[edges[e, 0] + 1] += 1
+        start[edges[e, 1] + 1] += 1
+    start = np.cumsum(start)
+    fill = start[:-1].copy()
+    other, weight = np.empty(2 * len(edges), dtype=np.int64), np.empty(2 * len(edges))
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        other[fill[i]], weight[fill[i]] = j, -ahead[e]
+        other[fill[j]], weight[fill[j]] = i, ahead[e]
+        fill[i] += 1
+        fill[j] += 1
+    return start, other, weight

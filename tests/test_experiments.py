@@ -1,0 +1,111 @@
+"""The figures of the paper: their trials, what is kept between runs, and the scripts in their quick mode."""
+
+import importlib.util
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).parents[1] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
+
+from experiments import trials  # noqa: E402
+from experiments.trials import Cell, relative_error, run, run_batch  # noqa: E402
+
+CELLS = [Cell(12, 0.0), Cell(12, 0.2, 0.05)]
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_the_error_is_the_papers_and_ignores_shift_and_scale():
+    t = np.random.default_rng(0).standard_normal((6, 3))
+    assert relative_error(3.0 * t + 1.0, t) < 1e-15
+    assert relative_error(-t, t) == pytest.approx(2.0)
+
+
+def test_every_method_solves_the_same_problems_and_a_trial_is_that_of_its_seed():
+    both = run_batch(CELLS, ["ShapeFit", "least squares"], 2, 0)
+    assert both.shape == (2, 2, 2, 4)
+    np.testing.assert_array_equal(run_batch(CELLS[1:], ["ShapeFit"], 2, 0)[0, 0], both[1, 0])
+    assert not np.array_equal(run_batch(CELLS[1:], ["ShapeFit"], 2, 1)[0, 0], both[1, 0])
+
+
+def test_a_problem_without_an_answer_counts_as_not_recovered():
+    values = run_batch([Cell(4, 0.0, p=0.1)], ["ShapeFit"], 3, 0)
+    np.testing.assert_array_equal(values[0, 0, :, 0], 1.0)
+    np.testing.assert_array_equal(values[0, 0, :, 1], -1)
+
+
+def test_the_camera_that_is_farthest_off_is_named_with_its_share_of_wrong_pairs():
+    problem = next(trials.problems(Cell(10, 0.3), 1, 0))
+
+    def one_flies(_graph, problem):
+        t = problem.locations.copy()
+        t[7] += 100.0
+        return t
+
+    found = trials.trial(problem, one_flies)
+    touching = (problem.edges == 7).any(axis=1)
+    assert found.worst_camera == 7
+    assert found.wrong_share == pytest.approx(problem.corrupted[touching].mean())
+    assert found.error_of_others < 1e-12 < found.error
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path, monkeypatch):
+    cache = tmp_path / "kept.npz"
+    whole = run(CELLS, ["ShapeFit"], 2, cache=cache, processes=1)
+    with np.load(cache) as kept:
+        values, settings = kept["values"].copy(), str(kept["settings"])
+    values[0] = np.nan  # as if the run had been stopped before this cell
+    values[1, ..., 0] = 0.125
+    np.savez(cache, settings=settings, values=values, seconds=1.0)
+    resumed = run(CELLS, ["ShapeFit"], 2, cache=cache, processes=1)
+    np.testing.assert_array_equal(resumed.values[0], whole.values[0])
+    np.testing.assert_array_equal(resumed.values[1, ..., 0], 0.125)
+
+
+def test_results_of_other_settings_are_not_mixed_in(tmp_path):
+    cache = tmp_path / "kept.npz"
+    run(CELLS[:1], ["ShapeFit"], 1, cache=cache, processes=1)
+    with pytest.raises(ValueError, match="other settings"):
+        run(CELLS[:1], ["ShapeFit"], 2, cache=cache, processes=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("figure", ["paper", "methods"])
+def test_figure_1_has_a_quick_mode(figure, tmp_path, capsys):
+    script("phase_transition").main(["--out", str(tmp_path / "f.png"), "--quick", "--figure", figure])
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    said = capsys.readouterr().out
+    assert "problems recovered below 1e-09" in said
+
+
+@pytest.mark.slow
+def test_figure_2_has_a_quick_mode_and_its_slope_is_one(tmp_path, capsys):
+    script("noise_robustness").main(["--out", str(tmp_path / "f.png"), "--quick"])
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    slope = float(capsys.readouterr().out.split("ShapeFit: slope ")[1].split()[0])
+    assert slope == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_slope_is_fitted_where_the_noise_is_small():
+    module = script("noise_robustness")
+    sigmas = np.logspace(-6, 0, 7)
+    errors = np.where(sigmas <= 1e-2, 3.0 * sigmas**1.5, 1.0)
+    assert module.fitted_slope(sigmas, errors) == pytest.approx(1.5)
+
+
+def test_every_panel_of_every_figure_names_a_known_method():
+    module = script("phase_transition")
+    from experiments.methods import METHODS
+
+    for figure in module.FIGURES:
+        assert module.panels(figure)
+        assert {panel.method for panel in module.panels(figure)} <= set(METHODS)

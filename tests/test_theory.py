@@ -1,0 +1,262 @@
+"""The paper's deterministic conditions, against brute force, and its lemmas as properties."""
+
+import itertools
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.program import projected_length
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.synthetic.graphs import random_graph_problem
+from sfm_shapefit.theory import graph_typicality, recovery_conditions, well_distributed
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def complete(n):
+    return np.stack(np.triu_indices(n, k=1), axis=1).astype(np.int64)
+
+
+def across(v, h):
+    """The part of h orthogonal to v."""
+    v = v / np.linalg.norm(v)
+    return h - (h @ v) * v
+
+
+def sine(a, b):
+    return np.linalg.norm(across(a, b)) / np.linalg.norm(b)
+
+
+def spread_along(t, adjacency, directions):
+    """Well-distributedness by its definition, over the given directions h of space."""
+    n, worst = len(t), np.inf
+    for i, j in itertools.combinations(range(n), 2):
+        common = np.flatnonzero(adjacency[i] & adjacency[j])
+        for direction in directions:
+            h = across(t[i] - t[j], direction)
+            sums = 0.0
+            for k in common:
+                spanned = np.linalg.qr(np.stack([t[k] - t[i], t[k] - t[j]], axis=1))[0]
+                sums += np.linalg.norm(h - spanned @ (spanned.T @ h))
+            if len(common):
+                worst = min(worst, sums / (len(common) * np.linalg.norm(h)))
+    return worst
+
+
+def test_a_complete_graph_is_typical_for_the_p_of_the_definition():
+    t = graph_typicality(10, complete(10))
+    assert t.connected
+    assert t.degrees == (9, 9)
+    assert t.codegrees == (8, 8)
+    assert t.p_low == pytest.approx(np.sqrt(8 / 20))
+    assert t.p_high == 1.0
+    assert t.holds
+
+
+def test_cameras_without_a_common_neighbour_make_a_graph_atypical():
+    ring = np.array([[i, (i + 1) % 8] for i in range(8)])
+    t = graph_typicality(8, ring)
+    assert t.connected
+    assert t.codegrees == (0, 1)
+    assert not t.holds
+
+
+def test_two_components_are_never_typical():
+    apart = np.concatenate([complete(5), complete(5) + 5])
+    assert not graph_typicality(10, apart).connected
+    assert not graph_typicality(10, apart).holds
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_beta_is_the_least_sine_over_all_triples(d):
+    problem = random_graph_problem(9, 1.0, d, seed=d)
+    t = problem.locations
+    found = recovery_conditions(t, problem.edges)
+    brute = min(sine(t[j] - t[i], t[k] - t[i]) for i, j, k in itertools.permutations(range(9), 3))
+    assert found.beta == pytest.approx(brute, rel=1e-9)
+
+
+def test_beta_with_exceptions_leaves_out_the_worst_cameras_of_each_pair():
+    problem = random_graph_problem(8, 1.0, 3, seed=4)
+    t = problem.locations
+    from sfm_shapefit.theory import _least_sines
+
+    _, most, _ = _least_sines(t, 2, 0, len(t))
+    brute = min(
+        sorted(
+            min(sine(t[j] - t[i], t[k] - t[i]), sine(t[j] - t[i], t[k] - t[j]))
+            for k in range(8)
+            if k not in (i, j)
+        )[2]
+        for i, j in itertools.combinations(range(8), 2)
+    )
+    assert most.min() == pytest.approx(brute, rel=1e-9)
+
+
+def test_collinear_cameras_are_counted_and_grant_nothing():
+    t = np.random.default_rng(0).standard_normal((8, 3))
+    t[5] = 0.5 * (t[2] + t[7])
+    found = recovery_conditions(t, complete(8))
+    assert found.num_collinear == 1
+    assert found.beta < 1e-12
+    assert found.granted_in_space == 0.0
+
+
+def test_distance_constants_are_those_of_the_two_theorems():
+    t = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0.3, 0.4, 1]])
+    lengths = [np.linalg.norm(t[i] - t[j]) for i, j in complete(4)]
+    found = recovery_conditions(t, complete(4))
+    assert found.distance_ratio == pytest.approx(min(lengths) / max(lengths))
+    assert found.distance_bound == pytest.approx(max(lengths) / np.mean(lengths))
+
+
+def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
+    problem = random_graph_problem(7, 0.8, 3, seed=2)
+    adjacency = np.zeros((7, 7), dtype=bool)
+    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
+    adjacency |= adjacency.T
+    exact, _ = well_distributed(problem.locations, adjacency)
+    rng = np.random.default_rng(0)
+    sampled = spread_along(problem.locations, adjacency, rng.standard_normal((400, 3)))
+    assert exact <= sampled + 1e-12
+    # The sum is 1-Lipschitz in the angle of h, of which 400 draws miss the best by about pi / 400.
+    assert sampled - exact < 0.02
+
+
+def test_the_bracket_of_other_dimensions_holds_the_exact_value_of_space():
+    problem = random_graph_problem(9, 0.9, 3, seed=5)
+    adjacency = np.zeros((9, 9), dtype=bool)
+    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
+    adjacency |= adjacency.T
+    exact, _ = well_distributed(problem.locations, adjacency)
+    padded = np.pad(problem.locations, ((0, 0), (0, 1)))  # h along the new axis is in every complement
+    low, high = well_distributed(padded, adjacency)
+    assert low <= exact + 1e-12 <= high + 1e-9
+    assert high <= 1.05 * exact
+
+
+def test_in_ten_dimensions_the_bracket_holds_what_sampling_finds():
+    problem = random_graph_problem(14, 0.9, 10, seed=6)
+    adjacency = np.zeros((14, 14), dtype=bool)
+    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
+    adjacency |= adjacency.T
+    low, high = well_distributed(problem.locations, adjacency)
+    sampled = spread_along(problem.locations, adjacency, np.random.default_rng(1).standard_normal((60, 10)))
+    assert 0.0 < low <= high <= sampled
+
+
+def test_a_collinear_common_neighbour_counts_in_full():
+    t = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])
+    adjacency = ~np.eye(3, dtype=bool)
+    adjacency[0, 1] = adjacency[1, 0] = False
+    assert well_distributed(t, adjacency) == (1.0, 1.0)
+
+
+def test_all_constants_are_the_same_for_any_scale_place_and_number_of_threads():
+    problem = random_graph_problem(40, 0.7, 3, seed=7)
+    one = recovery_conditions(problem.locations, problem.edges)
+    other = recovery_conditions(3.0 * problem.locations + [1.0, -2.0, 5.0], problem.edges, threads=2)
+    for name in ("beta", "beta_most", "distance_ratio", "distance_bound"):
+        assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-9)
+    assert other.spread == pytest.approx(one.spread, rel=1e-9)
+    assert recovery_conditions(problem.locations, problem.edges, threads=2) == one
+
+
+def test_the_granted_share_is_that_of_the_theorem():
+    n = 6
+    simplex = np.eye(n)  # all distances equal, all angles 60 degrees
+    found = recovery_conditions(simplex, complete(n))
+    assert found.beta == pytest.approx(np.sqrt(3.0) / 2.0)
+    assert found.distance_ratio == pytest.approx(1.0)
+    expected = found.beta * found.spread[0] ** 2 / (3 * 256 * 64 * 32)
+    assert found.granted == pytest.approx(expected)
+    assert found.guarantees_recovery(0)
+    assert not found.guarantees_recovery(1)
+
+
+def test_space_grants_by_its_own_theorem():
+    problem = random_graph_problem(30, 1.0, 3, seed=3)
+    found = recovery_conditions(problem.locations, problem.edges)
+    constants = found.beta_most * found.spread[0] ** 2 / found.distance_bound**2
+    assert found.granted_in_space == pytest.approx(constants / (32 * 3 * 64 * 1024))
+    assert found.granted_in_space > 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_truth_stays_feasible_below_the_share_of_the_lemma(seed):
+    """L(T0) > 0 with every corrupted direction turned round, the worst case of the lemma."""
+    n, rng = 40, np.random.default_rng(seed)
+    t = np.eye(n)[:, : n - 1]
+    edges = complete(n)
+    feasible = recovery_conditions(t, edges).feasible
+    directions = normalized(t[edges[:, 0]] - t[edges[:, 1]])
+    allowed = int(np.ceil(feasible * n)) - 1
+    assert allowed >= 1
+    degrees = np.zeros(n, dtype=int)
+    for e in rng.permutation(len(edges)):
+        if (degrees[edges[e]] < allowed).all():
+            degrees[edges[e]] += 1
+            directions[e] *= -1.0
+    assert degrees.max() == allowed
+    assert projected_length(ViewGraph(n, edges, directions), t) > 0.0
+
+
+def test_a_graph_that_is_not_typical_has_no_guarantee_even_without_corruption():
+    problem = random_graph_problem(30, 0.3, 3, seed=1)
+    assert not recovery_conditions(problem.locations, problem.edges).guarantees_recovery(0)
+
+
+def test_what_the_theorem_grants_is_recovered_exactly():
+    problem = random_graph_problem(25, 1.0, 3, seed=9)
+    found = recovery_conditions(problem.locations, problem.edges)
+    assert found.guarantees_recovery(0)
+    answer = solve(ViewGraph(25, problem.edges, problem.directions)).locations
+    truth = problem.locations - problem.locations.mean(axis=0)
+    error = answer / np.linalg.norm(answer) - truth / np.linalg.norm(truth)
+    assert np.linalg.norm(error) < 1e-8
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
+@settings(max_examples=60, deadline=None)
+def test_stretching_two_sides_of_a_triangle_differently_turns_a_side(seed, d):
+    """Lemma `rigidity1`: unbalanced parallel motions of a triangle induce rotation."""
+    rng = np.random.default_rng(seed)
+    t, v, alpha = rng.standard_normal((3, d)), rng.standard_normal((3, d)), rng.standard_normal()
+    turned, stretch = _motion(t, v, alpha)
+    bound = sine(t[0] - t[1], t[1] - t[2]) * np.linalg.norm(t[0] - t[1])
+    assert turned >= bound * abs(stretch[0, 1] - stretch[0, 2]) * (1 - 1e-9)
+
+
+@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
+@settings(max_examples=60, deadline=None)
+def test_stretching_opposite_sides_of_a_tetrahedron_differently_turns_a_side(seed, d):
+    """Lemma `rigidity2`: the same for two sides without a common corner."""
+    rng = np.random.default_rng(seed)
+    t, v, alpha = rng.standard_normal((4, d)), rng.standard_normal((4, d)), rng.standard_normal()
+    turned, stretch = _motion(t, v, alpha)
+    beta = min(
+        sine(t[i] - t[j], t[i] - t[k]) for i, j, k in itertools.permutations(range(4), 3) if {j, k} != {0, 1}
+    )
+    bound = beta / 4.0 * np.linalg.norm(t[0] - t[1])
+    assert turned >= bound * abs(stretch[0, 1] - stretch[2, 3]) * (1 - 1e-9)
+
+
+def _motion(t, v, alpha):
+    """Return the sum of rotations, and how each side stretches beyond alpha."""
+    n = len(t)
+    turned, stretch = 0.0, np.zeros((n, n))
+    for i, j in itertools.combinations(range(n), 2):
+        side, moved = t[i] - t[j], v[i] - v[j]
+        turned += np.linalg.norm(across(side, moved))
+        stretch[i, j] = stretch[j, i] = (moved - alpha * side) @ side / (side @ side)
+    return turned, stretch
+
+
+def test_too_few_or_coincident_cameras_are_refused():
+    with pytest.raises(InputError, match="three cameras"):
+        recovery_conditions(np.zeros((2, 3)), np.array([[0, 1]]))
+    with pytest.raises(InputError, match="coincide"):
+        recovery_conditions(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), complete(3))
