@@ -18,7 +18,7 @@ from experiments.trials import Cell, Results, run
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 
-SHOWN = ("ShapeFit", "LUD", "oracle")
+SHOWN = ("ShapeFit", "refined", "LUD", "oracle")
 NUM_LOCATIONS, CORRUPTED = 50, 0.2
 LARGEST_FITTED = 1e-2
 NOT_RECOVERABLE = 1e-4  # at sigma = 1e-6

@@ -6,13 +6,16 @@ go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
 """
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import matplotlib as mpl
 import numpy as np
 from experiments.trials import Cell, Results, run
+
+from sfm_shapefit.synthetic.graphs import Corruption
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
@@ -32,7 +35,7 @@ class Panel:
     sigma: float = 0.0
     p: float = 0.5
     d: int = 3
-    corruption: str = "uniform"
+    corruption: Corruption = "uniform"
 
     def cells(self) -> list[Cell]:
         return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
@@ -46,31 +49,57 @@ def _shares(num: int) -> tuple[float, ...]:
     return tuple(np.round(np.linspace(0.0, 0.5, num), 4).tolist())
 
 
+NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
+FINE, COARSE = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
+
+
 def panels(figure: str) -> list[Panel]:
     """Return the panels of a figure."""
-    fine, coarse = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
-    noises = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
-    if figure == "paper":
-        return [Panel(f"ShapeFit, {words}", "ShapeFit", *fine, sigma=s) for s, words in noises]
-    if figure == "reference":
-        methods = ("ShapeFit", "ShapeFit, conic")
-        return [Panel(f"{m}, {words}", m, *fine, sigma=s) for s, words in noises for m in methods]
-    if figure == "methods":
-        return [
-            Panel(f"{method}, {words}", method, *coarse, sigma=s)
-            for s, words in noises
-            for method in ("ShapeFit", "LUD", "least squares")
-        ]
-    if figure == "density":
-        return [Panel(f"ShapeFit, p = {p}", "ShapeFit", *coarse, p=p) for p in (0.25, 0.5, 0.75)]
-    if figure == "dimension":
-        return [Panel(f"ShapeFit, d = {d}", "ShapeFit", *coarse, d=d) for d in (2, 3, 10)] + [
-            Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50)
-        ]
-    return [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), coarse[1])]
+    return FIGURES[figure]()
 
 
-FIGURES = ("paper", "reference", "methods", "density", "dimension", "large")
+def _paper(method: str = "ShapeFit") -> list[Panel]:
+    return [Panel(f"{method}, {words}", method, *FINE, sigma=s) for s, words in NOISES]
+
+
+def _reference() -> list[Panel]:
+    return _paper() + _paper("ShapeFit, conic")
+
+
+def _methods() -> list[Panel]:
+    methods = ("ShapeFit", "refined", "LUD", "least squares")
+    return [Panel(f"{m}, {words}", m, *COARSE, sigma=s) for s, words in NOISES for m in methods]
+
+
+def _corruption() -> list[Panel]:
+    methods = ("ShapeFit", "refined", "LUD")
+    return [
+        Panel(f"{m}, {kind}", m, *COARSE, corruption=kind) for kind in get_args(Corruption) for m in methods
+    ]
+
+
+def _density() -> list[Panel]:
+    return [Panel(f"ShapeFit, p = {p}", "ShapeFit", *COARSE, p=p) for p in (0.25, 0.5, 0.75)]
+
+
+def _dimension() -> list[Panel]:
+    low = [Panel(f"ShapeFit, d = {d}", "ShapeFit", *COARSE, d=d) for d in (2, 3, 10)]
+    return [*low, Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50)]
+
+
+def _large() -> list[Panel]:
+    return [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])]
+
+
+FIGURES: dict[str, Callable[[], list[Panel]]] = {
+    "paper": _paper,
+    "reference": _reference,
+    "methods": _methods,
+    "corruption": _corruption,
+    "density": _density,
+    "dimension": _dimension,
+    "large": _large,
+}
 
 
 def quick(panel: Panel) -> Panel:
@@ -95,7 +124,7 @@ def image(panel: Panel, results: Results) -> np.ndarray:
 
 def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
     """Draw the panels as the paper does."""
-    columns = min(len(shown), 3)
+    columns = min(len(shown), 3 if len(shown) % 3 == 0 else 4)
     rows = -(-len(shown) // columns)
     figure, axes = plt.subplots(rows, columns, figsize=(4.2 * columns, 3.9 * rows), dpi=100, squeeze=False)
     for panel, axis in zip(shown, axes.ravel(), strict=False):

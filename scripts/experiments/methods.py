@@ -6,6 +6,8 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.baselines import locate_least_squares, locate_lud
+from sfm_shapefit.robust.finish import finish
+from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import GraphProblem
@@ -20,6 +22,11 @@ def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
 
 def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
     return solve(graph, SolverOptions(method="conic", tol=1e-9, uniqueness=False)).locations
+
+
+def _refined(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    """ShapeFit and LUD, both refined in angles, the better kept: what `locate` does."""
+    return finish(graph, solve(graph, _TIGHT), PlacementOptions()).locations
 
 
 def _lud(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
@@ -41,6 +48,7 @@ def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
 METHODS: dict[str, Callable[[ViewGraph, GraphProblem], FloatArray]] = {
     "ShapeFit": _shapefit,
     "ShapeFit, conic": _conic,
+    "refined": _refined,
     "LUD": _lud,
     "least squares": _least_squares,
     "oracle": _oracle,

@@ -23,7 +23,7 @@ from experiments.methods import METHODS
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import ShapeFitError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.synthetic.graphs import GraphProblem, random_graph_problem
+from sfm_shapefit.synthetic.graphs import Corruption, GraphProblem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 
 NOT_RECOVERED = 1.0  # the error of a problem that has no unique answer, as in the paper's black cells
@@ -40,7 +40,7 @@ class Cell:
     sigma: float = 0.0
     p: float = 0.5
     d: int = 3
-    corruption: str = "uniform"
+    corruption: Corruption = "uniform"
 
 
 class Trial(NamedTuple):
@@ -173,7 +173,9 @@ def problems(cell: Cell, trials: int, seed: int) -> Iterator[GraphProblem]:
     """Yield the problems of a cell; each has a seed of its own, whatever else is run."""
     for k in range(trials):
         rng = np.random.default_rng([seed, cell.n, round(1e4 * cell.q), round(1e4 * cell.p), cell.d, k])
-        yield random_graph_problem(cell.n, cell.p, cell.d, sigma=cell.sigma, q=cell.q, seed=rng)
+        yield random_graph_problem(
+            cell.n, cell.p, cell.d, sigma=cell.sigma, q=cell.q, seed=rng, corruption=cell.corruption
+        )
 
 
 def trial(problem: GraphProblem, method: Callable[[ViewGraph, GraphProblem], FloatArray]) -> Trial:
