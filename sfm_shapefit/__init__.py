@@ -9,6 +9,7 @@
 Names are imported when they are first used, so that importing the package is cheap.
 """
 
+import zlib  # noqa: F401  before pycolmap, whose own copy would take the place of the system's, see `jit`
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 

@@ -15,6 +15,8 @@ of code, whatever else was compiled), or compiled apart and called by its addres
 only one copy).
 """
 
+import hashlib
+import sys
 from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, TypeVar, cast
@@ -24,8 +26,20 @@ import numpy as np
 import numpy.typing as npt
 from llvmlite import ir
 from numba import types
-from numba.core import cgutils
+from numba.core import cgutils, targetconfig
 from numba.extending import get_cython_function_address, intrinsic
+
+
+def _names_without_zlib(config: Any) -> str:
+    """Return a string of a compiler configuration for the names of symbols, as its own method does."""
+    return hashlib.sha256(config.summary().encode()).hexdigest()
+
+
+_loaded = list(sys.modules)
+if "pycolmap" in _loaded and _loaded.index("pycolmap") < _loaded.index("zlib"):
+    # pycolmap's library brings a zlib of its own and exports it; the system's, loaded after it, then runs
+    # half of either and corrupts memory. numba compresses the names of symbols with it, so it must not.
+    targetconfig.TargetConfig.get_mangle_string = _names_without_zlib
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
