@@ -108,7 +108,7 @@ def _best_hypothesis(
     threshold_px: float,
     num_hypotheses: int,
 ) -> FloatArray:
-    """Return the two-match direction of least truncated cost over the members; the draws are always the same."""
+    """Return the two-match direction of least truncated cost over the members; its draws are fixed."""
     count = np.uint64(len(members))
     best, d = np.zeros(3), np.zeros(3)
     best[0] = 1.0

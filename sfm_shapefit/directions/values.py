@@ -24,6 +24,10 @@ class DirectionStatus(enum.Enum):
     ROTATION_MISMATCH = "the relative rotation contradicts the given rotations"
 
 
+_FLOOR_DEG = 0.05  # what good rotations leave in any direction; matches that promise more are no better
+_MIN_WEIGHT = 0.02  # keeps the program well conditioned; a camera may have nothing better
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DirectionOptions:
     """What a pair must show before its direction is believed."""
@@ -99,6 +103,22 @@ class PairDirections:
         largest = np.linalg.eigvalsh(np.nan_to_num(self.covariance))[:, -1]
         missing = np.isnan(self.covariance).any(axis=(1, 2))
         return np.where(missing, np.nan, np.degrees(np.sqrt(np.maximum(largest, 0.0))))
+
+    def weights(self) -> FloatArray:
+        """Return what each pair counts in the program, with median 1 over the usable ones, shape (k,).
+
+        w = ratio^2 / sqrt(1 + (sigma / 0.05 deg)^2), not below 0.02 of the median: ratio is the share of the
+        matches that are inliers, sigma the largest standard deviation of the direction. A pair whose
+        uncertainty is not known counts as a certain one. NaN where there is no direction.
+        """
+        usable = self.usable()
+        sigmas_deg = np.nan_to_num(self.sigma_deg()[usable])
+        ratios = self.num_inliers[usable] / np.maximum(self.num_matches[usable], 1)
+        relative = ratios**2 / np.sqrt(1.0 + (sigmas_deg / _FLOOR_DEG) ** 2)
+        weights = np.full(len(self.pairs), np.nan)
+        if len(usable):
+            weights[usable] = np.maximum(relative / np.median(relative), _MIN_WEIGHT)
+        return weights
 
 
 def concatenate(parts: Sequence[PairDirections]) -> PairDirections:
