@@ -56,7 +56,7 @@ def _judged(
     options: DirectionOptions,
 ) -> PairDirections:
     """Decide which estimates to believe, and give the others their reason."""
-    inliers, front, behind, voters, rivals, residual_px, parallax_rad = measures.T
+    inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
     covariance = _tangent_covariance(directions, moments)
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
     rules = (  # the first that fires names the reason
@@ -64,7 +64,7 @@ def _judged(
         (inliers < options.min_inlier_ratio * num_matches, DirectionStatus.LOW_INLIER_RATIO),
         (inliers < options.min_inliers, DirectionStatus.FEW_INLIERS),
         ((sigma_deg > options.max_sigma_deg) | (voters < options.min_inliers), DirectionStatus.NO_PARALLAX),
-        (rivals > options.max_rival_share * inliers, DirectionStatus.TWO_MOTIONS),
+        (rivals > options.max_rival_share * loyal, DirectionStatus.TWO_MOTIONS),
         (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
         (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
     )

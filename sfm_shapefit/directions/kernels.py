@@ -10,7 +10,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import kernel
 
 MIN_MATCHES = 5  # two fix a direction; below this a robust fit means nothing
-MEASURES = ("inliers", "front", "behind", "voters", "rivals", "residual_px", "parallax_rad")
+MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual_px", "parallax_rad")
 """What is counted and measured of a pair, in this order."""
 
 _MEDIAN_TO_SIGMA = 1.4826  # of |x| for a normal x
@@ -42,7 +42,7 @@ def estimate_pairs(
 ) -> None:
     """Fill the output rows of the given pairs; rows with fewer than MIN_MATCHES stay zero.
 
-    Outputs: directions (k, 3); measures (k, 7) in the order of MEASURES; moments (k, 2, 3, 3), the curvature
+    Outputs: directions (k, 3); measures (k, 8) in the order of MEASURES; moments (k, 2, 3, 3), the curvature
     of the cost and the variance of its slope, both in rad^-2.
     """
     for p in rows:
@@ -60,7 +60,7 @@ def estimate_pairs(
         sign = _count_sides(a, b, normals, d, inliers, vote_px, measures[p])
         _measure(a, b, normals, residuals, inliers, pixel_angles[p], measures[p])
         others = np.flatnonzero(np.abs(residuals) > 2.0 * max(threshold_px, 2.0 * noise_px))
-        measures[p, 4] = _count_rivals(a, b, normals, others, threshold_px, num_hypotheses, vote_px)
+        _count_rivals(a, b, normals, inliers, others, threshold_px, num_hypotheses, vote_px, measures[p])
         directions[p] = sign * d
 
 
@@ -371,7 +371,7 @@ def _measure(
         k = inliers[row]
         cosine = a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1] + a[k, 2] * b[k, 2]
         angles[row] = np.arctan2(_length(normals, k) * pixel_angle, cosine)
-    measures[5], measures[6] = np.median(np.abs(residuals[inliers])), np.median(angles)
+    measures[6], measures[7] = np.median(np.abs(residuals[inliers])), np.median(angles)
 
 
 @kernel(exact=True)
@@ -379,17 +379,20 @@ def _count_rivals(
     a: FloatArray,
     b: FloatArray,
     normals: FloatArray,
+    inliers: IntArray,
     others: IntArray,
     threshold_px: float,
     num_hypotheses: int,
     vote_px: float,
-) -> int:
-    """Return how many of the matches that contradict the direction agree on another one, in front of it."""
+    measures: FloatArray,
+) -> None:
+    """Fill how many of the others agree on a second direction, in front, and how many inliers do not."""
+    measures[5] = len(inliers)
     if len(others) < MIN_MATCHES:
-        return 0
+        return
     d = _best_hypothesis(a, b, normals, others, threshold_px, num_hypotheses)
     residuals = np.empty(len(a))
     _fill_residuals(a, b, normals, d, residuals)
     sides = np.zeros(4)
     _count_sides(a, b, normals, d, others[np.abs(residuals[others]) <= threshold_px], vote_px, sides)
-    return int(sides[1])
+    measures[4], measures[5] = sides[1], np.sum(np.abs(residuals[inliers]) > threshold_px)

@@ -37,7 +37,8 @@ class DirectionOptions:
     min_inlier_ratio: float = 0.5
     """Least share of inliers among the pair's matches; repeated facades show up below it."""
     max_rival_share: float = 0.5
-    """A second direction must not have this share of the inliers among the matches off the first."""
+    """Largest number of matches that speak for a second direction only, per match that speaks for the first
+    only; repeated facades and moving things show up above it."""
     min_sign_majority: float = 5.0
     """Points in front of both cameras must outnumber those behind both by this factor."""
     max_sigma_deg: float = 10.0
