@@ -7,9 +7,15 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import graph_peers, real, scale, solver
+from benchmarks import directions, graph_peers, real, scale, solver
 
-SUBCOMMANDS = {"real": real, "solver": solver, "scale": scale, "peers-graphs": graph_peers}
+SUBCOMMANDS = {
+    "real": real,
+    "directions": directions,
+    "solver": solver,
+    "scale": scale,
+    "peers-graphs": graph_peers,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
