@@ -19,7 +19,6 @@ from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.scenes import COURTYARD
 
-
 FOCAL_PX = 1000.0
 EXACT_DEG = 1e-9  # rays are exact to 1e-16 rad, and 5 degrees of parallax amplify that by a hundred or so
 
