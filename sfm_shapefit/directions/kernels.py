@@ -22,7 +22,7 @@ _RESCALINGS = 8  # steps that measure the noise anew; it is kept from then on, s
 _STEPS = 30
 _LONGEST_STEP_RAD = 0.3
 _LEVERAGE_QUANTILE = 0.9
-_LEVERAGE = 2.0  # a match has full weight up to this many times that quantile of the inliers' parallax
+_LEVERAGE = 2.0  # a match has full weight up to this many times that quantile of the inliers with parallax
 _MIN_VOTE_PX = 2.0  # a match votes on the sign only if its parallax is larger, and beyond the noise:
 _VOTE_SIGMAS = 6.0  # without any parallax the rays differ by more than 6 standard deviations once in 8000
 
@@ -194,20 +194,25 @@ def _fill_residuals(
 def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tuple[float, float]:
     """Return the noise and the leverage cap in px, from the matches whose residual is below the cutoff.
 
-    A fit of two unknowns leaves residuals that are too small by about (n - 2) / n in the median.
+    A fit of two unknowns leaves residuals that are too small by about (n - 2) / n in the median. The cap is
+    taken from matches with parallax: few near points among many far ones are not suspicious.
     """
     near = np.flatnonzero(np.abs(residuals) < cutoff_px)
     count = len(near)
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
-    sizes, parallaxes = np.empty(count), np.empty(count)
-    for row in range(count):
-        sizes[row] = abs(residuals[near[row]])
-        parallaxes[row] = _length(normals, near[row])
-    noise_px = max(_MEDIAN_TO_SIGMA * np.median(sizes) * count / (count - 2.0), _MIN_NOISE_PX)
-    rank = int(_LEVERAGE_QUANTILE * (count - 1))
-    large_px = np.partition(parallaxes, rank)[rank]
-    return noise_px, _LEVERAGE * max(large_px, _WIDTH * noise_px)
+    noise_px = _MEDIAN_TO_SIGMA * np.median(np.abs(residuals[near])) * count / (count - 2.0)
+    noise_px = max(noise_px, _MIN_NOISE_PX)
+    parallaxes, seen = np.empty(count), 0
+    for k in near:
+        length = _length(normals, k)
+        if length > _VOTE_SIGMAS * noise_px:
+            parallaxes[seen] = length
+            seen += 1
+    if seen < MIN_MATCHES:
+        return noise_px, np.inf
+    rank = int(_LEVERAGE_QUANTILE * (seen - 1))
+    return noise_px, _LEVERAGE * np.partition(parallaxes[:seen], rank)[rank]
 
 
 @kernel(exact=True)
