@@ -236,6 +236,28 @@ def test_no_parallax_is_recognised_whatever_the_noise(kind):
     assert set(estimate(pairs, options).status) == {DirectionStatus.NO_PARALLAX}
 
 
+def test_few_near_points_among_many_far_ones_give_the_direction_and_its_covariance():
+    pairs = []
+    for seed in range(200):
+        rng = np.random.default_rng(seed)
+        image = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), np.ones(500)])
+        points = image * np.where(np.arange(500) < 450, 1e5, rng.uniform(4, 8, 500))[:, None]
+        direction = normalized(rng.standard_normal(3) * [1.0, 0.6, 0.6])
+        rays = []
+        for seen in (points, points + 0.3 * direction):
+            pixels = FOCAL_PX * seen[:, :2] / seen[:, 2:] + 0.5 * rng.standard_normal((500, 2))
+            rays.append(normalized(np.column_stack([pixels / FOCAL_PX, np.ones(500)])))
+        pairs.append((rays[0], rays[1], direction))
+    found = estimate(pairs)
+    truth = np.array([pair[2] for pair in pairs])
+    assert set(found.status) == {DirectionStatus.USABLE}
+    tangential = np.einsum("kdi,kd->ki", tangent_bases(found.directions), truth)
+    squares = np.einsum("ki,kij,kj->k", tangential, np.linalg.inv(found.covariance), tangential)
+    assert 1.6 < squares.mean() < 2.4
+    # 50 points with 50 px of parallax know the direction to 0.25 degrees, whatever the far ones add in noise.
+    assert np.median(angle_between_deg(found.directions, truth)) < 0.3
+
+
 def test_five_pixels_of_parallax_are_enough():
     pairs = [make_pair(seed, noise_px=0.5, count=100, baseline=(0.03, 0.0, 0.0)) for seed in range(100)]
     assert estimate(pairs).counts()[DirectionStatus.USABLE] >= 95
