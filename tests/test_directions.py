@@ -236,26 +236,29 @@ def test_no_parallax_is_recognised_whatever_the_noise(kind):
     assert set(estimate(pairs, options).status) == {DirectionStatus.NO_PARALLAX}
 
 
-def test_few_near_points_among_many_far_ones_give_the_direction_and_its_covariance():
+@pytest.mark.parametrize(("near", "baseline", "error_deg"), [(50, 0.3, 0.3), (20, 0.12, 1.5)])
+def test_few_near_points_among_many_far_ones_give_the_direction_and_its_covariance(near, baseline, error_deg):
     pairs = []
     for seed in range(200):
         rng = np.random.default_rng(seed)
-        image = np.column_stack([rng.uniform(-0.45, 0.45, (500, 2)), np.ones(500)])
-        points = image * np.where(np.arange(500) < 450, 1e5, rng.uniform(4, 8, 500))[:, None]
+        count = 450 + near
+        image = np.column_stack([rng.uniform(-0.45, 0.45, (count, 2)), np.ones(count)])
+        points = image * np.where(np.arange(count) < 450, 1e5, rng.uniform(4, 8, count))[:, None]
         direction = normalized(rng.standard_normal(3) * [1.0, 0.6, 0.6])
         rays = []
-        for seen in (points, points + 0.3 * direction):
-            pixels = FOCAL_PX * seen[:, :2] / seen[:, 2:] + 0.5 * rng.standard_normal((500, 2))
-            rays.append(normalized(np.column_stack([pixels / FOCAL_PX, np.ones(500)])))
+        for seen in (points, points + baseline * direction):
+            pixels = FOCAL_PX * seen[:, :2] / seen[:, 2:] + 0.5 * rng.standard_normal((count, 2))
+            rays.append(normalized(np.column_stack([pixels / FOCAL_PX, np.ones(count)])))
         pairs.append((rays[0], rays[1], direction))
     found = estimate(pairs)
-    truth = np.array([pair[2] for pair in pairs])
-    assert set(found.status) == {DirectionStatus.USABLE}
-    tangential = np.einsum("kdi,kd->ki", tangent_bases(found.directions), truth)
-    squares = np.einsum("ki,kij,kj->k", tangential, np.linalg.inv(found.covariance), tangential)
-    assert 1.6 < squares.mean() < 2.4
-    # 50 points with 50 px of parallax know the direction to 0.25 degrees, whatever the far ones add in noise.
-    assert np.median(angle_between_deg(found.directions, truth)) < 0.3
+    usable = found.usable()
+    assert len(usable) >= 0.95 * len(pairs)
+    directions, truth = found.directions[usable], np.array([pair[2] for pair in pairs])[usable]
+    tangential = np.einsum("kdi,kd->ki", tangent_bases(directions), truth)
+    squares = np.einsum("ki,kij,kj->k", tangential, np.linalg.inv(found.covariance[usable]), tangential)
+    assert 1.5 < squares.mean() < 2.5  # 2 within 20 %, and 200 draws give the mean to 7 %
+    # A standard deviation of 0.2 and 1.1 degrees (parallax 50 and 20 px), whatever noise the far ones add.
+    assert np.median(angle_between_deg(directions, truth)) < error_deg
 
 
 def test_five_pixels_of_parallax_are_enough():
