@@ -204,8 +204,8 @@ def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tupl
     noise_px = _MEDIAN_TO_SIGMA * np.median(np.abs(residuals[near])) * count / (count - 2.0)
     noise_px = max(noise_px, _MIN_NOISE_PX)
     parallaxes, seen = np.empty(count), 0
-    for k in near:
-        length = _length(normals, k)
+    for row in range(count):
+        length = _length(normals, near[row])
         if length > _VOTE_SIGMAS * noise_px:
             parallaxes[seen] = length
             seen += 1
