@@ -30,9 +30,16 @@ the bias of noise in the normals: Kanatani, "Statistical Optimization for Geomet
 
 from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.relative_poses import from_relative_poses
-from sfm_shapefit.directions.values import DirectionOptions, DirectionStatus, PairDirections, concatenate
+from sfm_shapefit.directions.values import (
+    CONTRADICTIONS,
+    DirectionOptions,
+    DirectionStatus,
+    PairDirections,
+    concatenate,
+)
 
 __all__ = [
+    "CONTRADICTIONS",
     "DirectionOptions",
     "DirectionStatus",
     "PairDirections",

@@ -24,6 +24,10 @@ class DirectionStatus(enum.Enum):
     ROTATION_MISMATCH = "the relative rotation contradicts the given rotations"
 
 
+CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MISMATCH)
+"""The reasons that speak against the given rotations."""
+
+
 _FLOOR_DEG = 0.05  # what good rotations leave in any direction; matches that promise more are no better
 _MIN_WEIGHT = 0.02  # keeps the program well conditioned; a camera may have nothing better
 
