@@ -7,15 +7,17 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, graph_peers, real, scale, solver, trust
+from benchmarks import coherent, directions, graph_peers, real, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
     "solver": solver,
     "scale": scale,
     "peers-graphs": graph_peers,
+    "directions": directions,
     "trust": trust,
     "coherent": coherent,
+}
 }
 
 

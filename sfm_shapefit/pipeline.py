@@ -236,7 +236,11 @@ def _view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
             f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
         )
     return ViewGraph(
-        model.num_images, directions.pairs[usable], directions.directions[usable], names=model.names
+        model.num_images,
+        directions.pairs[usable],
+        directions.directions[usable],
+        directions.weights()[usable],
+        names=model.names,
     )
 
 

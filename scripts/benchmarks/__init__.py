@@ -5,6 +5,7 @@
     process.py   fresh processes with a number of threads and a time limit; memory
     graphs.py    bare graphs by family and size, and the paper's error
     real.py      subcommand `real`: real scenes against their ground truth
+    directions.py    subcommand `directions`: speed and calibration of directions from matches
     glomap.py    GLOMAP's global positioning, run side by side
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy

@@ -1,0 +1,350 @@
+"""Directions from matches: pairs per second, memory over many batches, and whether the covariance is right.
+
+The matches are synthetic: two cameras of 1000 px focal length and 1000 x 750 px see points 4 to 8 units
+away, with Gaussian noise in each pixel coordinate; wrong matches end anywhere in the second image. The
+baseline is given as a share of 6 units, the typical depth.
+
+A normalised error is r^T Sigma^-1 r, r the error of the direction in its tangent plane and Sigma its
+covariance; its mean is 2 where the covariance is right.
+"""
+
+import argparse
+import math
+import multiprocessing
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.metrics import Check, Quantity, number, numbers, verdict
+from benchmarks.process import call, resident_memory_mb, thread_environment
+from benchmarks.record import environment, legend, table, write_section
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+
+HELP = "Directions from matches: speed, memory, and whether their covariance is right."
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("numpy", "numba")
+FOCAL_PX, WIDTH_PX, HEIGHT_PX, DEPTH = 1000.0, 1000.0, 750.0, 6.0
+MATCHES = 100
+BATCH = 10_000
+MIN_PAIRS_PER_S = 3000.0
+EXPECTED, SLACK = 2.0, 0.2
+MAX_GROWTH_MB = 20.0
+NO_PARALLAX_LIMIT = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """Pairs of one kind."""
+
+    name: str
+    matches: int = MATCHES
+    noise_px: float = 0.5
+    wrong: float = 0.0
+    """Share of the matches that end anywhere."""
+    baseline: float = 0.15
+    planar: bool = False
+    in_goal: bool = True
+    """Whether the goal speaks of it: at most 40 % wrong matches."""
+
+
+CASES = (
+    Case(name="general depth"),
+    *(Case(name=f"{n} matches", matches=n) for n in (15, 30, 500)),
+    *(Case(name=f"noise {noise} px", noise_px=noise) for noise in (0.3, 1.0, 2.0)),
+    Case(name="planar", planar=True),
+    Case(name="planar, 40 % wrong", planar=True, wrong=0.4),
+    *(Case(name=f"baseline {share:.0%} of the depth", baseline=share) for share in (0.05, 0.02, 0.01)),
+    *(Case(name=f"{wrong:.0%} wrong", wrong=wrong) for wrong in (0.2, 0.4)),
+    Case(name="15 matches, noise 2 px", matches=15, noise_px=2.0),
+    Case(name="30 matches, 40 % wrong", matches=30, wrong=0.4),
+    Case(name="60 % wrong", wrong=0.6, in_goal=False),
+    Case(name="60 % wrong, 300 matches", wrong=0.6, matches=300, in_goal=False),
+)
+STILL = (
+    Case(name="pure rotation", baseline=0.0),
+    Case(name="pure rotation, noise 2 px", baseline=0.0, noise_px=2.0),
+    Case(name="pure rotation, 30 % wrong", baseline=0.0, wrong=0.3),
+    Case(name="pure rotation, 500 matches, 30 % wrong", baseline=0.0, wrong=0.3, matches=500),
+    Case(name="far points only (0.2 px of parallax)", baseline=2e-4),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """What one case gave."""
+
+    case: Case
+    usable: float
+    """Share of the pairs that have a direction."""
+    no_parallax: float
+    """Share of the pairs that are said to have no parallax."""
+    mean: float
+    """Mean normalised error."""
+    median_deg: float
+    p95_deg: float
+    """95th percentile of the error."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Speed:
+    """How fast so many pairs went in one setting."""
+
+    label: str
+    pairs: int
+    seconds: float
+    cpu_s: float
+    growth_mb: float
+    """Resident memory at the end minus that after the first batch, of the worst process."""
+
+    @property
+    def pairs_per_s(self) -> float:
+        """Pairs per second of wall-clock time."""
+        return self.pairs / self.seconds
+
+
+QUANTITIES = (
+    Quantity(
+        name="pairs/s", unit="1/s", better="higher", rel_tol=0.25, meaning="wall-clock, without start-up"
+    ),
+    Quantity(
+        name="growth",
+        unit="MB",
+        better="lower",
+        rel_tol=1.0,
+        meaning="resident memory at the end minus that after the first batch, of the worst process",
+    ),
+    Quantity(
+        name="normalised error",
+        unit="1",
+        better="neither",
+        rel_tol=0.05,
+        meaning="mean of r^T Sigma^-1 r over the usable pairs; 2 where the covariance is right",
+    ),
+    Quantity(
+        name="error, median / 95 %",
+        unit="deg",
+        better="lower",
+        rel_tol=0.05,
+        meaning="of the usable directions",
+    ),
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `directions`."""
+    parser.add_argument(
+        "--pairs", type=_positive, default=1_000_000, help="pairs in batches (default 1000000)"
+    )
+    parser.add_argument(
+        "--draws", type=_positive, default=2000, help="pairs per calibration case (default 2000)"
+    )
+    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+
+
+def _positive(text: str) -> int:
+    """Parse a number that is at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
+    return int(text)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the section and write it; a missed limit is no failure."""
+    command = f"python scripts/benchmark.py directions --pairs {args.pairs} --draws {args.draws}"
+    about = environment(PACKAGES, command)
+    call(measure_batches, BATCH, 1)  # compiles where nothing is compiled yet
+    tenth = max(args.pairs // 10, BATCH)
+    speeds = [call(measure_batches, tenth, threads, environment=thread_environment(1)) for threads in (1, 2)]
+    speeds.append(measure_processes(args.pairs))
+    calibrations = [measure_case(case, args.draws) for case in CASES]
+    still = [measure_case(case, args.draws) for case in STILL]
+    body = section(speeds, calibrations, still, about)
+    print(body)
+    write_section(args.out, "directions", body)
+    return 0
+
+
+# --- measuring -------------------------------------------------------------------------------------
+
+
+def make_pairs(case: Case, count: int, seed: int) -> "tuple[FloatArray, FloatArray, FloatArray]":
+    """Return rays_i and rays_j (count, matches, 3) and the true directions (count, 3) of random pairs."""
+    import numpy as np
+
+    from sfm_shapefit.geometry import normalized
+
+    rng = np.random.default_rng(seed)
+    shape = (count, case.matches)
+    half = np.array([WIDTH_PX, HEIGHT_PX]) / 2.0
+    image = rng.uniform(-half, half, (*shape, 2)) / FOCAL_PX
+    depths = rng.uniform(4.0, 8.0, shape)
+    if case.planar:
+        tilts = rng.uniform(-0.5, 0.5, (count, 1, 2))
+        depths = DEPTH / (1.0 + np.sum(tilts * image, axis=2))
+    points = np.concatenate([image, np.ones((*shape, 1))], axis=2) * depths[:, :, None]
+    directions = normalized(rng.standard_normal((count, 3)) * [1.0, 0.6, 0.6])
+    seen_from_j = points + (case.baseline * DEPTH * directions)[:, None, :]
+
+    def pixels(x: "FloatArray") -> "FloatArray":
+        noise = case.noise_px * rng.standard_normal((*shape, 2))
+        return np.asarray(FOCAL_PX * x[:, :, :2] / x[:, :, 2:] + noise)
+
+    pixels_i, pixels_j = pixels(points), pixels(seen_from_j)
+    is_wrong = rng.random(shape) < case.wrong
+    pixels_j[is_wrong] = rng.uniform(-half, half, (int(is_wrong.sum()), 2))
+    ones = np.ones((*shape, 1))
+    rays_i = normalized(np.concatenate([pixels_i / FOCAL_PX, ones], axis=2))
+    return rays_i, normalized(np.concatenate([pixels_j / FOCAL_PX, ones], axis=2)), directions
+
+
+def measure_case(case: Case, count: int) -> Calibration:
+    """Estimate `count` pairs of one kind and compare errors with covariances."""
+    import numpy as np
+
+    from sfm_shapefit.directions import DirectionOptions, DirectionStatus, estimate_directions
+    from sfm_shapefit.geometry import angle_between_deg, tangent_bases
+
+    rays_i, rays_j, truth = make_pairs(case, count, seed=1)
+    # Wrong matches are the case, not a reason for refusal; lists of 15 may lose some to the threshold.
+    options = DirectionOptions(min_inlier_ratio=0.1, min_inliers=8)
+    found = estimate_directions(
+        np.column_stack([np.arange(count), np.arange(count) + 1]),
+        np.arange(count + 1) * case.matches,
+        rays_i.reshape(-1, 3),
+        rays_j.reshape(-1, 3),
+        np.full(count, 1.0 / FOCAL_PX),
+        options,
+    )
+    usable = found.usable()
+    missing = found.counts().get(DirectionStatus.NO_PARALLAX, 0) / count
+    if len(usable) == 0:
+        nothing = math.nan
+        return Calibration(
+            case=case, usable=0.0, no_parallax=missing, mean=nothing, median_deg=nothing, p95_deg=nothing
+        )
+    d, truth = found.directions[usable], truth[usable]
+    error = np.einsum("kdi,kd->ki", tangent_bases(d), truth)
+    squares = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance[usable]), error)
+    angles_deg = angle_between_deg(d, truth)
+    return Calibration(
+        case=case,
+        usable=len(usable) / count,
+        no_parallax=missing,
+        mean=float(squares.mean()),
+        median_deg=float(np.median(angles_deg)),
+        p95_deg=float(np.quantile(angles_deg, 0.95)),
+    )
+
+
+def measure_batches(pairs: int, threads: int) -> Speed:
+    """Estimate one batch, a tenth of whose matches is wrong, again and again; drawing it is not timed."""
+    import numpy as np
+
+    from sfm_shapefit.directions import estimate_directions
+
+    rays_i, rays_j, _ = make_pairs(Case(name="speed", wrong=0.1), BATCH, seed=2)
+    rays_i, rays_j = rays_i.reshape(-1, 3), rays_j.reshape(-1, 3)
+    ids = np.column_stack([np.arange(BATCH), np.arange(BATCH) + 1])
+    offsets, angles = np.arange(BATCH + 1) * MATCHES, np.full(BATCH, 1.0 / FOCAL_PX)
+
+    def estimate() -> None:
+        estimate_directions(ids, offsets, rays_i, rays_j, angles, threads=threads)
+
+    estimate()
+    before_mb, start, cpu = resident_memory_mb(), time.perf_counter(), time.process_time()
+    batches = math.ceil(pairs / BATCH)
+    for _ in range(batches):
+        estimate()
+    return Speed(
+        label=f"{threads} thread{'s' * (threads > 1)}",
+        pairs=batches * BATCH,
+        seconds=time.perf_counter() - start,
+        cpu_s=time.process_time() - cpu,
+        growth_mb=resident_memory_mb() - before_mb,
+    )
+
+
+def measure_processes(pairs: int) -> Speed:
+    """Estimate so many pairs in two processes of one thread each; the slower one counts."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(max_workers=2, mp_context=context) as pool:
+        parts = list(pool.map(measure_batches, [pairs // 2] * 2, [1] * 2))
+    return Speed(
+        label="2 processes",
+        pairs=sum(part.pairs for part in parts),
+        seconds=max(part.seconds for part in parts),
+        cpu_s=sum(part.cpu_s for part in parts),
+        growth_mb=max(part.growth_mb for part in parts),
+    )
+
+
+# --- the section -----------------------------------------------------------------------------------
+
+
+def calibration_checks(one: Calibration) -> list[Check]:
+    """Return the two checks of a mean normalised error: within 20 % of 2 from either side."""
+    if not one.case.in_goal:
+        return []
+    low, high = EXPECTED * (1.0 - SLACK), EXPECTED * (1.0 + SLACK)
+    return [
+        Check(name="normalised error", value=one.mean, limit=high),
+        Check(name="normalised error", value=one.mean, limit=low, better="higher"),
+    ]
+
+
+def section(
+    speeds: Sequence[Speed], calibrations: Sequence[Calibration], still: Sequence[Calibration], about: str
+) -> str:
+    """Return the section of the file of results."""
+    speed_rows = []
+    for speed in speeds:
+        checks = [Check(name="growth", value=speed.growth_mb, limit=MAX_GROWTH_MB)]
+        if speed.label == "2 processes":
+            checks.append(
+                Check(name="pairs/s", value=speed.pairs_per_s, limit=MIN_PAIRS_PER_S, better="higher")
+            )
+        cells = [speed.label, f"{speed.pairs}", number(speed.pairs_per_s), number(speed.pairs / speed.cpu_s)]
+        speed_rows.append([*cells, number(speed.growth_mb), verdict(checks)])
+    calibration_rows = [
+        [
+            one.case.name,
+            f"{one.usable:.1%}",
+            number(one.mean),
+            numbers([one.median_deg, one.p95_deg]),
+            verdict(calibration_checks(one)),
+        ]
+        for one in calibrations
+    ]
+    still_rows = [
+        [
+            one.case.name,
+            f"{one.no_parallax:.2%}",
+            f"{one.usable:.2%}",
+            verdict([Check(name="usable", value=one.usable, limit=NO_PARALLAX_LIMIT)]),
+        ]
+        for one in still
+    ]
+    return "\n\n".join(
+        [
+            "## Directions",
+            about,
+            f"### Speed, {MATCHES} matches per pair, batches of {BATCH} pairs",
+            table(
+                ["setting", "pairs", "pairs/s", "pairs per CPU second", "growth, MB", "verdict"], speed_rows
+            ),
+            f"### Calibration ({MATCHES} matches, noise 0.5 px, baseline 15 % unless told)",
+            table(
+                ["case", "usable", "normalised error", "error, median / 95 %, deg", "verdict"],
+                calibration_rows,
+            ),
+            "### No parallax",
+            table(["case", "said to have none", "usable", "verdict"], still_rows),
+            "### What the columns mean",
+            legend(QUANTITIES),
+        ]
+    )

@@ -1,0 +1,102 @@
+"""Directions of many pairs from their matches: shares the pairs among threads, then judges the estimates."""
+
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.directions.kernels import MEASURES, MIN_MATCHES, estimate_pairs
+from sfm_shapefit.directions.values import DirectionOptions, DirectionStatus, PairDirections
+from sfm_shapefit.geometry import tangent_bases
+
+
+def estimate_directions(
+    pairs: IntArray,
+    offsets: IntArray,
+    rays_i: FloatArray,
+    rays_j: FloatArray,
+    pixel_angles: FloatArray,
+    options: DirectionOptions | None = None,
+    threads: int = 1,
+) -> PairDirections:
+    """Return one direction per pair from its matches and the known rotations.
+
+    Each pair is estimated on its own and with the same draws, so neither batches nor threads change
+    a bit of the answer.
+
+    Args:
+        pairs: (k, 2) camera indices.
+        offsets: (k + 1,) rows of the matches of pair p are offsets[p] to offsets[p + 1].
+        rays_i, rays_j: (M, 3) unit rays of the matched points in world axes.
+        pixel_angles: (k,) angle of one pixel in radians, 1 / focal length in px.
+        options: what to believe; defaults if None.
+        threads: number of threads to share the pairs among.
+    """
+    options = options or DirectionOptions()
+    k = len(pairs)
+    directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
+    a, b = np.ascontiguousarray(rays_i), np.ascontiguousarray(rays_j)
+    settings = (options.inlier_threshold_px, options.num_hypotheses)
+
+    def run(rows: IntArray) -> None:
+        estimate_pairs(rows, offsets, a, b, pixel_angles, *settings, directions, measures, moments)
+
+    shares = np.array_split(np.arange(k, dtype=np.int64), max(1, threads))
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        list(pool.map(run, shares))
+    return _judged(pairs, np.diff(offsets), directions, measures, moments, options)
+
+
+def _judged(
+    pairs: IntArray,
+    num_matches: IntArray,
+    directions: FloatArray,
+    measures: FloatArray,
+    moments: FloatArray,
+    options: DirectionOptions,
+) -> PairDirections:
+    """Decide which estimates to believe, and give the others their reason."""
+    inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
+    covariance = _tangent_covariance(directions, moments)
+    sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
+    rules = (  # the first that fires names the reason
+        (num_matches < max(options.min_inliers, MIN_MATCHES), DirectionStatus.TOO_FEW_MATCHES),
+        (inliers < options.min_inlier_ratio * num_matches, DirectionStatus.LOW_INLIER_RATIO),
+        (inliers < options.min_inliers, DirectionStatus.FEW_INLIERS),
+        ((sigma_deg > options.max_sigma_deg) | (voters < options.min_inliers), DirectionStatus.NO_PARALLAX),
+        (rivals > options.max_rival_share * loyal, DirectionStatus.TWO_MOTIONS),
+        (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
+        (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
+    )
+    status = np.full(len(pairs), DirectionStatus.USABLE, dtype=object)
+    for fired, reason in reversed(rules):
+        status[fired] = reason
+    usable: BoolArray = np.array([value is DirectionStatus.USABLE for value in status], dtype=np.bool_)
+    return PairDirections(
+        pairs=pairs,
+        directions=np.where(usable[:, None], directions, np.nan),
+        status=list(status),
+        num_matches=np.asarray(num_matches, dtype=np.int64),
+        num_inliers=inliers.astype(np.int64),
+        num_rivals=rivals.astype(np.int64),
+        cheirality_fraction=front / np.maximum(voters, 1.0),
+        median_residual_px=residual_px,
+        parallax_deg=np.degrees(parallax_rad),
+        covariance=np.where(usable[:, None, None], covariance, np.nan),
+    )
+
+
+def _tangent_covariance(directions: FloatArray, moments: FloatArray) -> FloatArray:
+    """Return A^-1 B A^-1 in each direction's tangent basis, shape (k, 2, 2), from A and B (k, 2, 3, 3).
+
+    Where A has no information, and where the variance exceeds (1 rad)^2, it is that, which means: unknown.
+    """
+    is_estimated = np.linalg.norm(directions, axis=1, keepdims=True) > 0.0
+    bases = tangent_bases(np.where(is_estimated, directions, [1.0, 0.0, 0.0]))
+    curvature, slope_variance = np.einsum("kab,ksac,kcd->skbd", bases, moments, bases)
+    values, vectors = np.linalg.eigh(curvature)
+    inverse = (vectors / np.maximum(values, 1.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
+    variances, axes = np.linalg.eigh(inverse @ slope_variance @ inverse)
+    variances[values[:, 0] <= 1.0, 1] = 1.0
+    covariance: FloatArray = (axes * np.minimum(variances, 1.0)[:, None, :]) @ axes.transpose(0, 2, 1)
+    return covariance
