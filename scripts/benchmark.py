@@ -18,7 +18,6 @@ SUBCOMMANDS = {
     "trust": trust,
     "coherent": coherent,
 }
-}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
