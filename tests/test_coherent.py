@@ -79,11 +79,12 @@ def test_wrong_pairs_that_agree_are_found_and_no_alarm_is_raised(seed):
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("q", [0.45, 0.5])
-def test_at_the_limit_the_answer_is_wrong_and_the_report_says_not_to_trust_it(seed, q):
+def test_at_the_limit_the_optimum_is_wrong_and_an_answer_that_is_wrong_is_warned_of(seed, q):
     problem = random_graph_problem(60, sigma=0.01, q=q, seed=seed, corruption="self-consistent")
     placement = placed(problem)
     assert relative_error(placement.solve.locations, problem.locations) > 0.1  # without corruption 0.005
-    assert any(quality_warnings(placement))
+    if relative_error(placement.locations, problem.locations) > 0.1:  # the refinement may still find it
+        assert any(quality_warnings(placement))
 
 
 def test_a_method_breaks_where_it_stays_broken():

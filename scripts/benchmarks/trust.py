@@ -2,8 +2,6 @@
 
 Calibration: scenes of known truth, directions with known or unknown covariances, and photographed scenes
 through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are.
-They are those of the refined system, so the limits hold for locations refined by robust least squares; the
-program's own optimum is less exact.
 
 Ranking: graphs in which some cameras are worse than others, for one of three reasons. A camera is bad if its
 error is more than three times the median; the area under the curve (AUC) is the probability that a bad camera
@@ -30,11 +28,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
     from sfm_shapefit.colmap.model import PosedModel
     from sfm_shapefit.placement import Placement
-    from sfm_shapefit.robust.trust import Evidence
     from sfm_shapefit.synthetic.options import Shape
-    from sfm_shapefit.viewgraph import ViewGraph
-
-    Ratios = tuple[FloatArray, FloatArray]
 
 HELP = "Standard deviations against errors, trust against errors, wrong rotations recognised."
 ROOT = Path(__file__).parents[2]
@@ -43,7 +37,6 @@ SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle
 FURTHER_SETS = ("liberty", "liberty-calibrated")
 COVERAGE = (0.546, 0.816)  # 68 % within 20 %
 LEAST_AUC = 0.9
-REFINING_STEPS = 20
 BAD = 3.0  # times the median error
 WRONG_DEG = 5.0
 SHAPES: "tuple[Shape, ...]" = ("ring", "facade", "cloud", "courtyard")
@@ -128,21 +121,18 @@ def calibration_table(seeds: int) -> str:
         print(f"calibrating scene {shape}", file=sys.stderr, flush=True)
         ratios = [_scene_ratios(shape, seed) for seed in range(seeds)]
         rows.append(_calibration_row(f"scene {shape}, 25 images, 0.5 px", ratios))
-    header = ["problem", "covered, placed", "rms", "covered, refined", "rms", "verdict on refined"]
+    header = ["problem", "covered", "rms", "verdict"]
     return table(header, rows)
 
 
-def _calibration_row(name: str, found: "list[Ratios]") -> list[str]:
-    placed, refined = (np.concatenate(part) for part in zip(*found, strict=True))
-    covered = float(np.mean(np.abs(refined) < 1.0))
+def _calibration_row(name: str, found: "list[FloatArray]") -> list[str]:
+    ratios = np.concatenate(found)
+    covered = float(np.mean(np.abs(ratios) < 1.0))
     checks = [
         Check(name="covered", value=covered, limit=COVERAGE[0], better="higher"),
         Check(name="covered", value=covered, limit=COVERAGE[1]),
     ]
-    cells = []
-    for ratios in (placed, refined):
-        cells += [number(float(np.mean(np.abs(ratios) < 1.0))), number(float(np.sqrt(np.mean(ratios**2))))]
-    return [name, *cells, verdict(checks)]
+    return [name, number(covered), number(float(np.sqrt(np.mean(ratios**2)))), verdict(checks)]
 
 
 def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray") -> "FloatArray":
@@ -154,81 +144,32 @@ def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray")
     return ratios
 
 
-def _graph_ratios(graph: Graph) -> "Ratios":
+def _graph_ratios(graph: Graph) -> "FloatArray":
     from sfm_shapefit.placement import place
     from sfm_shapefit.viewgraph import ViewGraph
 
     given = ViewGraph(len(graph.locations), graph.edges, graph.directions)
-    placement = place(given, covariance=graph.covariances)
-    return _both_ratios(placement, graph.covariances, None, graph.locations)
+    return _placement_ratios(place(given, covariance=graph.covariances), graph.locations)
 
 
-def _both_ratios(
-    placement: "Placement", covariances: "FloatArray", evidence: "Evidence | None", truth: "FloatArray"
-) -> "Ratios":
-    """Return errors over standard deviations, as placed and at the robust least squares locations."""
-    from sfm_shapefit.robust.verdicts import assess
-
-    cameras, edges = placement.cameras, placement.edges
-    piece, _ = placement.graph.restricted_to(edges)
-    heard = evidence and evidence.restricted_to(edges, cameras, placement.graph.num_cameras)
-    placed = placement.locations
-    locations = refined(piece, placed, covariances[edges], placement.assessment.inliers)
-    judged = assess(piece, locations, covariances[edges], heard)
-    return (
-        error_ratios(placed, truth[cameras], placement.assessment.sigmas),
-        error_ratios(locations, truth[cameras], judged.sigmas),
-    )
+def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArray":
+    cameras = placement.cameras
+    sigmas = placement.assessment.sigmas[: len(cameras)]
+    return error_ratios(placement.locations, truth[cameras], sigmas)
 
 
-def refined(
-    graph: "ViewGraph", locations: "FloatArray", covariances: "FloatArray", used: "BoolArray"
-) -> "FloatArray":
-    """Return the least squares locations of the directions in `used`, with Geman-McClure weights."""
-    from scipy.sparse import eye_array
-    from scipy.sparse.linalg import spsolve
-
-    from sfm_shapefit.geometry import normalized, tangent_bases
-    from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
-    from sfm_shapefit.solver.program import adjoint, differences
-
-    t, edges, v = locations, graph.edges[used], graph.directions[used]
-    bases, pattern = tangent_bases(v), laplacian_pattern(graph.num_cameras, edges)
-    information = bases @ np.linalg.inv(covariances[used]) @ bases.transpose(0, 2, 1)
-    for _ in range(REFINING_STEPS):
-        baselines = differences(t, edges)
-        lengths, u = np.linalg.norm(baselines, axis=1), normalized(baselines)
-        residuals = v - np.sum(u * v, axis=1, keepdims=True) * u
-        across = np.eye(3) - u[:, :, None] * u[:, None, :]
-        chi2 = np.einsum("ea,eab,eb->e", residuals, information, residuals)
-        weights = (1.0 + chi2 / (9.0 * np.median(chi2))) ** -2.0
-        local = weights[:, None, None] * (across @ information @ across)
-        hessian = assemble(pattern, local / lengths[:, None, None] ** 2)
-        force = adjoint(np.einsum("eab,eb->ea", local, residuals) / lengths[:, None], edges, len(t))
-        ridge = 1e-9 * hessian.diagonal().max() * eye_array(t.size)
-        t = t + spsolve((hessian + ridge).tocsc(), force.ravel()).reshape(t.shape)
-        t = (t - t.mean(axis=0)) / np.linalg.norm(t - t.mean(axis=0))
-    return t
-
-
-def _scene_ratios(shape: "Shape", seed: int) -> "Ratios":
+def _scene_ratios(shape: "Shape", seed: int) -> "FloatArray":
     import sfm_shapefit
-    from sfm_shapefit.colmap.database import open_database
     from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline import evidence_of, shared_errors
     from sfm_shapefit.synthetic import SceneOptions, make_scene
 
     scene = make_scene(SceneOptions(shape=shape, num_images=25, num_points=1000, seed=seed))
-    options = LocateOptions(min_trust=0.0)
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / "scene"
         write_workspace(scene, workspace)
-        found = sfm_shapefit.locate(workspace / "sparse" / "0", options=options)
-        with open_database(workspace / "database.db", found.model) as matches:
-            errors = shared_errors(found.model, matches, found.directions, "matches", options)
-    known = found.directions.covariance[found.directions.usable()]
-    return _both_ratios(found.placement, known, evidence_of(found.directions, errors), scene.centers)
+        found = sfm_shapefit.locate(workspace / "sparse" / "0", options=LocateOptions(min_trust=0.0))
+    return _placement_ratios(found.placement, scene.centers)
 
 
 # --- ranking ---------------------------------------------------------------------------------------
