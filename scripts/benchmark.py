@@ -7,13 +7,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, graph_peers, real, scale, solver, trust
+from benchmarks import coherent, directions, graph_peers, real, real_peers, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
     "solver": solver,
     "scale": scale,
     "peers-graphs": graph_peers,
+    "peers-real": real_peers,
     "directions": directions,
     "trust": trust,
     "coherent": coherent,

@@ -233,7 +233,7 @@ def _pytheia_nonlinear(sfm: Any, pairs: Any, orientations: Any) -> Any:
     return estimator.EstimatePositions(pairs, orientations)
 
 
-def _prepare_gtsam(robust: bool) -> Callable[["ViewGraph"], Solver]:
+def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph"], Solver]:
     def prepare(graph: "ViewGraph") -> Solver:
         import gtsam
 
@@ -245,7 +245,7 @@ def _prepare_gtsam(robust: bool) -> Callable[["ViewGraph"], Solver]:
             gtsam.BinaryMeasurementUnit3(i, j, gtsam.Unit3(-v), noise)  # gtsam's points from i to j
             for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True)
         ]
-        recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), False)
+        recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), bilinear)
 
         def run_it() -> tuple["FloatArray", str]:
             with _silence():
@@ -274,6 +274,9 @@ CONTENDERS = (
     Contender(name="pytheia Nonlinear", prepare=_prepare_pytheia(_pytheia_nonlinear), package="pytheia"),
     Contender(name="gtsam TranslationRecovery", prepare=_prepare_gtsam(robust=False), package="gtsam"),
     Contender(name="gtsam with Huber", prepare=_prepare_gtsam(robust=True), package="gtsam"),
+    Contender(
+        name="gtsam bilinear with Huber", prepare=_prepare_gtsam(robust=True, bilinear=True), package="gtsam"
+    ),
 )
 
 
