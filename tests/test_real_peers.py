@@ -7,9 +7,9 @@ import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "scripts"))
 
-from benchmarks import real_peers  # noqa: E402
-from benchmarks.real import Errors  # noqa: E402
-from benchmarks.real_peers import BY_DEFAULT, SAME_DIRECTIONS, Row, checks, section  # noqa: E402
+from benchmarks import real_peers
+from benchmarks.real import Errors
+from benchmarks.real_peers import BY_DEFAULT, SAME_DIRECTIONS, Row, checks, section
 
 SHARED = Path(__file__).parents[1].parent / "shared" / "data"
 
