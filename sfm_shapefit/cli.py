@@ -277,6 +277,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", _shortened(left_out))] if left_out else []),
+        *_pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", _objective_line(found.solve)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
@@ -288,6 +289,17 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
     ]
+
+
+def _pieces_line(facts: dict[str, Any]) -> Rows:
+    """Return a row that says where the further pieces stand, if there are any."""
+    lines = [
+        f"{piece['folder']}: {piece['num_placed']} of {piece['num_cameras']} cameras, hinged at "
+        f"{', '.join(piece['hinges']) or 'nothing'}, with a scale of its own"
+        for piece in facts["pieces"][1:]
+        if piece["folder"]
+    ]
+    return [("further pieces", _shortened(lines))] if lines else []
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:
@@ -352,7 +364,7 @@ def solve_command(
 
 def _solve_table(found: "GraphResult", out: Path) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.results import quality_warnings
+    from sfm_shapefit.results import graph_summary, quality_warnings
 
     placement = found.placement
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -360,6 +372,7 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
         ("dimension", str(placement.graph.dimension)),
         ("placed", f"{len(placement.cameras)} of {placement.graph.num_cameras} nodes"),
         *([("not placed", _shortened(left_out))] if left_out else []),
+        *_pieces_line(graph_summary(found)),
         (
             "pairs",
             f"{placement.num_pairs}, of which {len(placement.rejected_pairs)} contradict the solution",

@@ -33,8 +33,15 @@ from sfm_shapefit.evaluation import Evaluation, evaluate_poses
 from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
-from sfm_shapefit.placement import Placement, place
-from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings, trust_warnings
+from sfm_shapefit.placement import Placement, place, place_further
+from sfm_shapefit.results import (
+    FurtherPiece,
+    GraphResult,
+    Inputs,
+    LocateResult,
+    quality_warnings,
+    trust_warnings,
+)
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
@@ -112,9 +119,11 @@ def locate(
             kept = _trusted(placement, options.min_trust)
             locations = placement.locations[kept]
             gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
+        with clock("further pieces"):
+            further = _further_pieces(model, matches, placement, joint, evidence, options)
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
-            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock)
+            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock.advance)
             adjusted = None
             if not options.bundle_adjust:  # which triangulates at the seed's poses itself
                 seeded = triangulate(seed, tracks, options.for_structure())
@@ -138,6 +147,7 @@ def locate(
         timings_s=clock.seconds,
         warnings=tuple(_warnings(matches, placement, kept, gauge, seeded.num_points3D())),
         turned_deg=turned_deg,
+        further=further,
     )
 
 
@@ -386,7 +396,7 @@ def _seed_and_tracks(
     matches: MatchDatabase | None,
     placement: Placement,
     located: tuple[BoolArray, FloatArray],
-    clock: _Clock,
+    advance: Callable[[int, int], None] | None = None,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
     """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
 
@@ -400,8 +410,39 @@ def _seed_and_tracks(
     if matches is None:
         return build_seed(model, placed, all_centers), model.reconstruction
     seed = build_seed(model, placed, all_centers, matches.keypoints)
-    batches = _without_pairs(matches.iter_matches(1), placement.rejected_pairs)
-    return seed, correspondence_graph(seed, model.image_ids, _counted(batches, matches.num_pairs, clock))
+    among = (
+        placement.cameras if placement.piece else None
+    )  # a further piece is small: read no more than it needs
+    batches = _without_pairs(matches.iter_matches(1, among=among), placement.rejected_pairs)
+    if advance is not None:
+        batches = _counted(batches, matches.num_pairs, advance)
+    return seed, correspondence_graph(seed, model.image_ids, batches)
+
+
+def _further_pieces(
+    model: PosedModel,
+    matches: MatchDatabase | None,
+    placement: Placement,
+    joint: JointGraph,
+    evidence: Evidence,
+    options: LocateOptions,
+) -> tuple[FurtherPiece, ...]:
+    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own."""
+    found = []
+    for placed in place_further(placement, options.for_placement(), joint.covariance, evidence):
+        kept = _trusted(placed, options.min_trust)
+        locations = placed.locations[kept]
+        gauge = choose_gauge(locations, np.zeros_like(locations), "unit")
+        located = kept, gauge.similarity.apply(locations)
+        seed, tracks = _seed_and_tracks(model, matches, placed, located)
+        if options.bundle_adjust:
+            seeded = bundle_adjust(seed, tracks, options.for_structure()).reconstruction
+        else:
+            seeded = triangulate(seed, tracks, options.for_structure())
+        if matches is not None:
+            seeded = colored(seeded, model.reconstruction)
+        found.append(FurtherPiece(placement=placed, kept=kept, gauge=gauge, reconstruction=seeded))
+    return tuple(found)
 
 
 def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
@@ -422,13 +463,15 @@ def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterato
         )
 
 
-def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterator[MatchBatch]:
+def _counted(
+    batches: Iterator[MatchBatch], total: int, advance: Callable[[int, int], None]
+) -> Iterator[MatchBatch]:
     """Report progress while batches are consumed."""
     done = 0
     for batch in batches:
         yield batch
         done += len(batch.pairs)
-        clock.advance(done, total)
+        advance(done, total)
 
 
 def _warnings(
@@ -463,7 +506,11 @@ def solve_graph_file(path: Path | str, options: PlacementOptions | None = None) 
         graph = read_graph(path)
     with clock("solve"):
         placement = place(graph, options)
-    return GraphResult(path=Path(path), options=options, placement=placement, timings_s=clock.seconds)
+    with clock("further pieces"):
+        further = tuple(place_further(placement, options))
+    return GraphResult(
+        path=Path(path), options=options, placement=placement, further=further, timings_s=clock.seconds
+    )
 
 
 def evaluate(
