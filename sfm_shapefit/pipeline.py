@@ -19,6 +19,7 @@ from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, with_turned_cameras
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
+from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import (
     CONTRADICTIONS,
     DirectionStatus,
@@ -510,6 +511,68 @@ def solve_graph_file(path: Path | str, options: PlacementOptions | None = None) 
         further = tuple(place_further(placement, options))
     return GraphResult(
         path=Path(path), options=options, placement=placement, further=further, timings_s=clock.seconds
+    )
+
+
+def inspect(
+    source: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None = None,
+    options: LocateOptions | None = None,
+    *,
+    theory: bool = False,
+    progress: Progress | None = None,
+) -> Inspection:
+    """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
+
+    Args:
+        source: a reconstruction or a model folder as for `locate`, or the text file of a bare graph.
+        database: as for `locate`; a bare graph has none.
+        options: how it would be placed; defaults if None.
+        theory: also compute the constants of the recovery theorems at the model's centres.
+        progress: called as stages advance.
+
+    Raises:
+        InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
+            is diagnosed; `diagnosis.obstacle` says why.
+    """
+    options = options or LocateOptions()
+    if isinstance(source, Path | str) and Path(source).is_file():
+        if database is not None:
+            raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
+        return _inspect_graph(Path(source), options, theory=theory)
+    clock = _Clock(progress or (lambda _stage, _done, _total: None))
+    with ExitStack() as resources:
+        with clock("read"):
+            model = read_model(source)
+            inputs = _choose_inputs(source, database, options.directions)
+            matches = None
+            if inputs.database is not None:
+                matches = resources.enter_context(open_database(inputs.database, model))
+        with clock("directions"):
+            directions = _measure_directions(model, matches, inputs.source, options, clock)
+        with clock("diagnosis"):
+            joint = _joint_graph(model, matches, directions, options)
+            pairs = _view_graph(model, directions)
+            return Inspection(
+                directions=inputs.statement,
+                num_images=len(model.reconstruction.images),
+                statuses={status.value: count for status, count in directions.counts().items()},
+                points=options.points_statement(model.num_images, joint.num_points),
+                diagnosis=diagnose(joint.graph, options.for_placement(), joint.num_cameras),
+                theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+            )
+
+
+def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspection:
+    """Diagnose the bare graph of a text file."""
+    graph = read_graph(path)
+    return Inspection(
+        directions=f"as given in {path}",
+        num_images=graph.num_cameras,
+        statuses={DirectionStatus.USABLE.value: graph.num_edges},
+        points="no: a bare graph has no matches",
+        diagnosis=diagnose(graph, options.for_placement()),
+        theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
     )
 
 

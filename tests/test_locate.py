@@ -203,7 +203,7 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(tmp_path):
     piece = pycolmap.Reconstruction(folder)
     assert set(piece.reg_image_ids()) == first  # the hinge stands in both models
     assert set(found.reconstruction.reg_image_ids()) == second
-    assert piece.num_points3D() > 100
+    assert piece.num_points3D() > 50
     assert piece.compute_mean_reprojection_error() < 1e-3  # exact data, keypoints stored as float32
     centers = np.array([piece.image(i).projection_center() for i in sorted(first)])
     np.testing.assert_allclose(centers.mean(axis=0), 0.0, atol=1e-12)

@@ -83,7 +83,7 @@ def test_further_pieces_are_solved_each_by_its_own_edges():
 
 
 def test_a_piece_that_no_scale_fits_is_left_out_and_the_rest_is_placed():
-    t, edges, v = two_pieces()
+    _, edges, v = two_pieces()
     v[:3] = [[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]]  # (4, 5), (4, 6), (5, 6): they cancel at every camera
     placement = place(ViewGraph(7, edges, v))
     assert list(place_further(placement)) == []
