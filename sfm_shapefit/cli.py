@@ -450,7 +450,8 @@ def inspect_command(
         if as_json:
             print(dumps(found.as_dict()))  # noqa: T201
         else:
-            _print_table(f"{found.num_images} images of {source}", _inspection_table(found))
+            what = "nodes" if source.is_file() else "images"
+            _print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)
 

@@ -7,19 +7,24 @@ weak cameras   A camera's pairs hold it by the stacked projectors P_v = I - v v^
                is the least over the greatest of these: 0 where all directions are parallel, so that the
                camera may slide along them, 1 where they point evenly everywhere.
 corruption     In a triangle without errors each direction lies on the arc between the other two. The
-               iterated mean angle to these arcs (`baselines.triangles`) tells wrong pairs from right ones. The
-               estimate is the share of pairs above 0.3 rad, of those in a triangle. On six synthetic families
-               with uniformly wrong directions, noise of 0.01 and 0.05, it lies within 0.04 of the true share
-               up to 0.4 of them, and within 0.06 at 0.5, where it is rather too high. It does not
-               see wrong pairs that agree with one another, nor, in the plane, half of the others.
+               iterated mean angle to these arcs (`baselines.triangles`) tells wrong pairs from right ones.
+               The estimate is the share of pairs above 0.3 rad, of those in a triangle. On six synthetic
+               families with uniformly wrong directions, noise of 0.01 and 0.05, it lies within 0.04 of the
+               true share up to 0.4 of them, and within 0.06 at 0.5, where it is rather too high. It does not
+               see wrong pairs that agree with one another; in the plane, where arcs take up much of the
+               circle, it is too low.
+
+A camera most of whose matches contradict the given rotations is named as well. Where the scene repeats itself
+right cameras are among those; only the solution tells them from wrong ones (`robust.trust`).
 """
 
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.baselines.triangles import triangle_scores
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.placement import count_large, ordered_pieces, refuse_without_triangle
@@ -149,7 +154,10 @@ class Inspection:
 
 
 def diagnose(
-    graph: ViewGraph, options: PlacementOptions | None = None, num_cameras: int | None = None
+    graph: ViewGraph,
+    options: PlacementOptions | None = None,
+    num_cameras: int | None = None,
+    contradicting: IntArray | None = None,
 ) -> Diagnosis:
     """Diagnose a view graph without solving.
 
@@ -157,6 +165,7 @@ def diagnose(
         graph: any view graph.
         options: how it would be placed; defaults if None.
         num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
+        contradicting: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
     options = options or PlacementOptions()
     n = graph.num_cameras if num_cameras is None else num_cameras
@@ -172,6 +181,7 @@ def diagnose(
     contradicted: BoolArray = np.zeros(graph.num_edges, dtype=np.bool_)
     if scores is not None:
         contradicted[is_pair] = scores > WRONG_SCORE_RAD
+    against = np.zeros((0, 2), dtype=np.int64) if contradicting is None else contradicting
     outside = left_out_reasons(graph, [] if obstacle else pieces)
     return Diagnosis(
         dimension=graph.dimension,
@@ -181,7 +191,7 @@ def diagnose(
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
         pieces=_piece_diagnoses(graph, pieces, n),
         left_out={_name(graph, camera): reason for camera, reason in outside.items() if camera < n},
-        weak=() if obstacle else _weak_cameras(graph, pieces[0], n, contradicted),
+        weak=() if obstacle else _weak_cameras(graph, pieces[0], n, contradicted, against),
         corruption=_corruption(pairs, scores),
         plan=None if obstacle else _plan(graph.restricted_to(pieces[0].edges)[0], options),
         obstacle=obstacle,
@@ -224,7 +234,7 @@ def _piece_diagnoses(
 
 
 def _weak_cameras(
-    graph: ViewGraph, piece: RigidPiece, num_cameras: int, contradicted: BoolArray
+    graph: ViewGraph, piece: RigidPiece, num_cameras: int, contradicted: BoolArray, against: IntArray
 ) -> tuple[WeakCamera, ...]:
     """Return the cameras of the largest piece that little holds, or that most triangles contradict.
 
@@ -233,6 +243,7 @@ def _weak_cameras(
         piece: its largest piece.
         num_cameras: nodes beyond are points.
         contradicted: (m,) pairs that are wrong by their triangles; they hold nothing.
+        against: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
     n = graph.num_cameras
     ends = graph.edges[piece.edges]
@@ -242,6 +253,7 @@ def _weak_cameras(
     num_wrong = np.bincount(ends[wrong].ravel(), minlength=n)
     num_ties = np.bincount(ends.ravel(), minlength=n)
     spread = direction_spread(n, ends[~wrong], graph.directions[piece.edges[~wrong]])
+    num_against = np.bincount(against.ravel(), minlength=n)
     weak = []
     for camera in piece.cameras[piece.cameras < num_cameras].tolist():
         reasons = []
@@ -251,6 +263,11 @@ def _weak_cameras(
             reasons.append(
                 f"{num_wrong[camera]} of its {num_pairs[camera]} pairs contradict their triangles: "
                 "its rotation may be wrong"
+            )
+        if num_against[camera] > num_pairs[camera]:
+            reasons.append(
+                f"the matches of {num_against[camera]} further pairs contradict the given rotations, more "
+                f"than its {num_pairs[camera]} usable ones: its rotation may be wrong, or the scene repeats"
             )
         if num_ties[camera] > num_wrong[camera] and spread[camera] < _PARALLEL:
             reasons.append("the directions that hold it are nearly parallel: it may slide along them")
@@ -266,7 +283,7 @@ def _weak_cameras(
     return tuple(weak)
 
 
-def direction_spread(num_nodes: int, ends: FloatArray, directions: FloatArray) -> FloatArray:
+def direction_spread(num_nodes: int, ends: IntArray, directions: FloatArray) -> FloatArray:
     """Return how far the directions at each node are from parallel, (n,) in [0, 1]; 0 without any.
 
     The least over the greatest eigenvalue of the sum of I - v v^T: the squared ratio of the singular values
@@ -292,15 +309,25 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
     if scores is None:
         statement = f"not estimated: more than {_MAX_SCORED_PAIRS} pairs"
         return Corruption(share=None, num_checked=0, statement=statement)
-    checked = int(np.sum(scores > 0.0))  # exactly 0 in no triangle: rounding leaves something elsewhere
+    checked = int(np.sum(_in_triangle(pairs)))
     if checked == 0:
         return Corruption(share=None, num_checked=0, statement="not estimated: no pair is in a triangle")
     share = float(np.sum(scores > WRONG_SCORE_RAD)) / checked
     return Corruption(
         share=share,
         num_checked=checked,
-        statement=f"about {share:.0%} of the {checked} pairs in triangles contradict them, of {pairs.num_edges}",
+        statement=f"about {share:.0%}, judged by the triangles of {checked} of {pairs.num_edges} pairs",
     )
+
+
+def _in_triangle(graph: ViewGraph) -> BoolArray:
+    """Return which pairs (m,) have a common neighbour."""
+    i, j = graph.edges.T
+    n = graph.num_cameras
+    half = coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    adjacency = half + half.T
+    found: BoolArray = np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0
+    return found
 
 
 def _plan(piece: ViewGraph, options: PlacementOptions) -> Plan:

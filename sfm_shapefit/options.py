@@ -104,10 +104,10 @@ class LocateOptions:
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
         """Say whether 3D points join the view graph of so many cameras, and why."""
-        if self.points != "auto":
-            return (
-                f"{num_points} tracks join as nodes, as asked" if self.points == "always" else "no, as asked"
-            )
+        if self.points == "never":
+            return "no, as asked"
+        if self.points == "always":
+            return f"{num_points} tracks join as nodes, as asked"
         limit = f"{_MAX_CAMERAS_WITH_POINTS:,}"
         if not self.uses_points(num_cameras):
             return f"no: more than {limit} cameras, where they would multiply the time of the solve"

@@ -558,7 +558,12 @@ def inspect(
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
                 points=options.points_statement(model.num_images, joint.num_points),
-                diagnosis=diagnose(joint.graph, options.for_placement(), joint.num_cameras),
+                diagnosis=diagnose(
+                    joint.graph,
+                    options.for_placement(),
+                    joint.num_cameras,
+                    evidence_of(directions).contradicting,
+                ),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
             )
 
