@@ -4,6 +4,7 @@
     result = solve(graph)                                   # ShapeFit with a certificate of optimality
     found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
     write_result(found, "out")
+    report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     errors = evaluate(found.reconstruction, "truth")
 
 Names are imported when they are first used, so that importing the package is cheap.
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline import evaluate, locate
+    from sfm_shapefit.pipeline import evaluate, inspect, locate
     from sfm_shapefit.results import LocateResult, write_result
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "options": ("LocateOptions",),
-    "pipeline": ("evaluate", "locate"),
+    "pipeline": ("evaluate", "inspect", "locate"),
     "results": ("LocateResult", "write_result"),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
@@ -49,6 +50,7 @@ __all__ = [
     "ViewGraph",
     "certify",
     "evaluate",
+    "inspect",
     "locate",
     "solve",
     "write_result",

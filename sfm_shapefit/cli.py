@@ -27,6 +27,7 @@ from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
 
 if TYPE_CHECKING:
+    from sfm_shapefit.diagnosis import Diagnosis, Inspection
     from sfm_shapefit.evaluation import Evaluation
     from sfm_shapefit.pipeline import Progress
     from sfm_shapefit.results import GraphResult, LocateResult
@@ -39,6 +40,7 @@ Rows = list[tuple[str, str]]
 
 _EXIT_USAGE, _EXIT_INPUT, _EXIT_UNSOLVABLE, _EXIT_INTERRUPTED = 2, 3, 4, 130
 _NAMES_SHOWN = 8
+_SEE_JSON = "see --json"
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -80,13 +82,17 @@ def _interrupt(_signal: int, _frame: object) -> None:
 # --- flags from options ----------------------------------------------------------------------------
 
 
-def _takes(options_type: type) -> Callable[[Command], Command]:
-    """Give a command one flag per field of an options dataclass, None where the user says nothing."""
+def _takes(options_type: type, only: Sequence[str] = ()) -> Callable[[Command], Command]:
+    """Give a command one flag per field of an options dataclass, None where the user says nothing.
+
+    `only` names the fields that matter to the command, if not all do.
+    """
 
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        parameters = own + _flags(options_type)
+        flags = [flag for flag in _flags(options_type) if not only or flag.name in only]
+        parameters = own + flags
         command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
         return command
@@ -277,6 +283,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", _shortened(left_out))] if left_out else []),
+        *_pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", _objective_line(found.solve)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
@@ -288,6 +295,17 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
     ]
+
+
+def _pieces_line(facts: dict[str, Any]) -> Rows:
+    """Return a row that says where the further pieces stand, if there are any."""
+    lines = [
+        f"{piece['folder']}: {piece['num_placed']} of {piece['num_cameras']} cameras, hinged at "
+        f"{', '.join(piece['hinges']) or 'nothing'}, with a scale of its own"
+        for piece in facts["pieces"][1:]
+        if piece["folder"]
+    ]
+    return [("further pieces", _shortened(lines))] if lines else []
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:
@@ -352,7 +370,7 @@ def solve_command(
 
 def _solve_table(found: "GraphResult", out: Path) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.results import quality_warnings
+    from sfm_shapefit.results import graph_summary, quality_warnings
 
     placement = found.placement
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -360,6 +378,7 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
         ("dimension", str(placement.graph.dimension)),
         ("placed", f"{len(placement.cameras)} of {placement.graph.num_cameras} nodes"),
         *([("not placed", _shortened(left_out))] if left_out else []),
+        *_pieces_line(graph_summary(found)),
         (
             "pairs",
             f"{placement.num_pairs}, of which {len(placement.rejected_pairs)} contradict the solution",
@@ -375,6 +394,101 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
 def _objective_line(solve: "SolverResult") -> str:
     chosen = f"{solve.method}: {solve.method_reason}"
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
+
+
+# --- inspect ---------------------------------------------------------------------------------------
+
+_INSPECTED = (
+    "directions",
+    "solver",
+    "objective",
+    "refine",
+    "points",
+    "min_inliers",
+    "min_inlier_ratio",
+    "inlier_threshold_px",
+    "threads",
+)
+"""The options of `locate` that decide what the view graph is and what becomes of it."""
+
+
+@app.command("inspect")
+@_takes(LocateOptions, only=_INSPECTED)
+def inspect_command(
+    model: Annotated[
+        Path | None,
+        typer.Argument(metavar="MODEL", help="COLMAP model folder, or the text file of a bare graph."),
+    ] = None,
+    *,
+    input_path: InputPath = None,
+    database: Annotated[
+        Path | None,
+        typer.Option(
+            "--database",
+            "--database_path",
+            help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
+        ),
+    ] = None,
+    theory: Annotated[
+        bool,
+        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centres."),
+    ] = False,
+    as_json: Json = False,
+    **given: Any,
+) -> None:
+    """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
+    source = _one_path(model, input_path, "MODEL")
+    with _reported():
+        options = _options(LocateOptions, given)
+
+        from sfm_shapefit.pipeline import inspect as inspect_model
+        from sfm_shapefit.report import dumps
+
+        _catch_termination()
+        with _progress(not as_json) as progress:
+            found = inspect_model(source, database, options, theory=theory, progress=progress)
+        if as_json:
+            print(dumps(found.as_dict()))  # noqa: T201
+        else:
+            what = "nodes" if source.is_file() else "images"
+            _print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))
+        if found.diagnosis.obstacle:
+            raise UnsolvableError(found.diagnosis.obstacle)
+
+
+def _inspection_table(found: "Inspection") -> Rows:
+    """Return the diagnosis, label by label."""
+    seen = found.diagnosis
+    statuses = "\n".join(f"{count} {status}" for status, count in found.statuses.items())
+    left_out = [f"{name}: {reason}" for name, reason in seen.left_out.items()]
+    weak = [f"{camera.name}: {'; '.join(camera.reasons)}" for camera in seen.weak]
+    return [
+        ("directions", found.directions),
+        ("pairs", statuses),
+        ("points as nodes", found.points),
+        ("components", _components_line(seen)),
+        *([("rigid pieces", _shortened(_piece_lines(seen), _SEE_JSON))] if seen.pieces else []),
+        *([("not placed", _shortened(left_out, _SEE_JSON))] if left_out else []),
+        *([("weak cameras", _shortened(weak, _SEE_JSON))] if weak else []),
+        ("wrong pairs", seen.corruption.statement),
+        *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
+        *([("finish", seen.plan.finish)] if seen.plan else []),
+        *([("theory", found.theory.statement)] if found.theory else []),
+    ]
+
+
+def _components_line(seen: "Diagnosis") -> str:
+    sizes = ", ".join(map(str, seen.components[:_NAMES_SHOWN]))
+    more = ", ..." if len(seen.components) > _NAMES_SHOWN else ""
+    return f"{len(seen.components)} ({sizes}{more} cameras)"
+
+
+def _piece_lines(seen: "Diagnosis") -> list[str]:
+    """Say of each rigid piece how large it is and what it hangs by."""
+    return [
+        f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
+        for piece in seen.pieces
+    ]
 
 
 # --- evaluate --------------------------------------------------------------------------------------
@@ -477,9 +591,9 @@ def _one_path(positional: Path | None, flag: Path | None, name: str) -> Path:
     return path
 
 
-def _shortened(lines: Sequence[str]) -> str:
-    """Return the first lines, and how many there are more."""
-    more = [f"and {len(lines) - _NAMES_SHOWN} more, see cameras.csv"] if len(lines) > _NAMES_SHOWN else []
+def _shortened(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:
+    """Return the first lines, and how many there are more and where."""
+    more = [f"and {len(lines) - _NAMES_SHOWN} more, {elsewhere}"] if len(lines) > _NAMES_SHOWN else []
     return "\n".join([*lines[:_NAMES_SHOWN], *more])
 
 

@@ -102,6 +102,17 @@ class LocateOptions:
         """Return whether 3D points join the view graph of so many cameras."""
         return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
 
+    def points_statement(self, num_cameras: int, num_points: int) -> str:
+        """Say whether 3D points join the view graph of so many cameras, and why."""
+        if self.points == "never":
+            return "no, as asked"
+        if self.points == "always":
+            return f"{num_points} tracks join as nodes, as asked"
+        limit = f"{_MAX_CAMERAS_WITH_POINTS:,}"
+        if not self.uses_points(num_cameras):
+            return f"no: more than {limit} cameras, where they would multiply the time of the solve"
+        return f"{num_points} tracks join as nodes: at most {limit} cameras, so they cost little"
+
     def for_placement(self) -> "PlacementOptions":
         """Return the share of the solver and of what follows it."""
         from sfm_shapefit.robust.options import PlacementOptions

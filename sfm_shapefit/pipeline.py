@@ -19,6 +19,7 @@ from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, with_turned_cameras
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
+from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import (
     CONTRADICTIONS,
     DirectionStatus,
@@ -33,8 +34,15 @@ from sfm_shapefit.evaluation import Evaluation, evaluate_poses
 from sfm_shapefit.formats import read_graph
 from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions, Source
-from sfm_shapefit.placement import Placement, place
-from sfm_shapefit.results import GraphResult, Inputs, LocateResult, quality_warnings, trust_warnings
+from sfm_shapefit.placement import Placement, place, place_further
+from sfm_shapefit.results import (
+    FurtherPiece,
+    GraphResult,
+    Inputs,
+    LocateResult,
+    quality_warnings,
+    trust_warnings,
+)
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
@@ -112,9 +120,11 @@ def locate(
             kept = _trusted(placement, options.min_trust)
             locations = placement.locations[kept]
             gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
+        with clock("further pieces"):
+            further = _further_pieces(model, matches, placement, joint, evidence, options)
         with clock("structure"):
             centers = gauge.similarity.apply(locations)
-            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock)
+            seed, tracks = _seed_and_tracks(model, matches, placement, (kept, centers), clock.advance)
             adjusted = None
             if not options.bundle_adjust:  # which triangulates at the seed's poses itself
                 seeded = triangulate(seed, tracks, options.for_structure())
@@ -138,6 +148,7 @@ def locate(
         timings_s=clock.seconds,
         warnings=tuple(_warnings(matches, placement, kept, gauge, seeded.num_points3D())),
         turned_deg=turned_deg,
+        further=further,
     )
 
 
@@ -390,7 +401,7 @@ def _seed_and_tracks(
     matches: MatchDatabase | None,
     placement: Placement,
     located: tuple[BoolArray, FloatArray],
-    clock: _Clock,
+    advance: Callable[[int, int], None] | None = None,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
     """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
 
@@ -404,8 +415,39 @@ def _seed_and_tracks(
     if matches is None:
         return build_seed(model, placed, all_centers), model.reconstruction
     seed = build_seed(model, placed, all_centers, matches.keypoints)
-    batches = _without_pairs(matches.iter_matches(1), placement.rejected_pairs)
-    return seed, correspondence_graph(seed, model.image_ids, _counted(batches, matches.num_pairs, clock))
+    among = (
+        placement.cameras if placement.piece else None
+    )  # a further piece is small: read no more than it needs
+    batches = _without_pairs(matches.iter_matches(1, among=among), placement.rejected_pairs)
+    if advance is not None:
+        batches = _counted(batches, matches.num_pairs, advance)
+    return seed, correspondence_graph(seed, model.image_ids, batches)
+
+
+def _further_pieces(
+    model: PosedModel,
+    matches: MatchDatabase | None,
+    placement: Placement,
+    joint: JointGraph,
+    evidence: Evidence,
+    options: LocateOptions,
+) -> tuple[FurtherPiece, ...]:
+    """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own."""
+    found = []
+    for placed in place_further(placement, options.for_placement(), joint.covariance, evidence):
+        kept = _trusted(placed, options.min_trust)
+        locations = placed.locations[kept]
+        gauge = choose_gauge(locations, np.zeros_like(locations), "unit")
+        located = kept, gauge.similarity.apply(locations)
+        seed, tracks = _seed_and_tracks(model, matches, placed, located)
+        if options.bundle_adjust:
+            seeded = bundle_adjust(seed, tracks, options.for_structure()).reconstruction
+        else:
+            seeded = triangulate(seed, tracks, options.for_structure())
+        if matches is not None:
+            seeded = colored(seeded, model.reconstruction)
+        found.append(FurtherPiece(placement=placed, kept=kept, gauge=gauge, reconstruction=seeded))
+    return tuple(found)
 
 
 def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
@@ -426,13 +468,15 @@ def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterato
         )
 
 
-def _counted(batches: Iterator[MatchBatch], total: int, clock: _Clock) -> Iterator[MatchBatch]:
+def _counted(
+    batches: Iterator[MatchBatch], total: int, advance: Callable[[int, int], None]
+) -> Iterator[MatchBatch]:
     """Report progress while batches are consumed."""
     done = 0
     for batch in batches:
         yield batch
         done += len(batch.pairs)
-        clock.advance(done, total)
+        advance(done, total)
 
 
 def _warnings(
@@ -467,7 +511,78 @@ def solve_graph_file(path: Path | str, options: PlacementOptions | None = None) 
         graph = read_graph(path)
     with clock("solve"):
         placement = place(graph, options)
-    return GraphResult(path=Path(path), options=options, placement=placement, timings_s=clock.seconds)
+    with clock("further pieces"):
+        further = tuple(place_further(placement, options))
+    return GraphResult(
+        path=Path(path), options=options, placement=placement, further=further, timings_s=clock.seconds
+    )
+
+
+def inspect(
+    source: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None = None,
+    options: LocateOptions | None = None,
+    *,
+    theory: bool = False,
+    progress: Progress | None = None,
+) -> Inspection:
+    """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
+
+    Args:
+        source: a reconstruction or a model folder as for `locate`, or the text file of a bare graph.
+        database: as for `locate`; a bare graph has none.
+        options: how it would be placed; defaults if None.
+        theory: also compute the constants of the recovery theorems at the model's centres.
+        progress: called as stages advance.
+
+    Raises:
+        InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
+            is diagnosed; `diagnosis.obstacle` says why.
+    """
+    options = options or LocateOptions()
+    if isinstance(source, Path | str) and Path(source).is_file():
+        if database is not None:
+            raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
+        return _inspect_graph(Path(source), options, theory=theory)
+    clock = _Clock(progress or (lambda _stage, _done, _total: None))
+    with ExitStack() as resources:
+        with clock("read"):
+            model = read_model(source)
+            inputs = _choose_inputs(source, database, options.directions)
+            matches = None
+            if inputs.database is not None:
+                matches = resources.enter_context(open_database(inputs.database, model))
+        with clock("directions"):
+            directions = _measure_directions(model, matches, inputs.source, options, clock)
+        with clock("diagnosis"):
+            joint = _joint_graph(model, matches, directions, options)
+            pairs = _view_graph(model, directions)
+            return Inspection(
+                directions=inputs.statement,
+                num_images=len(model.reconstruction.images),
+                statuses={status.value: count for status, count in directions.counts().items()},
+                points=options.points_statement(model.num_images, joint.num_points),
+                diagnosis=diagnose(
+                    joint.graph,
+                    options.for_placement(),
+                    joint.num_cameras,
+                    evidence_of(directions).contradicting,
+                ),
+                theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+            )
+
+
+def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspection:
+    """Diagnose the bare graph of a text file."""
+    graph = read_graph(path)
+    return Inspection(
+        directions=f"as given in {path}",
+        num_images=graph.num_cameras,
+        statuses={DirectionStatus.USABLE.value: graph.num_edges},
+        points="no: a bare graph has no matches",
+        diagnosis=diagnose(graph, options.for_placement()),
+        theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
+    )
 
 
 def evaluate(

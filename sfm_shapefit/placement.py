@@ -1,5 +1,10 @@
-"""A view graph placed: its largest rigid piece, solved, finished, judged. What `locate` and `solve` share."""
+"""A view graph placed: its rigid pieces, solved, finished, judged. What `locate` and `solve` share.
 
+Directions say nothing of the scale between two rigid pieces, nor of where they lie, so each is a placement of
+its own. The largest is the answer; the others are kept apart.
+"""
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,10 +20,13 @@ from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
+SMALLEST_PIECE = 3
+"""Cameras; fewer have no shape that is worth a placement of its own."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Placement:
-    """The locations of a view graph's largest rigid piece, and the evidence for them.
+    """The locations of one rigid piece of a view graph, and the evidence for them.
 
     Nodes of the graph from `num_cameras` on are 3D points, which only help to place the cameras.
     """
@@ -28,7 +36,9 @@ class Placement:
     num_cameras: int
     """The nodes 0..num_cameras-1 are cameras."""
     pieces: list[RigidPiece]
-    """Its parallel-rigid pieces, most cameras first; piece 0 is the one that is solved."""
+    """Its parallel-rigid pieces, most cameras first."""
+    piece: int
+    """The one that is solved: 0, the largest, or one of the further ones."""
     solve: SolverResult
     """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to
     its edge `edges[e]`."""
@@ -40,7 +50,7 @@ class Placement:
     @property
     def nodes(self) -> IntArray:
         """The nodes of the graph that are placed, cameras first, ascending."""
-        return self.pieces[0].cameras
+        return self.pieces[self.piece].cameras
 
     @property
     def cameras(self) -> IntArray:
@@ -55,7 +65,7 @@ class Placement:
     @property
     def edges(self) -> IntArray:
         """The edges of the graph that place them, ascending."""
-        return self.pieces[0].edges
+        return self.pieces[self.piece].edges
 
     @property
     def pairs(self) -> IntArray:
@@ -96,29 +106,78 @@ def place(
     """
     options = options or PlacementOptions()
     num_cameras = graph.num_cameras if num_cameras is None else num_cameras
-    pieces = _most_cameras_first(rigid_pieces(graph), num_cameras)
-    if not pieces or np.sum(pieces[0].cameras < num_cameras) < min(3, num_cameras):
+    pieces = ordered_pieces(graph, num_cameras)
+    refuse_without_triangle(graph, pieces, num_cameras)
+    return _place_piece(graph, pieces, 0, options, covariance, evidence, num_cameras)
+
+
+def place_further(
+    placement: Placement,
+    options: PlacementOptions | None = None,
+    covariance: FloatArray | None = None,
+    evidence: Evidence | None = None,
+) -> Iterator[Placement]:
+    """Solve the further rigid pieces of at least three cameras, each with a scale of its own.
+
+    Args:
+        placement: the graph and its largest piece.
+        options, covariance, evidence: as they were given to `place`, for the whole graph.
+
+    Yields:
+        Placements, most cameras first; a piece that the solver refuses is left out.
+    """
+    options = options or PlacementOptions()
+    pieces, num_cameras = placement.pieces, placement.num_cameras
+    for k in range(1, count_large(pieces, num_cameras)):
+        try:
+            yield _place_piece(placement.graph, pieces, k, options, covariance, evidence, num_cameras)
+        except UnsolvableError:
+            continue
+
+
+def ordered_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
+    """Return the rigid pieces, most cameras first; nodes from `num_cameras` on are points."""
+    return sorted(rigid_pieces(graph), key=lambda piece: -int(np.sum(piece.cameras < num_cameras)))
+
+
+def count_large(pieces: list[RigidPiece], num_cameras: int) -> int:
+    """Return how many of the pieces, most cameras first, have three cameras or more."""
+    return sum(int(np.sum(piece.cameras < num_cameras)) >= SMALLEST_PIECE for piece in pieces)
+
+
+def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_cameras: int) -> None:
+    """Raise UnsolvableError if a graph of many cameras has no three that are rigid."""
+    if not pieces or np.sum(pieces[0].cameras < num_cameras) < min(SMALLEST_PIECE, num_cameras):
         raise UnsolvableError(
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
             "match more pairs, above all pairs that close triangles"
         )
-    piece, _ = graph.restricted_to(pieces[0].edges)
-    known = None if covariance is None else covariance[pieces[0].edges]
-    classes = np.max(graph.edges[pieces[0].edges] >= num_cameras, axis=1).astype(np.int64)
-    heard = evidence and evidence.restricted_to(pieces[0].edges, pieces[0].cameras, graph.num_cameras)
+
+
+def _place_piece(
+    graph: ViewGraph,
+    pieces: list[RigidPiece],
+    k: int,
+    options: PlacementOptions,
+    covariance: FloatArray | None,
+    evidence: Evidence | None,
+    num_cameras: int,
+) -> Placement:
+    """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`."""
+    nodes, edges = pieces[k].cameras, pieces[k].edges
+    piece, _ = graph.restricted_to(edges)
+    known = None if covariance is None else covariance[edges]
+    classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
+    heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
     solved = solve(piece, options)
     finished = finish(piece, solved, options, known, classes)
-    placed = int(np.sum(pieces[0].cameras < num_cameras))
+    placed = int(np.sum(nodes < num_cameras))
     return Placement(
         graph=graph,
         num_cameras=num_cameras,
         pieces=pieces,
+        piece=k,
         solve=solved,
         finish=finished,
         assessment=assess(piece, finished.locations, known, heard, placed),
     )
-
-
-def _most_cameras_first(pieces: list[RigidPiece], num_cameras: int) -> list[RigidPiece]:
-    """Sort pieces by their number of cameras; pieces of as many stay in their order."""
-    return sorted(pieces, key=lambda piece: -int(np.sum(piece.cameras < num_cameras)))

@@ -29,7 +29,8 @@ class CameraRow:
     reason: str = ""
     """Why it is not placed or, if it is, why its trust is low."""
     piece: int | None = None
-    """The parallel-rigid piece it belongs to, 0 the solved one; None outside every piece of 3 cameras."""
+    """The parallel-rigid piece it belongs to, 0 the largest, which is the output; N stands in pieces/N with
+    a scale of its own. None outside every piece of 3 cameras."""
     center: tuple[float, ...] = ()
     """Centre in the output's units, d numbers; empty when not placed. Columns x, y, z."""
     degree: int = 0
@@ -73,9 +74,14 @@ class PieceRow:
 
     num_cameras: int
     scale: str
-    """The gauge of a solved piece, "free, not solved" for the others."""
+    """The gauge of a solved piece; pieces that the solver refuses have none."""
     hinges: list[str]
     """Names of the cameras that it shares with other pieces."""
+    folder: str
+    """Where it stands in the output: "." for the largest piece, "pieces/1" and so on; empty if it is not
+    solved."""
+    num_placed: int
+    """Cameras of it that are in the output; the others are not trusted."""
 
 
 def write_rows(

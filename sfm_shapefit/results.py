@@ -1,4 +1,7 @@
-"""What `locate` returns, and its files: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`."""
+"""What `locate` returns, and its files: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`.
+
+Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each.
+"""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -18,7 +21,7 @@ from sfm_shapefit.directions import DirectionStatus, PairDirections
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.output import MARKER, atomic_folder
-from sfm_shapefit.placement import Placement
+from sfm_shapefit.placement import SMALLEST_PIECE, Placement, count_large
 from sfm_shapefit.report import (
     SCHEMA_VERSION,
     CameraRow,
@@ -38,11 +41,11 @@ from sfm_shapefit.viewgraph import ViewGraph
 if TYPE_CHECKING:
     import pycolmap
 
-_SMALLEST_PIECE = 3  # cameras; two cameras of one pair are no piece worth a line
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
 _ALARMING_LEVEL_DEG = 5.0
 _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_NOT_SOLVED = "free: its directions determine no placement"
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 
 
@@ -62,7 +65,7 @@ class Inputs:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LocateResult:
-    """The seeded model and the evidence for it. Piece 0, the largest, is the one that is solved."""
+    """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
 
     reconstruction: "pycolmap.Reconstruction"
     """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
@@ -88,6 +91,8 @@ class LocateResult:
     turned_deg: FloatArray | None = None
     """(n,) by how much each rotation of the input was refined, exactly 0 where it was kept; None if
     rotations were not to be refined."""
+    further: "tuple[FurtherPiece, ...]" = ()
+    """The further rigid pieces of three cameras or more, each with a scale of its own."""
 
     @property
     def solve(self) -> SolverResult:
@@ -106,7 +111,8 @@ class LocateResult:
         images = [self.reconstruction.image(image_id) for image_id in kept_ids]
         centers = np.full((len(self.kept), 3), np.nan)
         centers[self.kept] = [image.projection_center() for image in images]
-        rows = camera_rows(self.placement, centers, self.gauge.similarity.scale)
+        solved_pieces = [piece.placement for piece in self.further]
+        rows = camera_rows(self.placement, centers, self.gauge.similarity.scale, solved_pieces)
         for camera, reason in _without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(_all_names(self)) - set(self.model.names))
@@ -115,7 +121,8 @@ class LocateResult:
     @property
     def pairs(self) -> list[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
-        usable = iter(pair_rows(self.placement, self.directions.num_inliers[self.directions.usable()]))
+        support = self.directions.num_inliers[self.directions.usable()]
+        usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
         names = self.model.names
         return [
             next(usable)
@@ -131,6 +138,27 @@ class LocateResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FurtherPiece:
+    """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
+
+    placement: Placement
+    """Its solution; `placement.piece` is its number."""
+    kept: BoolArray
+    """Which of the placement's cameras are in its model; the others are not trusted enough."""
+    gauge: Gauge
+    """From the solver's units to those of its model, a unit of its own."""
+    reconstruction: "pycolmap.Reconstruction"
+    """Its seeded model."""
+
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per camera of the piece."""
+        centers = self.gauge.similarity.apply(self.placement.locations)
+        centers = np.where(self.kept[:, None], centers, np.nan)
+        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class GraphResult:
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
@@ -138,21 +166,26 @@ class GraphResult:
     """The graph's file."""
     options: PlacementOptions
     placement: Placement
+    further: tuple[Placement, ...]
+    """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
 
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per node."""
-        return camera_rows(self.placement, self.placement.locations, 1.0)
+        return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
 
     @property
     def pairs(self) -> list[PairRow]:
         """One row per edge."""
-        return pair_rows(self.placement, np.zeros(self.placement.num_pairs, dtype=np.int64))
+        support = np.zeros(self.placement.num_pairs, dtype=np.int64)
+        return pair_rows(self.placement, support, self.further)
 
 
-def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+def camera_rows(
+    placement: Placement, centers: FloatArray, scale: float, further: Sequence[Placement] = ()
+) -> list[CameraRow]:
     """Return one row per camera of a placed graph.
 
     Args:
@@ -160,28 +193,43 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
         centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
             because they are not trusted.
         scale: the output's units in one unit of the solver.
+        further: the other pieces that are solved; the rows of their cameras say where they stand.
     """
     graph = placement.graph
-    row_of = {camera: k for k, camera in enumerate(placement.cameras.tolist())}
     homes = _home_pieces(placement)
-    reasons = left_out_reasons(graph, placement.pieces)
-    sigmas = scale * placement.assessment.sigmas
-    rows = []
+    reasons = _with_folders(left_out_reasons(graph, placement.pieces), further)
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
-    for camera, degree in enumerate(degrees.tolist()):
-        row = CameraRow(name=_name(graph, camera), piece=homes[camera], degree=degree)
-        k = row_of.get(camera)
-        if k is None:
-            rows.append(replace(row, reason=reasons[camera]))
-            continue
+    rows = [
+        CameraRow(
+            name=_name(graph, camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
+        )
+        for camera, degree in enumerate(degrees.tolist())
+    ]
+    for camera, row in zip(
+        placement.cameras.tolist(), own_camera_rows(placement, centers, scale), strict=True
+    ):
+        rows[camera] = replace(row, degree=rows[camera].degree)
+    return rows
+
+
+def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+    """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
+    graph, assessment = placement.graph, placement.assessment
+    inside = graph.edges[placement.edges[placement.pairs]]
+    degrees = np.bincount(inside.ravel(), minlength=graph.num_cameras)
+    sigmas = scale * assessment.sigmas
+    rows = []
+    for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
-        trust, reason = float(placement.assessment.trust[k]), placement.assessment.reasons[k]
+        trust, reason = float(assessment.trust[k]), assessment.reasons[k]
         rows.append(
-            replace(
-                row,
+            CameraRow(
+                name=_name(graph, camera),
                 placed=kept,
                 reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
+                piece=placement.piece,
                 center=tuple(centers[k].tolist()) if kept else (),
+                degree=int(degrees[camera]),
                 trust=trust,
                 sigma=tuple(sigmas[k].tolist()),
             )
@@ -189,11 +237,36 @@ def camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list
     return rows
 
 
-def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
-    """Return one row per pair of cameras; `support` (m,) is their number of inlier matches."""
-    graph, assessment = placement.graph, placement.assessment
-    row_of = {edge: e for e, edge in enumerate(placement.edges.tolist())}
-    dual_norms = np.linalg.norm(placement.solve.dual, axis=1) / graph.weights[placement.edges]
+def _with_folders(reasons: dict[int, str], further: Sequence[Placement]) -> dict[int, str]:
+    """Add to the reason for which a camera is left out in which further pieces it stands."""
+    homes: dict[int, list[str]] = {}
+    for placement in further:
+        for camera in placement.cameras.tolist():
+            homes.setdefault(camera, []).append(_folder(placement.piece))
+    return {
+        camera: f"{reason}; see {', '.join(homes[camera])}" if camera in homes else reason
+        for camera, reason in reasons.items()
+    }
+
+
+def _folder(piece: int) -> str:
+    """Return where a piece stands in the output."""
+    return f"pieces/{piece}" if piece else "."
+
+
+def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:
+    """Return one row per pair of cameras.
+
+    Args:
+        placement: the graph and its largest piece.
+        support: (m,) the pairs' number of inlier matches.
+        further: the other pieces that are solved; their pairs are judged by them.
+    """
+    graph = placement.graph
+    judged: dict[int, tuple[Placement, int, float]] = {}
+    for piece in (placement, *further):
+        dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
+        judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
@@ -203,16 +276,17 @@ def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
             support=int(support[edge]),
             weight=float(graph.weights[edge]),
         )
-        e = row_of.get(edge)
-        if e is None:
-            rows.append(replace(row, reason="outside the piece that is solved"))
+        if edge not in judged:
+            rows.append(replace(row, reason="outside the pieces that are solved"))
             continue
+        piece, e, dual_norm = judged[edge]
+        assessment = piece.assessment
         verdict = assessment.verdict(e)
         rows.append(
             replace(
                 row,
                 residual_deg=float(assessment.residuals_deg[e]),
-                dual_norm=float(dual_norms[e]),
+                dual_norm=float(dual_norm),
                 leverage=float(assessment.leverages[e]),
                 verdict=verdict.value,
                 reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
@@ -221,17 +295,35 @@ def pair_rows(placement: Placement, support: IntArray) -> list[PairRow]:
     return rows
 
 
-def piece_rows(placement: Placement, scale: str) -> list[PieceRow]:
-    """Return one row per parallel-rigid piece of three cameras or more, and for the solved one."""
-    return [
-        PieceRow(
-            num_cameras=int(np.sum(piece.cameras < placement.num_cameras)),
-            scale=scale if k == 0 else "free, not solved",
-            hinges=[_name(placement.graph, hinge) for hinge in piece.hinges.tolist()],
+def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[PieceRow]:
+    """Return one row per parallel-rigid piece of three cameras or more, and for the largest.
+
+    Args:
+        placement: the graph and its largest piece.
+        solved: number, scale and number of placed cameras of each piece that is solved.
+    """
+    facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
+    large = max(count_large(placement.pieces, placement.num_cameras), 1)
+    rows = []
+    for k, piece in enumerate(placement.pieces[:large]):
+        scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
+        hinges = piece.hinges[piece.hinges < placement.num_cameras]
+        rows.append(
+            PieceRow(
+                num_cameras=int(np.sum(piece.cameras < placement.num_cameras)),
+                scale=scale,
+                hinges=[_name(placement.graph, hinge) for hinge in hinges.tolist()],
+                folder=_folder(k) if k in facts else "",
+                num_placed=num_placed,
+            )
         )
-        for k, piece in enumerate(placement.pieces)
-        if k == 0 or len(piece.cameras) >= _SMALLEST_PIECE
-    ]
+    return rows
+
+
+def _pieces_of(found: LocateResult) -> list[PieceRow]:
+    solved = [(0, found.gauge.statement, int(np.sum(found.kept)))]
+    solved += [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in found.further]
+    return piece_rows(found.placement, solved)
 
 
 def summary(found: LocateResult) -> dict[str, Any]:
@@ -259,7 +351,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "residual_level_deg": placement.assessment.level_deg,
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
-        "pieces": [asdict(row) for row in piece_rows(placement, found.gauge.statement)],
+        "pieces": [asdict(row) for row in _pieces_of(found)],
         "solve": solve_summary(found.solve),
         "finish": _finish_summary(placement.finish),
         "rotation_refinement": _refinement_summary(found.turned_deg),
@@ -284,7 +376,13 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "num_pairs_rejected": len(placement.rejected_pairs),
         "residual_level_deg": placement.assessment.level_deg,
         "loose_groups": _loose_groups(placement),
-        "pieces": [asdict(row) for row in piece_rows(placement, _SOLVER_SCALE)],
+        "pieces": [
+            asdict(row)
+            for row in piece_rows(
+                placement,
+                [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)],
+            )
+        ],
         "solve": solve_summary(placement.solve),
         "finish": _finish_summary(placement.finish),
         "timings_s": found.timings_s,
@@ -363,7 +461,7 @@ def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
     if np.isnan(largest).any():
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
-    if uncertain and len(placement.cameras) >= _SMALLEST_PIECE:
+    if uncertain and len(placement.cameras) >= SMALLEST_PIECE:
         worst = _name(placement.graph, int(placement.cameras[np.argmax(largest)]))
         yield (
             f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
@@ -389,12 +487,22 @@ def write_result(
     with atomic_folder(out, overwrite=overwrite, protect=[*inputs, *protect]) as folder:
         write_model(found.reconstruction, folder)
         _write_tables(found, summary(found), folder)
+        for piece in found.further:
+            subfolder = folder / _folder(piece.placement.piece)
+            subfolder.mkdir(parents=True)
+            write_model(piece.reconstruction, subfolder)
+            write_rows(piece.cameras, CameraRow, 3, subfolder / "cameras.csv")
 
 
 def write_graph_result(found: GraphResult, out: Path | str, *, overwrite: bool = False) -> None:
     """Write the tables of a bare graph like `write_result`; there is no model."""
     with atomic_folder(out, overwrite=overwrite, protect=[found.path]) as folder:
         _write_tables(found, graph_summary(found), folder)
+        for piece in found.further:
+            subfolder = folder / _folder(piece.piece)
+            subfolder.mkdir(parents=True)
+            rows = own_camera_rows(piece, piece.locations, 1.0)
+            write_rows(rows, CameraRow, piece.graph.dimension, subfolder / "cameras.csv")
 
 
 def _write_tables(found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path) -> None:
@@ -419,12 +527,12 @@ def _all_names(found: LocateResult) -> list[str]:
 
 
 def _home_pieces(placement: Placement) -> list[int | None]:
-    """Return the first piece of three cameras or more that holds each camera, or the solved one."""
+    """Return the first piece of three cameras or more that holds each camera, or the largest."""
     homes: list[int | None] = [None] * placement.graph.num_cameras
-    for k, piece in reversed(list(enumerate(placement.pieces))):
-        if k == 0 or len(piece.cameras) >= _SMALLEST_PIECE:
-            for camera in piece.cameras.tolist():
-                homes[camera] = k
+    large = max(count_large(placement.pieces, placement.num_cameras), 1)
+    for k in reversed(range(large)):
+        for camera in placement.pieces[k].cameras.tolist():
+            homes[camera] = k
     return homes
 
 

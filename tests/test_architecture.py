@@ -33,6 +33,7 @@ LAYERS = [
     "synthetic",
     "colmap",
     "tracks",
+    "diagnosis",
     "options",
     "report",
     "results",

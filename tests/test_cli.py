@@ -249,6 +249,24 @@ def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
+    from sfm_shapefit.formats import graph_text
+    from sfm_shapefit.viewgraph import ViewGraph
+
+    t = np.random.default_rng(0).standard_normal((8, 3))
+    edges = [(i, j) for i in range(5) for j in range(i)] + [(5, 6), (5, 7), (6, 7)]
+    v = np.array([(t[i] - t[j]) / np.linalg.norm(t[i] - t[j]) for i, j in edges])
+    names = [f"n{k}" for k in range(8)]
+    (tmp_path / "graph.txt").write_text(graph_text(ViewGraph(8, edges, v, names=names)))
+    result = run("solve", tmp_path / "graph.txt", tmp_path / "out")
+    assert "pieces/1: 3 of 3 cameras" in " ".join(result.stdout.split())
+    lines = (tmp_path / "out" / "pieces" / "1" / "cameras.csv").read_text().splitlines()
+    assert [line.split(",")[0] for line in lines] == ["name", "n5", "n6", "n7"]
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    assert [piece["folder"] for piece in facts["pieces"]] == [".", "pieces/1"]
+    assert "another component; see pieces/1" in (tmp_path / "out" / "cameras.csv").read_text()
+
+
 def test_evaluate_prints_a_table_json_and_csv(ring_out, tmp_path):
     table = run("evaluate", ring_out, RING_MODEL, "--threshold", "0.5", "--csv", tmp_path / "errors.csv")
     assert table.exit_code == 0

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement import place
+from sfm_shapefit.placement import place, place_further
 from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
@@ -63,6 +63,31 @@ def test_rows_speak_of_the_whole_graph():
     for row, (i, j) in zip(pairs, edges, strict=True):
         assert (row.name1, row.name2) == (f"image{i}", f"image{j}")
         np.testing.assert_allclose(row.direction, normalized(t[i] - t[j]), atol=1e-12)
+
+
+def test_further_pieces_are_solved_each_by_its_own_edges():
+    t, edges, v = two_pieces()
+    bent = 5  # in the large piece: the small one knows nothing of it
+    v[bent] = normalized(v[bent] + 0.3 * np.cross(v[bent], v[bent + 1]))
+    placement = place(ViewGraph(7, edges, v))
+    (further,) = place_further(placement)
+    assert (further.piece, further.cameras.tolist(), further.edges.tolist()) == (1, [4, 5, 6], [0, 1, 2])
+    found, true = further.locations, t[4:] - t[4:].mean(axis=0)
+    scale = np.sum(found * true) / np.sum(true * true)
+    np.testing.assert_allclose(found, scale * true, atol=1e-6 * scale)
+    rows = camera_rows(placement, placement.locations, 1.0, [further])
+    assert rows[5].reason == "another rigid piece, hinged at camera 4; see pieces/1"
+    verdicts = [row.verdict for row in pair_rows(placement, np.zeros(13, dtype=int), [further])]
+    assert verdicts[0] != "outlier"
+    assert verdicts[bent] == "outlier"
+
+
+def test_a_piece_that_no_scale_fits_is_left_out_and_the_rest_is_placed():
+    _, edges, v = two_pieces()
+    v[:3] = [[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]]  # (4, 5), (4, 6), (5, 6): they cancel at every camera
+    placement = place(ViewGraph(7, edges, v))
+    assert list(place_further(placement)) == []
+    assert placement.cameras.tolist() == [0, 1, 2, 3, 4]
 
 
 def test_a_graph_without_a_triangle_is_refused():

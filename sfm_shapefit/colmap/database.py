@@ -146,7 +146,9 @@ class MatchDatabase:
             )
         return xy
 
-    def iter_matches(self, min_matches: int, max_matches_per_batch: int = 2_000_000) -> Iterator[MatchBatch]:
+    def iter_matches(
+        self, min_matches: int, max_matches_per_batch: int = 2_000_000, among: IntArray | None = None
+    ) -> Iterator[MatchBatch]:
         """Yield the verified inlier matches of all pairs, in the order of pairs (i, j), in batches.
 
         Repeated matches of a pair count once, and matches whose pixel has no ray are left out.
@@ -154,11 +156,14 @@ class MatchDatabase:
         Args:
             min_matches: pairs with fewer matches are left out; at least 1.
             max_matches_per_batch: bounds the memory; only a single pair may exceed it.
+            among: only pairs of these images, by their index; all if None.
 
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
         """
         enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
+        if among is not None:
+            enough &= np.isin(self._pairs.pairs, among).all(axis=1)
         chosen = np.flatnonzero(enough)
         limit = max(max_matches_per_batch, 1)
         first = 0

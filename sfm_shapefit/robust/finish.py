@@ -115,8 +115,7 @@ def finish(
     """
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     metric = Metric(covariance, classes)
-    wants_lud = graph.num_edges <= _LUD_PAIRS and graph.num_cameras > 2
-    lud = _lud_start(graph, classes, options.threads) if wants_lud else None
+    lud = _lud_start(graph, classes, options.threads) if has_second_start(graph) else None
     plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
 
     starts = [_refined("ShapeFit", solved.locations, graph, metric, plan)]
@@ -139,6 +138,11 @@ def finish(
         moved=_moves(kept),
         lud=lud,
     )
+
+
+def has_second_start(graph: ViewGraph) -> bool:
+    """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
+    return graph.num_edges <= _LUD_PAIRS and graph.num_cameras > 2
 
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:

@@ -79,7 +79,7 @@ def solve(
     options = options or SolverOptions()
     start = time.perf_counter()
     _refuse_undetermined(graph)
-    choice = _choose(graph, options)
+    choice = choose_method(graph, options)
     watch = _Watch(on_iteration)
     limit = options.max_iterations or _LIMITS[choice.method]
     run = choice.run(graph, options, limit, watch if on_iteration else None)
@@ -102,8 +102,8 @@ def solve(
     )
 
 
-def _choose(graph: ViewGraph, options: SolverOptions) -> Choice:
-    """Pick the solver by the size of the problem and the predicted fill of its factor."""
+def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
+    """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
     unknowns = graph.num_cameras * graph.dimension
     asked = options.method != "auto"
     if options.method == "conic":

@@ -1,0 +1,215 @@
+"""Inputs made to mislead: each ends in a stated reason or in low trust, never in NaN or a wild camera.
+
+Twelve cameras with a direction for every pair, one of them, or one pair, changed for the worse.
+"""
+
+import sqlite3
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import LocateOptions, UnsolvableError
+from sfm_shapefit.diagnosis import diagnose
+from sfm_shapefit.geometry import fit_similarity_l1, normalized
+from sfm_shapefit.placement import Placement, place, place_further
+from sfm_shapefit.results import camera_rows, quality_warnings
+from sfm_shapefit.rigidity import parallel_rigid_pieces
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import RING, copied
+
+N = 12
+BAD = N - 1
+MIN_TRUST = LocateOptions().min_trust
+CENTERS = np.random.default_rng(1).standard_normal((N, 3))
+ALL = [(i, j) for i in range(N) for j in range(i + 1, N)]
+OF_BAD = [k for k, (_, j) in enumerate(ALL) if j == BAD]
+OTHERS = [pair for pair in ALL if BAD not in pair]
+NOISE = [0.0, 1e-3]  # rad per axis
+
+
+def measured(t, edges, noise):
+    v = normalized(differences(t, np.array(edges)))
+    return normalized(v + noise * np.random.default_rng(0).standard_normal(v.shape))
+
+
+def errors_of(placement: Placement, t):
+    """The errors of all cameras, aligned on those that are not the bad one."""
+    good = placement.cameras != BAD
+    true = t[placement.cameras]
+    aligned = fit_similarity_l1(placement.locations[good], true[good], rotate=False)
+    return np.linalg.norm(aligned.apply(placement.locations) - true, axis=1)[good]
+
+
+def assert_only_the_bad_camera_is_distrusted(placement, t, noise):
+    assert np.isfinite(placement.locations).all()
+    trust = placement.assessment.trust
+    assert np.isfinite(trust).all()
+    assert placement.cameras[trust < MIN_TRUST].tolist() == [BAD]
+    assert placement.assessment.reasons[-1]
+    assert any(str(BAD) in warning for warning in quality_warnings(placement))
+    # Eleven cameras of distance about 2 with ten directions each: an error of about noise * 2 / sqrt(10).
+    assert np.max(errors_of(placement, t)) < 1e-6 + 10.0 * noise
+
+
+@pytest.mark.parametrize("noise", NOISE)
+def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbour(noise):
+    edges = [*OTHERS, (0, BAD)]
+    placement = place(ViewGraph(N, edges, measured(CENTERS, edges, noise)))
+    rows = camera_rows(placement, placement.locations, 1.0)
+    assert [row.reason for row in rows if not row.placed] == ["pendant: joined by a single pair to camera 0"]
+    assert (placement.assessment.trust >= MIN_TRUST).all()
+
+
+@pytest.mark.parametrize("noise", NOISE)
+def test_groups_on_a_hinge_are_two_placements(noise):
+    edges = [(i, j) for i, j in ALL if j <= 6 or i >= 6]
+    graph = ViewGraph(N, edges, measured(CENTERS, edges, noise))
+    placement = place(graph)
+    (further,) = place_further(placement)
+    assert placement.cameras.tolist() == list(range(7))
+    assert further.cameras.tolist() == list(range(6, 12))
+    reasons = [row.reason for row in camera_rows(placement, placement.locations, 1.0, [further])]
+    assert reasons[7:] == ["another rigid piece, hinged at camera 6; see pieces/1"] * 5
+
+
+def test_a_five_cycle_is_refused_and_a_four_cycle_is_not():
+    for n, rigid in ((4, True), (5, False)):
+        cycle = np.array([(k, (k + 1) % n) for k in range(n)])
+        assert bool(parallel_rigid_pieces(n, cycle, 3).max() == 0) is rigid
+        graph = ViewGraph(n, cycle, measured(CENTERS[:n], cycle, 0.0))
+        if rigid:
+            assert np.isfinite(place(graph).locations).all()
+        else:
+            with pytest.raises(UnsolvableError, match="tie no three cameras"):
+                place(graph)
+
+
+@pytest.mark.parametrize("noise", NOISE)
+@pytest.mark.parametrize("joined", [False, True], ids=["apart", "joined"])
+def test_twins_at_one_centre_are_placed_at_one_centre(noise, joined):
+    """What a pair of twins measures is noise; it is that of no baseline at all."""
+    t = CENTERS.copy()
+    t[BAD] = t[BAD - 1]
+    edges = [pair for pair in ALL if pair != (BAD - 1, BAD)]
+    v = measured(t, edges, noise)
+    if joined:
+        edges, v = [*edges, (BAD - 1, BAD)], np.concatenate([v, [[0.0, 0.0, 1.0]]])
+    placement = place(ViewGraph(N, edges, v))
+    assert np.isfinite(placement.locations).all()
+    assert np.isfinite(placement.assessment.trust).all()
+    assert np.isfinite(placement.assessment.residuals_deg).all()
+    assert np.max(errors_of(placement, t)) < 1e-6 + 10.0 * noise
+    scale = np.median(np.linalg.norm(placement.locations, axis=1))
+    assert np.linalg.norm(placement.locations[BAD] - placement.locations[BAD - 1]) < scale * (
+        1e-6 + 10.0 * noise
+    )
+
+
+@pytest.mark.parametrize("noise", NOISE)
+@pytest.mark.parametrize("seed", [12, 13, 14])
+def test_a_camera_of_wrong_pairs_only_is_not_trusted(noise, seed):
+    v = measured(CENTERS, ALL, noise)
+    v[OF_BAD] = normalized(np.random.default_rng(seed).standard_normal((len(OF_BAD), 3)))
+    graph = ViewGraph(N, ALL, v)
+    assert_only_the_bad_camera_is_distrusted(place(graph), CENTERS, noise)
+    assert [camera.name for camera in diagnose(graph).weak] == [str(BAD)]
+
+
+@pytest.mark.parametrize("noise", NOISE)
+def test_a_camera_whose_pairs_are_all_parallel_is_not_trusted(noise):
+    """It stands far off as seen from all others, in truth or by a mistake in the matches: its distance is free."""
+    v = measured(CENTERS, ALL, noise)
+    parallel = np.array([0.0, 0.0, 1.0])
+    v[OF_BAD] = normalized(parallel + noise * np.random.default_rng(2).standard_normal((len(OF_BAD), 3)))
+    graph = ViewGraph(N, ALL, v)
+    placement = place(graph)
+    assert np.isfinite(placement.locations).all()
+    assert placement.assessment.trust[BAD] < MIN_TRUST
+    assert placement.assessment.reasons[BAD]
+    assert [camera.name for camera in diagnose(graph).weak] == [str(BAD)]
+    assert (placement.assessment.trust[:BAD] >= MIN_TRUST).all()
+    assert np.max(errors_of(placement, CENTERS)) < 1e-4 + 10.0 * noise
+
+
+@pytest.mark.parametrize("noise", NOISE)
+def test_a_camera_on_the_line_of_its_two_neighbours_is_not_trusted(noise):
+    """Rigid by its graph, free to slide by its geometry; without noise its residuals are 0 wherever it is."""
+    t = CENTERS.copy()
+    t[BAD] = 2.0 * t[1] - t[0]
+    edges = [*OTHERS, (0, BAD), (1, BAD)]
+    placement = place(ViewGraph(N, edges, measured(t, edges, noise)))
+    assert_only_the_bad_camera_is_distrusted(placement, t, noise)
+
+
+@pytest.mark.parametrize("noise", NOISE)
+def test_cameras_on_one_line_are_none_of_them_trusted(noise):
+    t = CENTERS * [0.0, 0.0, 1.0]
+    placement = place(ViewGraph(N, ALL, measured(t, ALL, noise)))
+    assert np.isfinite(placement.locations).all()
+    assert (placement.assessment.trust < MIN_TRUST).all()
+    assert any("uncertain" in warning for warning in quality_warnings(placement))
+
+
+# --- from matches on -----------------------------------------------------------------------------
+
+
+def turned_model(scene, image_id, rotation):
+    """The model of a scene with another rotation of one image, about the same centre."""
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    image = model.image(image_id)
+    center = image.projection_center()
+    model.frame(image.frame_id).rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    return model
+
+
+def test_a_camera_whose_pairs_all_contradict_its_rotation_is_not_placed():
+    given = pycolmap.Reconstruction(RING / "sparse" / "0").image(3).cam_from_world().rotation
+    turn = pycolmap.Rotation3d(np.array([0.0, 1.0, 0.0, 0.0]))  # upside down
+    model = turned_model(RING, 3, turn * given)
+    found = sfm_shapefit.locate(model, RING / "database.db")
+    (row,) = [row for row in found.cameras if not row.placed]
+    assert row.name == "0003.jpg"
+    assert "contradict the given rotations" in row.reason or "not trusted" in row.reason
+    errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0").position
+    assert errors.max < 2e-6 * 5.0  # exact data, keypoints stored as float32
+
+
+def test_twin_images_stand_at_one_centre_and_their_pair_has_no_parallax(tmp_path):
+    scene = copied(RING, tmp_path)
+    make_twin(scene / "database.db", of=7, twin=8)
+    rotation = pycolmap.Reconstruction(scene / "sparse" / "0").image(7).cam_from_world().rotation
+    model = turned_model(scene, 8, rotation)
+    found = sfm_shapefit.locate(model, scene / "database.db", LocateOptions(scale="unit"))
+    (pair,) = [row for row in found.pairs if (row.name1, row.name2) == ("0007.jpg", "0008.jpg")]
+    assert pair.reason.startswith("no parallax")
+    rows = {row.name: row for row in found.cameras}
+    assert all(row.placed for row in rows.values())
+    np.testing.assert_allclose(rows["0007.jpg"].center, rows["0008.jpg"].center, atol=1e-5)
+
+
+def make_twin(database, of, twin):
+    """Give an image the keypoints of another, which is of smaller id, and its matches."""
+    with sqlite3.connect(database) as connection:
+        keypoints = connection.execute(
+            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (of,)
+        ).fetchone()
+        connection.execute(
+            "UPDATE keypoints SET rows = ?, cols = ?, data = ? WHERE image_id = ?", (*keypoints, twin)
+        )
+        for k in range(1, twin):
+            if k == of:
+                matches = np.repeat(np.arange(keypoints[0], dtype=np.uint32), 2)
+                found = len(matches) // 2, 2, matches.tobytes()
+            else:
+                found = connection.execute(
+                    "SELECT rows, cols, data FROM two_view_geometries WHERE pair_id = ?",
+                    (k * 2147483647 + of,),
+                ).fetchone()
+            connection.execute(
+                "UPDATE two_view_geometries SET rows = ?, cols = ?, data = ? WHERE pair_id = ?",
+                (*found, k * 2147483647 + twin),
+            )
+    connection.close()

@@ -1,0 +1,235 @@
+"""What is said of a view graph before anything is solved."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import sfm_shapefit
+from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
+from sfm_shapefit.cli import app
+from sfm_shapefit.diagnosis import diagnose, direction_spread, theory_of
+from sfm_shapefit.formats import graph_text
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.placement import place
+from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.synthetic import (
+    box_graph_problem,
+    community_graph_problem,
+    expander_graph_problem,
+    random_graph_problem,
+    trajectory_graph_problem,
+)
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import COURTYARD, RING, copied, fingerprint
+
+FAMILIES = {
+    "random": lambda **how: random_graph_problem(60, **how),
+    "sparse": lambda **how: random_graph_problem(100, 0.2, **how),
+    "expander": lambda **how: expander_graph_problem(150, 30, **how),
+    "box": lambda **how: box_graph_problem(150, **how),
+    "trajectory": lambda **how: trajectory_graph_problem(150, **how),
+    "community": lambda **how: community_graph_problem(200, **how),
+}
+
+
+def complete(nodes):
+    nodes = list(nodes)
+    return [(i, j) for i in nodes for j in nodes if i < j]
+
+
+def exact(t, edges):
+    return ViewGraph(len(t), edges, normalized(differences(t, np.array(edges))))
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def test_pieces_hinges_and_components_are_counted_and_named():
+    t = np.random.default_rng(0).standard_normal((11, 3))
+    edges = complete(range(5)) + complete((4, 5, 6)) + [(0, 7)] + complete((8, 9, 10))
+    seen = diagnose(exact(t, edges))
+    assert seen.components == (8, 3)
+    assert [(piece.num_cameras, piece.hinges) for piece in seen.pieces] == [(5, ("4",)), (3, ("4",)), (3, ())]
+    assert seen.left_out["7"] == "pendant: joined by a single pair to camera 0"
+    assert seen.left_out["8"] == "another component"
+    assert set(seen.left_out) == {"5", "6", "7", "8", "9", "10"}
+    assert seen.weak == ()
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+@pytest.mark.parametrize("sigma", [0.01, 0.05])
+def test_the_share_of_wrong_pairs_is_estimated_up_to_a_half(family, sigma):
+    for q, off in ((0.0, 0.01), (0.2, 0.03), (0.4, 0.06), (0.5, 0.09)):  # the documented bounds
+        problem = FAMILIES[family](sigma=sigma, q=q, seed=3)
+        graph = ViewGraph(len(problem.locations), problem.edges, problem.directions)
+        assert diagnose(graph).corruption.share == pytest.approx(problem.corrupted.mean(), abs=off)
+
+
+def test_only_pairs_in_triangles_say_something_of_corruption():
+    t = np.random.default_rng(1).standard_normal((6, 3))
+    square = [(0, 1), (1, 2), (2, 3), (0, 3)]
+    assert diagnose(exact(t[:4], square)).corruption.share is None
+    with_triangle = [*square, (3, 4), (3, 5), (4, 5)]
+    corruption = diagnose(exact(t, with_triangle)).corruption
+    assert (corruption.num_checked, corruption.share) == (3, 0.0)
+
+
+def test_a_camera_seen_in_one_direction_only_is_weak_and_named_so():
+    t = np.random.default_rng(2).standard_normal((10, 3))
+    t[9] = [0.0, 0.0, 60.0]
+    (weak,) = diagnose(exact(t, complete(range(10)))).weak
+    assert weak.name == "9"
+    assert weak.num_pairs == 9
+    assert "nearly parallel" in weak.reasons[0]
+    edges = [*complete(range(9)), (0, 9), (1, 9)]
+    (weak,) = diagnose(exact(t, edges)).weak
+    assert [reason.split(":")[0] for reason in weak.reasons] == [
+        "two pairs or fewer hold it",
+        "the directions that hold it are nearly parallel",
+    ]
+
+
+def test_a_wrong_pair_does_not_hide_that_the_others_are_parallel():
+    t = np.random.default_rng(2).standard_normal((10, 3))
+    t[9] = [0.0, 0.0, 60.0]
+    graph = exact(t, complete(range(10)))
+    v = graph.directions.copy()
+    v[(graph.edges == (0, 9)).all(axis=1)] = [1.0, 0.0, 0.0]
+    assert [camera.name for camera in diagnose(ViewGraph(10, graph.edges, v)).weak] == ["9"]
+
+
+def test_a_camera_of_contradicting_matches_is_weak():
+    t = np.random.default_rng(3).standard_normal((8, 3))
+    graph = exact(t, [pair for pair in complete(range(8)) if pair not in {(0, 7), (1, 7), (2, 7), (3, 7)}])
+    against = np.array([(0, 7), (1, 7), (2, 7), (3, 7)])
+    assert diagnose(graph).weak == ()
+    (weak,) = diagnose(graph, contradicting=against).weak
+    assert weak.name == "7"
+    assert "matches of 4 further pairs contradict the given rotations" in weak.reasons[0]
+
+
+def test_rays_to_points_hold_a_camera_too():
+    t = np.random.default_rng(4).standard_normal((9, 3))
+    edges = complete(range(5)) + [(0, 5), (1, 5)] + [(k, p) for p in (6, 7, 8) for k in (0, 2, 3, 5)]
+    seen = diagnose(exact(t, edges), num_cameras=6)
+    assert (seen.num_cameras, seen.num_points, seen.num_pairs) == (6, 3, 12)
+    assert seen.weak == ()
+    assert [camera.name for camera in diagnose(exact(t[:6], edges[:12])).weak] == ["5"]
+
+
+def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
+    v = np.array([[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]])
+    ends = np.array([(0, 1), (0, 1), (2, 3), (2, 3), (2, 3)])
+    np.testing.assert_allclose(direction_spread(5, ends, v), [0.0, 0.0, 1.0, 1.0, 0.0], atol=1e-15)
+
+
+@pytest.mark.parametrize("method", ["auto", "admm"])
+def test_the_plan_is_what_a_placement_does(method):
+    problem = random_graph_problem(30, seed=5, sigma=0.01)
+    graph = ViewGraph(30, problem.edges, problem.directions)
+    options = PlacementOptions(method=method, tol=1e-4)
+    plan, done = diagnose(graph, options).plan, place(graph, options)
+    assert plan.solver == done.solve.method
+    assert done.solve.method_reason.startswith(plan.solver_reason)
+    assert plan.second_start == (done.finish.lud is not None)
+    assert isinstance(options, SolverOptions)
+
+
+def test_the_plan_says_what_becomes_of_the_starts():
+    t = np.random.default_rng(6).standard_normal((5, 3))
+    graph = exact(t, complete(range(5)))
+    said = {
+        "better is kept, refined": PlacementOptions(),
+        "better is kept, unrefined": PlacementOptions(refine=False),
+        "as it is, as asked": PlacementOptions(objective="shapefit"),
+        "kept, as asked, refined": PlacementOptions(objective="lud"),
+    }
+    for words, options in said.items():
+        assert words in diagnose(graph, options).plan.finish
+    assert "no second start" in diagnose(exact(t[:2], [(0, 1)])).plan.finish
+
+
+def test_theory_is_given_in_words_or_left_out_with_the_reason():
+    problem = random_graph_problem(12, 1.0, seed=7)
+    graph = ViewGraph(12, problem.edges, problem.directions)
+    found = theory_of(graph, problem.locations)
+    assert "less than one pair of 12 cameras" in found.statement
+    assert found.conditions.granted_in_space > 0.0
+    assert "coincide" in theory_of(graph, np.zeros((12, 3))).statement
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("sfm_shapefit.diagnosis.MAX_THEORY_CAMERAS", 11)
+        assert theory_of(graph, problem.locations).conditions is None
+    chain = exact(problem.locations, [(k, k + 1) for k in range(11)])
+    assert "p-typical for no p" in theory_of(chain, problem.locations).statement
+
+
+# --- the command ---------------------------------------------------------------------------------
+
+
+def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
+    scene = copied(COURTYARD, tmp_path)
+    before = fingerprint(tmp_path)
+    result = run("inspect", scene / "sparse" / "0")
+    text = " ".join(result.stdout.replace("\N{BOX DRAWINGS LIGHT VERTICAL}", " ").split())
+    assert result.exit_code == 0, result.output
+    for words in (
+        "found beside the model",
+        "176 usable",
+        "tracks join as nodes",
+        "1 (25 cameras)",
+        "newton:",
+    ):
+        assert words in text
+    assert fingerprint(tmp_path) == before
+
+
+def test_inspect_sees_as_many_wrong_pairs_as_locate_rejects():
+    seen = sfm_shapefit.inspect(COURTYARD / "sparse" / "0").diagnosis
+    assert seen.corruption.share == pytest.approx(44 / 176, abs=0.05)  # self-consistent in part: too low
+
+
+def test_json_has_the_same_content_and_theory():
+    names = ("--input_path", RING / "sparse" / "0", "--database_path", RING / "database.db")
+    facts = json.loads(run("inspect", *names, "--json", "--theory").stdout)
+    assert facts["num_images"] == facts["diagnosis"]["num_cameras"] == 8
+    assert facts["diagnosis"]["plan"]["solver"] == "newton"
+    assert facts["theory"]["conditions"]["granted_in_space"] >= 0.0
+    assert facts["theory"]["statement"]
+    never = json.loads(run("inspect", *names, "--json", "--points", "never").stdout)
+    assert never["points"] == "no, as asked"
+    assert never["diagnosis"]["num_points"] == 0 < facts["diagnosis"]["num_points"]
+    assert never["theory"] is None
+
+
+def test_a_bare_graph_is_diagnosed_too(tmp_path):
+    t = np.random.default_rng(8).standard_normal((6, 3))
+    (tmp_path / "graph.txt").write_text(graph_text(exact(t, [*complete(range(5)), (0, 5)])))
+    result = run("inspect", tmp_path / "graph.txt", "--theory")
+    assert result.exit_code == 0
+    assert "5: pendant" in result.stdout
+    assert "no centres" in result.stdout
+    assert run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db").exit_code == 3
+    assert run("inspect", tmp_path / "nowhere").exit_code == 3
+    assert run("inspect").exit_code == 2
+    assert run("inspect", tmp_path / "graph.txt", "--min-inlier-ratio", "7").exit_code == 2
+
+
+def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):
+    t = np.random.default_rng(9).standard_normal((5, 3))
+    (tmp_path / "graph.txt").write_text(graph_text(exact(t, [(k, (k + 1) % 5) for k in range(5)])))
+    result = run("inspect", tmp_path / "graph.txt", "--json")
+    assert result.exit_code == 4
+    facts = json.loads(result.stdout)["diagnosis"]
+    assert "tie no three cameras" in facts["obstacle"]
+    assert facts["obstacle"] in result.stderr
+    assert facts["plan"] is None
+    assert len(facts["left_out"]) == 5
+
+
+def test_a_model_without_usable_directions_is_refused_as_by_locate():
+    with pytest.raises(UnsolvableError, match="none of the"):
+        sfm_shapefit.inspect(RING / "sparse" / "0", options=LocateOptions(min_inliers=100_000))
