@@ -181,8 +181,8 @@ def section(found: dict[str, list[Row]], about: str) -> str:
     parts = [
         "## Peers on real scenes",
         about + "- Threads: 1; a fresh process each",
-        f"**{sum(check.met for check in every)} of {len(every)} limits met**: by default `locate` has a median"
-        " and a mean error at most 5 % above the lowest of the peers'.",
+        f"**{sum(check.met for check in every)} of {len(every)} limits met**: by default `locate` has a"
+        " median and a mean error at most 5 % above the lowest of the peers'.",
         table(["set", "method", "median / mean / max", "seconds", "note"], rows),
         table(["set", "verdict"], verdicts),
         "### What the columns mean",
