@@ -120,7 +120,7 @@ def test_a_camera_of_wrong_pairs_only_is_not_trusted(noise, seed):
 
 @pytest.mark.parametrize("noise", NOISE)
 def test_a_camera_whose_pairs_are_all_parallel_is_not_trusted(noise):
-    """It stands far off as seen from all others, in truth or by a mistake in the matches: its distance is free."""
+    """It stands far off as seen from all others, in truth or by mistake: its distance is free."""
     v = measured(CENTERS, ALL, noise)
     parallel = np.array([0.0, 0.0, 1.0])
     v[OF_BAD] = normalized(parallel + noise * np.random.default_rng(2).standard_normal((len(OF_BAD), 3)))
@@ -199,17 +199,16 @@ def make_twin(database, of, twin):
         connection.execute(
             "UPDATE keypoints SET rows = ?, cols = ?, data = ? WHERE image_id = ?", (*keypoints, twin)
         )
-        for k in range(1, twin):
-            if k == of:
-                matches = np.repeat(np.arange(keypoints[0], dtype=np.uint32), 2)
-                found = len(matches) // 2, 2, matches.tobytes()
-            else:
-                found = connection.execute(
-                    "SELECT rows, cols, data FROM two_view_geometries WHERE pair_id = ?",
-                    (k * 2147483647 + of,),
-                ).fetchone()
-            connection.execute(
-                "UPDATE two_view_geometries SET rows = ?, cols = ?, data = ? WHERE pair_id = ?",
-                (*found, k * 2147483647 + twin),
-            )
+        own = np.repeat(np.arange(keypoints[0], dtype=np.uint32), 2)
+        connection.execute("DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = ?", (twin,))
+        connection.execute(
+            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config) "
+            "SELECT pair_id + ?, rows, cols, data, config FROM two_view_geometries "
+            "WHERE pair_id % 2147483647 = ?",
+            (twin - of, of),
+        )
+        connection.execute(
+            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config) VALUES (?, ?, 2, ?, 2)",
+            (of * 2147483647 + twin, keypoints[0], own.tobytes()),
+        )
     connection.close()
