@@ -231,7 +231,8 @@ def test_the_comparison_with_glomap_shows_both_sides_and_survives_its_failure():
     assert row_of(section, "GLOMAP", "castle-P30 (m) | two")[2] == "-"
 
 
-def test_sets_without_a_target_have_no_checks():
+def test_sets_without_a_target_have_no_checks(monkeypatch):
+    monkeypatch.setitem(real.SCENES, "Herz-Jesus-P8", real.Scene(name="Herz-Jesus-P8", unit="m"))
     assert real.all_checks(measured(name="Herz-Jesus-P8")) == []
 
 
