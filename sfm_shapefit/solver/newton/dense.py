@@ -45,7 +45,6 @@ _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
 """By bytes per number: in single precision each gains two digits and more, or the matrix is too ill-conditioned."""
 _SINGLE_FROM = 450  # unknowns from which a factor in single precision saves more than its refinements cost
-_LANES = 16  # entries that a vectorised loop takes at once
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
 
@@ -154,12 +153,12 @@ def _cycle(
     problem: Any, iterate: Any, model: Any, factor: Any, step: Any, progress: Any, tol: float
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
-    first, multiplier = progress.gap, progress.multiplier
+    first = progress.gap
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
     if _factorise(problem, model, factor) != 0:
-        return Progress(mu, multiplier, progress.objective, first)
+        return Progress(mu, progress.multiplier, progress.objective, first)
     order = float(problem.c.size)
     step_work = EDGE_WORK * len(problem.w) + SOLVE_WORK * order**2
     work = order**3 / 3.0 + 0.5 * EDGE_WORK * len(problem.w)
@@ -169,8 +168,7 @@ def _cycle(
         target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
         if not exact:
             break
-        multiplier = take(problem, iterate, step, mu, multiplier, target)
-        progress = measure(problem, iterate, mu, multiplier)
+        progress = take(problem, iterate, step, mu, progress.multiplier, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
@@ -212,15 +210,13 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     c = problem.c.reshape(order)
     along_c = size / dot(problem.c, problem.c)
     for q in range(order):
-        column = factor.matrix[q * order : (q + 1) * order]
-        translation = factor.translations[q % len(problem.axes)]
+        column = factor.matrix[q * order + q : (q + 1) * order]
+        translation = factor.translations[q % len(problem.axes), q:]
+        rest = c[q:]
         slope = along_c * c[q]
-        first = max(
-            0, order - (order - q + _LANES - 1) // _LANES * _LANES
-        )  # whole vectors; the rest is not read
-        for p in range(first, order):
-            column[p] = slope * c[p] + size * translation[p]
-        column[q] += ridge
+        for p in range(len(column)):  # of views that begin at 0: an index that may be negative is slow
+            column[p] = slope * rest[p] + size * translation[p]
+        column[0] += ridge
 
 
 @kernel(inline=True)
