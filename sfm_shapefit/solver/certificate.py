@@ -44,6 +44,7 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorise
+from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, routine_addresses, work_integers
 from sfm_shapefit.laplacian.operators import adjacency, apply_incidence_transposed
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
@@ -63,6 +64,10 @@ _SEED = 1
 _EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
+_REGULAR_SINGLE = 1e-3  # the same for a factor in single precision: far above its rounding, n d eps
+_SMALL, _LARGEST_DENSE = 450, 1800  # unknowns up to which, or up to which on dense graphs, the factor is dense
+_DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination saves much
+_SINGLE_FROM = 450  # unknowns from which a factor in single precision is tried first
 _UNIQUENESS_EDGES = 500_000  # beyond it uniqueness is not examined: ordering alone takes seconds
 _UNIQUENESS_FLOPS = 1e11  # a few seconds; beyond it uniqueness is not examined
 
@@ -356,22 +361,95 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
-    neighbours = adjacency(graph.num_cameras, graph.edges)
+    v, w = graph.directions, graph.weights
+    longest = int(np.argmax(along(differences(t, graph.edges), v)))
+    n, d = graph.num_cameras, graph.dimension
+    share = 2.0 * graph.num_edges / (n * (n - 1.0))
+    if n * d <= _SMALL or (n * d <= _LARGEST_DENSE and share >= _DENSE_GRAPH):
+        return _is_regular_dense(graph, y, longest)
+    neighbours = adjacency(n, graph.edges)
     symbolic = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
-    d = graph.dimension
     if symbolic.flops * d**3 > _UNIQUENESS_FLOPS:
         return None
-    v = graph.directions
-    norms = np.linalg.norm(y, axis=1)
-    held = norms < (1.0 - _STRICT) * graph.weights
-    u = np.where(held, 0.0, 1.0 / np.maximum(norms, np.finfo(float).tiny))[:, None] * y
-    blocks = np.eye(d) - v[:, :, None] * v[:, None, :] - u[:, :, None] * u[:, None, :]
-    longest = int(np.argmax(along(differences(t, graph.edges), v)))
-    blocks[longest] += np.outer(v[longest], v[longest])
+    blocks = np.empty((graph.num_edges, d, d))
+    _set_conditions(v, w, y, longest, blocks)
     try:
-        return factorise(symbolic, graph.weights[:, None, None] * blocks).smallest_pivot > _REGULAR
+        return factorise(symbolic, blocks).smallest_pivot > _REGULAR
     except UnsolvableError:
         return False
+
+
+def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
+    """Return whether the conditions of uniqueness have a regular matrix, by a dense factor of it."""
+    n, d = graph.num_cameras, graph.dimension
+    blocks = np.empty((graph.num_edges, d, d))
+    _set_conditions(graph.directions, graph.weights, y, longest, blocks)
+    diagonal = np.zeros((n, d, d))
+    with one_blas_thread():
+        if n * d >= _SINGLE_FROM:
+            matrix = np.zeros((n * d) ** 2, np.float32)
+            lapack = routine_addresses(np.float32), FLAGS, work_integers()
+            if _least_pivot(graph.edges, blocks, diagonal, matrix, *lapack) > _REGULAR_SINGLE:
+                return True
+        lapack = routine_addresses(np.float64), FLAGS, work_integers()
+        return bool(_least_pivot(graph.edges, blocks, diagonal, np.zeros((n * d) ** 2), *lapack) > _REGULAR)
+
+
+@kernel(exact=True)
+def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
+    """Write the block of each pair in the matrix whose null space is what the dual leaves open, (m, d, d)."""
+    d = v.shape[1]
+    for e in range(len(w)):
+        square = 0.0
+        for k in range(d):
+            square += y[e, k] ** 2
+        bend = w[e] / square if np.sqrt(square) >= (1.0 - _STRICT) * w[e] else 0.0
+        for k in range(d):
+            for q in range(d):
+                x = w[e] if k == q else 0.0
+                blocks[e, k, q] = x - w[e] * v[e, k] * v[e, q] - bend * y[e, k] * y[e, q]
+    for k in range(d):
+        for q in range(d):
+            blocks[longest, k, q] += w[longest] * v[longest, k] * v[longest, q]
+
+
+@kernel(exact=True)
+def _least_pivot(
+    edges: Any, blocks: Any, diagonal: Any, matrix: Any, routines: Any, flags: Any, integers: Any
+) -> float:
+    """Factor the Laplacian of the blocks, its last node grounded; return the least pivot per diagonal entry.
+
+    0 if a pivot is not positive. `matrix` is zero, column-major, and `diagonal` is scratch (n, d, d).
+    """
+    n, d = diagonal.shape[0], diagonal.shape[1]
+    order = n * d
+    diagonal[:] = 0.0
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        corner = min(i, j) * d * order + max(i, j) * d
+        for k in range(d):
+            for q in range(d):
+                x = blocks[e, k, q]
+                matrix[corner + k * order + q] -= x
+                diagonal[i, k, q] += x
+                diagonal[j, k, q] += x
+    ground = 0.0
+    for i in range(n):
+        for k in range(d):
+            ground += diagonal[i, k, k] / order
+    for k in range(d):
+        diagonal[n - 1, k, k] += ground
+    for i in range(n):
+        for k in range(d):
+            for q in range(k, d):
+                matrix[(i * d + k) * order + i * d + q] = diagonal[i, k, q]
+    if potrf(routines, flags, integers, matrix, 0, order, order) != 0:
+        return 0.0
+    least = np.inf
+    for i in range(n):
+        for k in range(d):
+            least = min(least, matrix[(i * d + k) * (order + 1)] ** 2 / diagonal[i, k, k])
+    return least
 
 
 def _checked_objective(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> float:

@@ -40,16 +40,21 @@ from sfm_shapefit.solver.newton.steps import (
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.viewgraph import ViewGraph
 
-_RIDGE = 1e-14, 1e-9  # first and last multiple of the identity added to M, per mean eigenvalue
-_LANES = 16  # entries that a vectorised loop takes at once
+_RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
+"""By bytes per number: first and last multiple of the identity added to M, per mean eigenvalue."""
+_REFINEMENTS = {4: 8, 8: REFINEMENTS}
+"""By bytes per number: in single precision each gains two digits and more, or the matrix is too ill-conditioned."""
+_SINGLE_FROM = 450  # unknowns from which a factor in single precision saves more than its refinements cost
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
 
 class DenseFactor(NamedTuple):
     """Room for M and its Cholesky factor, and what LAPACK is called with."""
 
-    matrix: FloatArray
-    """(nd * nd,) lower triangle in column-major order."""
+    matrix: Any
+    """(nd * nd,) lower triangle in column-major order, float32 or float64."""
+    right: Any
+    """(nd,) scratch of the same type: right-hand side, then solution."""
     diagonal: FloatArray
     """(n, d, d) scratch: the diagonal blocks of M."""
     half: FloatArray
@@ -59,6 +64,9 @@ class DenseFactor(NamedTuple):
     routines: IntArray
     flags: Any
     integers: Any
+    ridge: tuple[float, float]
+    """First and last multiple of the identity added to M, per mean eigenvalue."""
+    refinements: int
 
 
 def solve_newton_dense(
@@ -80,11 +88,8 @@ def solve_newton_dense(
     """
     problem, iterate, model, step = allocate(graph)
     n, d = problem.c.shape
-    lapack = routine_addresses(np.float64), FLAGS, work_integers()
-    translations = np.tile(np.eye(d) / n, n)
-    factor = DenseFactor(
-        np.empty((n * d) ** 2), np.empty((n, d, d)), np.empty((d, d - 1)), translations, *lapack
-    )
+    single = n * d >= _SINGLE_FROM
+    factor = _allocate_factor(n, d, np.float32 if single else np.float64)
     with one_blas_thread():
         if not _start(problem, iterate, model, factor):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
@@ -92,6 +97,8 @@ def solve_newton_dense(
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
+            if single and stalled:
+                single, factor, stalled = False, _allocate_factor(n, d, np.float64), 0
             limit = min(chunk, max_iterations - count)
             done, stalled, progress = _newton(
                 problem, iterate, model, factor, step, progress, tol, limit, stalled
@@ -100,6 +107,23 @@ def solve_newton_dense(
             if is_cancelled(on_iteration, count, progress):
                 break
     return *answer(problem, iterate, progress, tol), count
+
+
+def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFactor:
+    """Return room for a factor of float32 or float64."""
+    size = np.dtype(dtype).itemsize
+    return DenseFactor(
+        matrix=np.empty((n * d) ** 2, dtype),
+        right=np.empty(n * d, dtype),
+        diagonal=np.empty((n, d, d)),
+        half=np.empty((d, d - 1)),
+        translations=np.tile(np.eye(d) / n, n),
+        routines=routine_addresses(dtype),
+        flags=FLAGS,
+        integers=work_integers(),
+        ridge=_RIDGES[size],
+        refinements=_REFINEMENTS[size],
+    )
 
 
 @kernel()
@@ -116,7 +140,7 @@ def _newton(
 ) -> tuple[int, int, Progress]:
     """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
     count = 0
-    while count < limit and progress.gap > tol and stalled < STALL:
+    while count < limit and progress.gap > tol and stalled < (1 if factor.right.itemsize == 4 else STALL):
         before = progress.gap
         count += 1
         progress = _cycle(problem, iterate, model, factor, step, progress, tol)
@@ -129,12 +153,12 @@ def _cycle(
     problem: Any, iterate: Any, model: Any, factor: Any, step: Any, progress: Any, tol: float
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
-    first, multiplier = progress.gap, progress.multiplier
+    first = progress.gap
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
     if _factorise(problem, model, factor) != 0:
-        return Progress(mu, multiplier, progress.objective, first)
+        return Progress(mu, progress.multiplier, progress.objective, first)
     order = float(problem.c.size)
     step_work = EDGE_WORK * len(problem.w) + SOLVE_WORK * order**2
     work = order**3 / 3.0 + 0.5 * EDGE_WORK * len(problem.w)
@@ -144,8 +168,7 @@ def _cycle(
         target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
         if not exact:
             break
-        multiplier = take(problem, iterate, step, mu, multiplier, target)
-        progress = measure(problem, iterate, mu, multiplier)
+        progress = take(problem, iterate, step, mu, progress.multiplier, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
@@ -167,7 +190,7 @@ def _factorise(problem: Any, model: Any, factor: Any) -> int:
     size = 0.0  # mean eigenvalue
     for e in range(len(problem.w)):
         size += 2.0 * (len(problem.axes) - 1) * problem.w[e] * model.inverse[e] / order
-    ridge, last = _RIDGE
+    ridge, last = factor.ridge
     info = 1
     while info != 0 and ridge <= last:
         _lift(problem, factor, size, ridge * size)
@@ -187,15 +210,13 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     c = problem.c.reshape(order)
     along_c = size / dot(problem.c, problem.c)
     for q in range(order):
-        column = factor.matrix[q * order : (q + 1) * order]
-        translation = factor.translations[q % len(problem.axes)]
+        column = factor.matrix[q * order + q : (q + 1) * order]
+        translation = factor.translations[q % len(problem.axes), q:]
+        rest = c[q:]
         slope = along_c * c[q]
-        first = max(
-            0, order - (order - q + _LANES - 1) // _LANES * _LANES
-        )  # whole vectors; the rest is not read
-        for p in range(first, order):
-            column[p] = slope * c[p] + size * translation[p]
-        column[q] += ridge
+        for p in range(len(column)):  # of views that begin at 0: an index that may be negative is slow
+            column[p] = slope * rest[p] + size * translation[p]
+        column[0] += ridge
 
 
 @kernel(inline=True)
@@ -246,7 +267,7 @@ def _propose(
     _solve(factor, nodes)
     multiplier = dot(c, nodes) / scale
     extend_step(problem, model, multiplier * a - nodes, step)
-    for _ in range(REFINEMENTS):
+    for _ in range(factor.refinements):
         nodes[:] = multiplier * c - nodes
         if np.max(np.abs(nodes)) <= allowed:
             return float(multiplier), True
@@ -260,4 +281,10 @@ def _propose(
 @kernel(inline=True)
 def _solve(factor: Any, nodes: Any) -> None:
     """Replace `nodes` by M^-1 nodes."""
-    solve_factored(factor.routines, factor.flags, factor.integers, factor.matrix, nodes.size, nodes)
+    right = factor.right
+    x = nodes.reshape(right.size)
+    for k in range(len(right)):
+        right[k] = x[k]
+    solve_factored(factor.routines, factor.flags, factor.integers, factor.matrix, right.size, right)
+    for k in range(len(right)):
+        x[k] = right[k]

@@ -146,7 +146,7 @@ def _cycle(
     tol: float,
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
-    first, multiplier = progress.gap, progress.multiplier
+    first = progress.gap
     mu = min(progress.mu, MU_PER_GAP * first)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
@@ -164,8 +164,7 @@ def _cycle(
         target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
-        multiplier = take(problem, iterate, step, mu, multiplier, target)
-        progress = measure(problem, iterate, mu, multiplier)
+        progress = take(problem, iterate, step, mu, progress.multiplier, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break

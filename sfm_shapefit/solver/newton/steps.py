@@ -44,6 +44,8 @@ class Problem(NamedTuple):
     v: FloatArray
     basis: FloatArray
     """(m, d, d - 1) orthonormal columns B_e, orthogonal to v_e."""
+    tilt: FloatArray
+    """(m,) 1 / (1 + |v_e0|), with the sign of v_e0: what a product with B_e needs besides v_e."""
     w: FloatArray
     c: FloatArray
     kappa: float
@@ -120,12 +122,13 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
     def edges() -> FloatArray:
         return np.empty((m, d - 1))
 
-    basis = np.empty((m, d, d - 1))
-    set_basis(graph.directions, basis)
+    basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
+    set_basis(graph.directions, basis, tilt)
     problem = Problem(
         graph.edges.astype(np.uint32),
         graph.directions,
         basis,
+        tilt,
         graph.weights,
         scale_functional(graph),
         float(graph.weights.sum()),
@@ -148,11 +151,12 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
 
 
 @kernel()
-def set_basis(v: Any, basis: Any) -> None:
+def set_basis(v: Any, basis: Any, tilt: Any) -> None:
     """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column."""
     for e in range(len(v)):
-        sign = 1.0 if v[e, 0] >= 0.0 else -1.0
+        sign = np.copysign(1.0, v[e, 0])
         inverse = 1.0 / (1.0 + abs(v[e, 0]))
+        tilt[e] = sign * inverse
         for q in range(v.shape[1] - 1):
             basis[e, 0, q] = -sign * v[e, q + 1]
             for k in range(1, v.shape[1]):
@@ -237,15 +241,14 @@ def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -
     """Begin a step: dT = 0, y+ = g with g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, nodes = D^T g."""
     y, r = iterate.y, iterate.r
     step.t[:] = 0.0
-    step.r[:] = 0.0
     for e in range(len(problem.w)):
         rr = mu * mu
         for k in range(len(problem.transverse)):
             rr += r[e, k] * r[e, k]
-        step.rho[e] = np.sqrt(rr)
-    for e in range(len(problem.w)):
-        inverse = model.inverse[e]
-        keep, pull = 1.0 - step.rho[e] * inverse, problem.w[e] * inverse
+            step.r[e, k] = 0.0
+        rho, inverse = np.sqrt(rr), model.inverse[e]
+        keep, pull = 1.0 - rho * inverse, problem.w[e] * inverse
+        step.rho[e] = rho
         for k in range(len(problem.transverse)):
             step.y[e, k] = keep * y[e, k] + pull * r[e, k]
     sum_at_nodes(problem, step)
@@ -264,8 +267,6 @@ def extend_step(problem: Any, model: Any, dt: Any, step: Any) -> None:
     for e in range(len(problem.w)):
         for k in range(len(problem.transverse)):
             step.r[e, k] += change[e, k]
-    for e in range(len(problem.w)):
-        for k in range(len(problem.transverse)):
             x = step.y[e, k]
             for q in range(len(problem.transverse)):
                 x += model.s[e, k, q] * change[e, q]
@@ -275,35 +276,42 @@ def extend_step(problem: Any, model: Any, dt: Any, step: Any) -> None:
 
 @kernel(inline=True)
 def sum_at_nodes(problem: Any, step: Any) -> None:
-    """nodes = D^T y+."""
-    edges, basis, nodes = problem.edges, problem.basis, step.nodes
+    """nodes = D^T B y+, by the reflections as in `set_residuals`."""
+    edges, v, tilt, y, nodes = problem.edges, problem.v, problem.tilt, step.y, step.nodes
     nodes[:] = 0.0
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        for k in range(len(problem.axes)):
-            x = 0.0
-            for q in range(len(problem.transverse)):
-                x += basis[e, k, q] * step.y[e, q]
-            nodes[i, k] += x
-            nodes[j, k] -= x
+        along = 0.0
+        for q in range(len(problem.transverse)):
+            along += v[e, q + 1] * y[e, q]
+        along = np.copysign(along, along * tilt[e])
+        nodes[i, 0] -= along
+        nodes[j, 0] += along
+        along *= tilt[e]
+        for q in range(len(problem.transverse)):
+            x = y[e, q] - along * v[e, q + 1]
+            nodes[i, q + 1] += x
+            nodes[j, q + 1] -= x
 
 
 @kernel(inline=True)
 def set_residuals(problem: Any, t: Any, r: Any) -> None:
-    """r_e = B_e^T (t_i - t_j)."""
-    edges, basis = problem.edges, problem.basis
+    """r_e = B_e^T (t_i - t_j), from v_e itself: reading B_e takes longer than to reflect."""
+    edges, v, tilt = problem.edges, problem.v, problem.tilt
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
+        along = 0.0
+        for k in range(1, len(problem.axes)):
+            along += v[e, k] * (t[i, k] - t[j, k])
+        along = tilt[e] * along + (t[i, 0] - t[j, 0])
+        along = np.copysign(along, along * tilt[e])
         for q in range(len(problem.transverse)):
-            x = 0.0
-            for k in range(len(problem.axes)):
-                x += basis[e, k, q] * (t[i, k] - t[j, k])
-            r[e, q] = x
+            r[e, q] = (t[i, q + 1] - t[j, q + 1]) - along * v[e, q + 1]
 
 
 @kernel(inline=True)
-def take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, target: float) -> float:
-    """Move along the step as far as it helps; return the new multiplier."""
+def take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, target: float) -> Progress:
+    """Move along the step as far as it helps; return the scalars there."""
     alpha = 1.0
     while alpha > 0.0 and increase(problem, iterate, step, mu, alpha) > 0.0:
         alpha = 0.5 * alpha if alpha > 0.5**_HALVINGS else 0.0
@@ -314,8 +322,8 @@ def take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, ta
         scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0)))
         if scale * target > reached:
             keep, gain, reached = 0.0, scale, scale * target
-    move(problem, iterate, step, alpha, keep, gain)
-    return reached
+    objective, bound = move(problem, iterate, step, alpha, keep, gain)
+    return Progress(mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa)
 
 
 @kernel(inline=True)
@@ -379,15 +387,24 @@ def largest(x: Any) -> float:
 
 
 @kernel(inline=True)
-def move(problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float) -> None:
-    """T += alpha dT, r += alpha dr, y = keep y + gain y+."""
+def move(
+    problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
+) -> tuple[float, float]:
+    """T += alpha dT, r += alpha dr, y = keep y + gain y+; return sum_e w_e ||r_e|| and sum_e <y_e, r_e>."""
     iterate.t[:] += alpha * step.t
+    residual = bound = 0.0
     for e in range(len(problem.w)):
+        rr = yr = 0.0
         for k in range(len(problem.transverse)):
-            iterate.r[e, k] += alpha * step.r[e, k]
-    for e in range(len(problem.w)):
-        for k in range(len(problem.transverse)):
-            iterate.y[e, k] = keep * iterate.y[e, k] + gain * step.y[e, k]
+            r = iterate.r[e, k] + alpha * step.r[e, k]
+            y = keep * iterate.y[e, k] + gain * step.y[e, k]
+            iterate.r[e, k] = r
+            iterate.y[e, k] = y
+            rr += r * r
+            yr += y * r
+        residual += problem.w[e] * np.sqrt(rr)
+        bound += yr
+    return residual, bound
 
 
 @kernel(inline=True)
