@@ -239,7 +239,7 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
         for a in range(d):
             for b in range(d):
                 chi2 += residual[a] * information[e, a, b] * residual[b]
-        total += 0.5 * w[e] * KERNEL_WIDTH**2 * chi2 / (KERNEL_WIDTH**2 + chi2)
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * np.arctan(chi2 / KERNEL_WIDTH**2)
     return total
 
 
@@ -270,7 +270,7 @@ def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, o
                 pull[a] += information[e, a, b] * (u[b] - v[e, b])
             chi2 += (u[a] - v[e, a]) * pull[a]
             trace += information[e, a, a]
-        weight = w[e] / (1.0 + chi2 / KERNEL_WIDTH**2) ** 2
+        weight = w[e] / (1.0 + (chi2 / KERNEL_WIDTH**2) ** 2)
         damped[e] = w[e] * trace / (d * length * length)
         for a in range(d):
             gradient[e, a] = 0.0

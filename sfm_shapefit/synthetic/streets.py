@@ -2,7 +2,8 @@
 
 Cameras drive along a line, so that the directions between them say nothing of their distances; rays to points
 3 to 10 m aside do. Cameras are a metre apart on average, the speed varies smoothly by a factor of 3. Each
-camera starts tracks, seen by it and the next 3 to 7, of a point beside the middle of them.
+camera starts tracks, seen by it and the next 3 to 7, of a point beside the middle of them. Noise is a random
+vector of 0.01 rad between cameras and of 1e-3 rad, a pixel at a focal length of 1000, towards points.
 """
 
 from dataclasses import dataclass
@@ -15,7 +16,7 @@ from sfm_shapefit.synthetic.graphs import Seed
 
 _BAND = 10  # cameras ahead that a camera is paired with
 _PAIR_NOISE_RAD, _PAIR_SHARE_WRONG = 0.01, 0.1
-_RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15  # a pixel at a focal length of 1000
+_RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15
 _SPEED_RATIO, _WAVE = 3.0, 50.0  # largest over smallest speed, and cameras per wave of it
 
 
@@ -60,7 +61,7 @@ def street_problem(
     to_point = np.arange(len(edges)) >= len(pairs)
     true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
     noise = np.where(to_point, _RAY_NOISE_RAD, _PAIR_NOISE_RAD)
-    measured = normalized(true + noise[:, None] * rng.standard_normal(true.shape))
+    measured = normalized(true + noise[:, None] * normalized(rng.standard_normal(true.shape)))
     wrong = normalized(rng.standard_normal(true.shape))
     corrupted = rng.random(len(edges)) < np.where(to_point, _RAY_SHARE_WRONG, _PAIR_SHARE_WRONG)
     return StreetProblem(
@@ -68,7 +69,7 @@ def street_problem(
         num_cameras=n,
         edges=edges,
         directions=np.where(corrupted[:, None], wrong, measured),
-        covariance=noise[:, None, None] ** 2 * np.eye(2),
+        covariance=noise[:, None, None] ** 2 / 3.0 * np.eye(2),  # of a random vector of that length
         corrupted=corrupted,
     )
 
