@@ -119,10 +119,14 @@ def finish(
     lud = _lud_start(graph, classes, options.threads) if wants_lud else None
     plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
 
-    starts = [_refined("ShapeFit", solved.locations, graph, metric, plan)]
-    if lud is not None:
-        starts.append(_refined("LUD", lud.locations, graph, metric, plan))
     apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
+    candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
+    if apart is not None and apart > COLLAPSED:
+        candidates.reverse()  # the likely better one first: the other ends early where it loses
+    starts: list[Start] = []
+    for name, locations in candidates:
+        rival = starts[0].best if starts else None
+        starts.append(_refined(name, locations, graph, metric, plan, rival))
     levels = _common_levels(graph, starts, metric)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     kept, reason = _choose(starts, costs, apart, options)
@@ -170,10 +174,15 @@ def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult |
 
 
 def _refined(
-    name: str, locations: FloatArray, graph: ViewGraph, metric: Metric, plan: SymbolicFactor | None
+    name: str,
+    locations: FloatArray,
+    graph: ViewGraph,
+    metric: Metric,
+    plan: SymbolicFactor | None,
+    rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
-    refined = None if plan is None else refine_angles(graph, locations, metric, plan)
+    refined = None if plan is None else refine_angles(graph, locations, metric, plan, rival)
     if refined is not None and projected_length(graph, refined.locations) <= 0.0:
         refined = None
     return Start(name=name, locations=locations, refined=refined)

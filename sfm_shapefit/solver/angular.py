@@ -49,7 +49,8 @@ _LEAST_SHARE = 0.2  # of a class inside the kernel, below which its level stays:
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-8, 1e2
 _SHORTEST = 1e-3  # of the median length: the floor under |d|, where a direction says nothing
 _SETTLED = 0.03  # relative change of the levels that counts as none
-_CONVERGED = 1e-6  # relative decrease of the cost; on exact data the step after that is exact
+_CONVERGED = 3e-5  # relative decrease of the cost; on exact data the step after that is exact
+_HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival it does not catch up
 _MAX_STEPS = 60
 _MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
 _MAX_BYTES = 2_000_000_000
@@ -88,7 +89,13 @@ def plan_refinement(graph: ViewGraph) -> SymbolicFactor | None:
     return plan if plan.num_bytes(graph.dimension, np.float64) <= _MAX_BYTES else None
 
 
-def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: SymbolicFactor) -> AngularResult:
+def refine_angles(
+    graph: ViewGraph,
+    start: FloatArray,
+    metric: Metric,
+    plan: SymbolicFactor,
+    rival: FloatArray | None = None,
+) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
     Args:
@@ -96,6 +103,8 @@ def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: Sym
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
         plan: of the factorisation, from `plan_refinement`.
+        rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
+            as low as these, and where it clearly cannot.
 
     Returns:
         Locations whose cost at the final levels is not above that of the start: these, if nothing better
@@ -104,6 +113,7 @@ def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: Sym
     factor = allocate_factor(plan, graph.dimension)
     spread = _spread(graph, metric)
     first = _unit(start)
+    other = None if rival is None else _unit(rival)
     t, damping, steps = first, _FIRST_DAMPING, 0
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
@@ -115,11 +125,18 @@ def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: Sym
         steps += 1
         if settled and before - after <= _CONVERGED * before:
             break
+        if settled and other is not None and _is_decided(before, after, _cost(graph, information, other)):
+            break
     information = _information(graph, spread, levels[metric.classes])
     cost, first_cost = _cost(graph, information, t), _cost(graph, information, first)
     if first_cost < cost:
         t, cost = first, first_cost
     return AngularResult(locations=t, levels_rad=levels, cost=cost, iterations=steps)
+
+
+def _is_decided(before: float, after: float, rival: float) -> bool:
+    """Whether a cost has reached the rival's, or stays above it even if it falls many times as much again."""
+    return abs(after - rival) <= _CONVERGED * rival or after - rival > _HOPELESS * (before - after)
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
