@@ -7,12 +7,13 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, graph_peers, real, scale, solver, trust
+from benchmarks import coherent, families, graph_peers, real, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
     "solver": solver,
     "scale": scale,
+    "graphs": families,
     "peers-graphs": graph_peers,
     "trust": trust,
     "coherent": coherent,

@@ -31,7 +31,7 @@ from scipy.special import chdtri
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import tangent_bases
+from sfm_shapefit.geometry import median_spread, tangent_bases
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
@@ -46,10 +46,12 @@ KERNEL_WIDTH = 3.0
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH  # exact data: a smaller level would reject pairs for their rounding
 _LEAST_SHARE = 0.2  # of a class inside the kernel, below which its level stays: most of it is not fitted yet
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-8, 1e2
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
 _SHORTEST = 1e-3  # of the median length: the floor under |d|, where a direction says nothing
 _SETTLED = 0.03  # relative change of the levels that counts as none
-_CONVERGED = 3e-5  # relative decrease of the cost; on exact data the step after that is exact
+_CONVERGED = 1e-9  # relative decrease of the cost that counts as none
+_STILL = 1e-6  # move, as a share of the extent, of all but a tenth of the nodes, that counts as none
+_ALIKE = 1e-6  # relative difference of costs that says that two refinements end at the same place
 _HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival it does not catch up
 _MAX_STEPS = 60
 _MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
@@ -121,9 +123,10 @@ def refine_angles(
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
         information = _information(graph, spread, levels[metric.classes])
-        t, damping, before, after = _step(graph, information, factor, t, damping)
-        steps += 1
-        if settled and before - after <= _CONVERGED * before:
+        moved, damping, before, after = _step(graph, information, factor, t, damping)
+        still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
+        t, steps = moved, steps + 1
+        if settled and still:
             break
         if settled and other is not None and _is_decided(before, after, _cost(graph, information, other)):
             break
@@ -136,7 +139,7 @@ def refine_angles(
 
 def _is_decided(before: float, after: float, rival: float) -> bool:
     """Whether a cost has reached the rival's, or stays above it even if it falls many times as much again."""
-    return abs(after - rival) <= _CONVERGED * rival or after - rival > _HOPELESS * (before - after)
+    return abs(after - rival) <= _ALIKE * rival or after - rival > _HOPELESS * (before - after)
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
@@ -227,6 +230,15 @@ def _unit(t: FloatArray) -> FloatArray:
     """Return the locations centred and of unit norm."""
     centred = t - t.mean(axis=0)
     return np.asarray(centred / np.sqrt(np.sum(centred * centred)))
+
+
+def _motion(t: FloatArray, moved: FloatArray) -> float:
+    """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
+
+    A few loose nodes may wander for long while nothing else changes; in a long chain the cost may hardly
+    fall while all of it still moves.
+    """
+    return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 
 def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:

@@ -300,6 +300,18 @@ def community_graph_problem(
     return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
 
 
+def measured_problem(
+    locations: FloatArray,
+    edges: IntArray,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
+) -> GraphProblem:
+    """Return directions between given locations (n, d) along given pairs (m, 2)."""
+    return _measured(locations, edges, sigma, q, np.random.default_rng(seed), corruption)
+
+
 def _measured(
     locations: FloatArray,
     edges: IntArray,
