@@ -108,8 +108,8 @@ QUANTITIES = (
         unit="1",
         better="lower",
         rel_tol=0.1,
-        meaning=f"of the distances of cameras, after robust alignment, of those whose trust is {_MIN_TRUST:g}"
-        " or more; largest of the seeds",
+        meaning="of the distances of cameras after least squares alignment, those whose trust is "
+        f"{_MIN_TRUST:g} or more; largest of the seeds",
     ),
     Quantity(name="kept", unit="cameras", better="higher", rel_tol=0.0, meaning="these, fewest of the seeds"),
     Quantity(
@@ -237,7 +237,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     """Place one graph of a problem and compare with its truth."""
     import numpy as np
 
-    from sfm_shapefit.geometry import fit_similarity_l1
+    from sfm_shapefit.geometry import fit_similarity
     from sfm_shapefit.placement import place
 
     one = drawn(problem, seed, data)
@@ -247,7 +247,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     rows, count = placement.cameras, len(placement.cameras)
     truth, lud = one.truth[rows], placement.finish.lud
     kept = placement.assessment.trust[:count] >= _MIN_TRUST
-    aligned = fit_similarity_l1(placement.locations[kept], truth[kept], rotate=False)
+    aligned = fit_similarity(placement.locations[kept], truth[kept], rotate=False)
     distances = np.linalg.norm(aligned.apply(placement.locations[kept]) - truth[kept], axis=1)
     best = np.nan
     if one.graph.num_cameras <= _ORACLE_NODES and problem.spec.family != "madrid":

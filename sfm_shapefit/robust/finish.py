@@ -132,15 +132,17 @@ def finish(
     kept, reason = _choose(starts, costs, apart, options)
     if plan is None and options.refine and options.objective != "shapefit":
         reason += "; not refined, since the factor for that would be too large"
+    moved = _moves(kept)
+    certified = kept.name == "ShapeFit" and moved[1] == 0.0  # to the bit
     return Finish(
-        locations=normalized_locations(graph, kept.best),
+        locations=solved.locations if certified else normalized_locations(graph, kept.best),
         start=kept.name,
-        refined=_moves(kept)[1] > 0.0,
+        refined=moved[1] > 0.0,
         reason=reason,
         disagreement=apart,
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=_moves(kept),
+        moved=moved,
         lud=lud,
     )
 
@@ -152,7 +154,7 @@ def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
 
 
 def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
-    """Return the median length of each camera's pairs, (n,), at least a millionth of the median of all."""
+    """Return the median length of each camera's pairs, (n,), at least a millionth of the mean of all."""
     lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
     camera = graph.edges.T.ravel()
     order = np.lexsort((np.tile(lengths, 2), camera))
@@ -160,7 +162,7 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     first = np.cumsum(degree) - degree
     ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
-    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.median(lengths)))
+    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
 
 
 def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
@@ -205,7 +207,8 @@ def _choose(
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
     if len(starts) == 1:
-        return by_name["ShapeFit"], "the graph has no second start"
+        wanted = ", which LUD would have been" if options.objective == "lud" else ""
+        return by_name["ShapeFit"], f"the graph has no second start{wanted}"
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
     assert apart is not None

@@ -15,8 +15,8 @@ error than least squares on the right directions alone, where this takes 4 %.
 
 The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
 A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
-Laplacian, and so does the damping, which resists relative changes of length: lambda w_e tr(M_e) / |d_e|^2. A
-camera whose pairs are all rejected is held by it where it was; that is why the damping never ends.
+Laplacian, and so does the damping, which resists relative changes of length: lambda w_e tr(M_e) / |d_e|^2.
+It never ends, and keeps a camera whose pairs are all rejected from flying off.
 
 Sources: the residual: Zhuang, Cheong and Lee, "Baseline desensitizing in translation averaging", CVPR 2018,
 with angles in place of its chords; the kernel and its graduation: Yang, Antonante, Tzoumas and Carlone,
