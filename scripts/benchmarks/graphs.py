@@ -16,7 +16,8 @@ class GraphSpec:
     """A random graph problem that can be drawn again anywhere."""
 
     family: str
-    """er2 is G(n, 1/2), the paper's; geo, comm, er and seq are the families of `sfm_shapefit.synthetic`."""
+    """er2 is G(n, 1/2), the paper's; the others are those of `sfm_shapefit.synthetic`; seqv is seq with
+    a speed that varies by a factor of 4."""
     n: int
     degree: float = 0.0
     """Mean degree asked for; not used by er2."""
@@ -34,11 +35,16 @@ def draw(spec: GraphSpec, **changes: Any) -> "GraphProblem":
     noise: dict[str, Any] = {"sigma": spec.sigma, "q": spec.q, "seed": SEED} | changes
     if spec.family == "er2":
         return synthetic.random_graph_problem(spec.n, 0.5, **noise)
+    if spec.family == "seqv":
+        return synthetic.trajectory_graph_problem(spec.n, spec.degree, speed_ratio=4.0, **noise)
     families = {
         "geo": synthetic.box_graph_problem,
         "comm": synthetic.community_graph_problem,
         "er": synthetic.expander_graph_problem,
         "seq": synthetic.trajectory_graph_problem,
+        "ring": synthetic.ring_graph_problem,
+        "lawn": synthetic.lawn_graph_problem,
+        "corr": synthetic.corridor_graph_problem,
     }
     return families[spec.family](spec.n, spec.degree, **noise)
 

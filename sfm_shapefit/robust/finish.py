@@ -118,24 +118,30 @@ def finish(
     lud = _lud_start(graph, classes, options.threads) if has_second_start(graph) else None
     plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
 
-    starts = [_refined("ShapeFit", solved.locations, graph, metric, plan)]
-    if lud is not None:
-        starts.append(_refined("LUD", lud.locations, graph, metric, plan))
     apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
+    candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
+    if apart is not None and apart > COLLAPSED:
+        candidates.reverse()  # the likely better one first: the other ends early where it loses
+    starts: list[Start] = []
+    for name, locations in candidates:
+        rival = starts[0].best if starts else None
+        starts.append(_refined(name, locations, graph, metric, plan, rival))
     levels = _common_levels(graph, starts, metric)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     kept, reason = _choose(starts, costs, apart, options)
     if plan is None and options.refine and options.objective != "shapefit":
         reason += "; not refined, since the factor for that would be too large"
+    moved = _moves(kept)
+    certified = kept.name == "ShapeFit" and moved[1] == 0.0  # to the bit
     return Finish(
-        locations=normalized_locations(graph, kept.best),
+        locations=solved.locations if certified else normalized_locations(graph, kept.best),
         start=kept.name,
-        refined=_moves(kept)[1] > 0.0,
+        refined=moved[1] > 0.0,
         reason=reason,
         disagreement=apart,
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=_moves(kept),
+        moved=moved,
         lud=lud,
     )
 
@@ -152,7 +158,7 @@ def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
 
 
 def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
-    """Return the median length of each camera's pairs, (n,), at least a millionth of the median of all."""
+    """Return the median length of each camera's pairs, (n,), at least a millionth of the mean of all."""
     lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
     camera = graph.edges.T.ravel()
     order = np.lexsort((np.tile(lengths, 2), camera))
@@ -160,7 +166,7 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     first = np.cumsum(degree) - degree
     ranked = np.tile(lengths, 2)[order]
     low, high = ranked[first + (degree - 1) // 2], ranked[first + degree // 2]
-    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.median(lengths)))
+    return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
 
 
 def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
@@ -174,10 +180,15 @@ def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult |
 
 
 def _refined(
-    name: str, locations: FloatArray, graph: ViewGraph, metric: Metric, plan: SymbolicFactor | None
+    name: str,
+    locations: FloatArray,
+    graph: ViewGraph,
+    metric: Metric,
+    plan: SymbolicFactor | None,
+    rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
-    refined = None if plan is None else refine_angles(graph, locations, metric, plan)
+    refined = None if plan is None else refine_angles(graph, locations, metric, plan, rival)
     if refined is not None and projected_length(graph, refined.locations) <= 0.0:
         refined = None
     return Start(name=name, locations=locations, refined=refined)
@@ -200,7 +211,8 @@ def _choose(
     if options.objective == "shapefit":
         return by_name["ShapeFit"], "the certified ShapeFit optimum, as asked"
     if len(starts) == 1:
-        return by_name["ShapeFit"], "the graph has no second start"
+        wanted = ", which LUD would have been" if options.objective == "lud" else ""
+        return by_name["ShapeFit"], f"the graph has no second start{wanted}"
     if options.objective == "lud":
         return by_name["LUD"], "LUD, as asked"
     assert apart is not None

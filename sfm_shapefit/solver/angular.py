@@ -6,14 +6,17 @@ can be gained by shrinking, as it can in the convex programs. It is judged in th
     chi2_e = (u_e - v_e)^T M_e (u_e - v_e),    M_e = B_e (Sigma_e + s^2 I)^-1 B_e^T + m_e v_e v_e^T,
 
 Sigma_e the covariance of the direction, s the level of all residuals of its class together, m_e the mean
-eigenvalue of the first term. It counts by the Geman-McClure kernel, with k = 3:
+eigenvalue of the first term. It counts by the arctangent kernel, with k = 3,
 
-    minimise  sum_e w_e / 2 * k^2 chi2_e / (k^2 + chi2_e)
+    minimise  sum_e w_e / 2 * k^2 atan(chi2_e / k^2),
+
+flat where residuals are noise and as deaf to outliers as that of Geman and McClure, which takes 18 % more
+error than least squares on the right directions alone, where this takes 4 %.
 
 The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
 A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
-Laplacian, and so does the damping, which resists relative changes of length: lambda w_e tr(M_e) / |d_e|^2. A
-camera whose pairs are all rejected is held by it where it was.
+Laplacian, and so does the damping, which resists relative changes of length: lambda w_e tr(M_e) / |d_e|^2.
+It never ends, and keeps a camera whose pairs are all rejected from flying off.
 
 Sources: the residual: Zhuang, Cheong and Lee, "Baseline desensitizing in translation averaging", CVPR 2018,
 with angles in place of its chords; the kernel and its graduation: Yang, Antonante, Tzoumas and Carlone,
@@ -28,7 +31,7 @@ from scipy.special import chdtri
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import tangent_bases
+from sfm_shapefit.geometry import median_spread, tangent_bases
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
@@ -43,10 +46,13 @@ KERNEL_WIDTH = 3.0
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH  # exact data: a smaller level would reject pairs for their rounding
 _LEAST_SHARE = 0.2  # of a class inside the kernel, below which its level stays: most of it is not fitted yet
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e4
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
 _SHORTEST = 1e-3  # of the median length: the floor under |d|, where a direction says nothing
 _SETTLED = 0.03  # relative change of the levels that counts as none
-_CONVERGED = 1e-8  # relative decrease of the cost
+_CONVERGED = 1e-9  # relative decrease of the cost that counts as none
+_STILL = 1e-6  # move, as a share of the extent, of all but a tenth of the nodes, that counts as none
+_ALIKE = 1e-6  # relative difference of costs that says that two refinements end at the same place
+_HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival it does not catch up
 _MAX_STEPS = 60
 _MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
 _MAX_BYTES = 2_000_000_000
@@ -85,7 +91,13 @@ def plan_refinement(graph: ViewGraph) -> SymbolicFactor | None:
     return plan if plan.num_bytes(graph.dimension, np.float64) <= _MAX_BYTES else None
 
 
-def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: SymbolicFactor) -> AngularResult:
+def refine_angles(
+    graph: ViewGraph,
+    start: FloatArray,
+    metric: Metric,
+    plan: SymbolicFactor,
+    rival: FloatArray | None = None,
+) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
     Args:
@@ -93,33 +105,45 @@ def refine_angles(graph: ViewGraph, start: FloatArray, metric: Metric, plan: Sym
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
         plan: of the factorisation, from `plan_refinement`.
+        rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
+            as low as these, and where it clearly cannot.
 
     Returns:
         Locations whose cost at the final levels is not above that of the start: these, if nothing better
         was found.
     """
     factor = allocate_factor(plan, graph.dimension)
+    spread = _spread(graph, metric)
     first = _unit(start)
+    other = None if rival is None else _unit(rival)
     t, damping, steps = first, _FIRST_DAMPING, 0
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
-        information = _information(graph, metric, levels)
-        t, damping, before, after = _step(graph, information, factor, t, damping)
-        steps += 1
-        if settled and before - after <= _CONVERGED * before:
+        information = _information(graph, spread, levels[metric.classes])
+        moved, damping, before, after = _step(graph, information, factor, t, damping)
+        still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
+        t, steps = moved, steps + 1
+        if settled and still:
             break
-    cost = robust_cost(graph, t, metric, levels)
-    first_cost = robust_cost(graph, first, metric, levels)
+        if settled and other is not None and _is_decided(before, after, _cost(graph, information, other)):
+            break
+    information = _information(graph, spread, levels[metric.classes])
+    cost, first_cost = _cost(graph, information, t), _cost(graph, information, first)
     if first_cost < cost:
         t, cost = first, first_cost
     return AngularResult(locations=t, levels_rad=levels, cost=cost, iterations=steps)
 
 
+def _is_decided(before: float, after: float, rival: float) -> bool:
+    """Whether a cost has reached the rival's, or stays above it even if it falls many times as much again."""
+    return abs(after - rival) <= _ALIKE * rival or after - rival > _HOPELESS * (before - after)
+
+
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel over the pairs, each at most k^2 / 2 times its weight.
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 times its weight.
 
     Args:
         graph: the view graph.
@@ -127,7 +151,8 @@ def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels:
         metric: covariance and class of each pair.
         levels: (number of classes,) in radians.
     """
-    return _cost(graph, _information(graph, metric, levels), _unit(locations))
+    information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    return _cost(graph, information, _unit(locations))
 
 
 def residual_levels(
@@ -156,17 +181,28 @@ def residual_levels(
     return np.maximum(found, _LEAST_LEVEL_RAD)
 
 
-def _information(graph: ViewGraph, metric: Metric, levels: FloatArray) -> FloatArray:
-    """Return M_e, (m, d, d)."""
-    d, level2 = graph.dimension, levels[metric.classes] ** 2
+def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] | None:
+    """Return the axes (m, d, d - 1) and variances (m, d - 1) of each direction; None if all are unknown.
+
+    A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
+    """
     if metric.covariance is None:
-        return np.asarray(np.eye(d) / level2[:, None, None])
-    own = np.where(np.isfinite(metric.covariance), metric.covariance, 0.0)
-    inverse = np.linalg.inv(own + level2[:, None, None] * np.eye(d - 1))
-    bases = tangent_bases(graph.directions)
-    along = np.einsum("ea,eb->eab", graph.directions, graph.directions)
-    mean = np.trace(inverse, axis1=1, axis2=2) / (d - 1)
-    return np.asarray(bases @ inverse @ bases.transpose(0, 2, 1) + mean[:, None, None] * along)
+        return None
+    known = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(known.reshape(-1, 1, 1), metric.covariance, 0.0))
+    return np.asarray(tangent_bases(graph.directions) @ axes), np.maximum(variances, 0.0)
+
+
+def _information(
+    graph: ViewGraph, spread: tuple[FloatArray, FloatArray] | None, level: FloatArray
+) -> FloatArray:
+    """Return M_e, (m, d, d), for the level s of each pair, (m,)."""
+    m, d = graph.directions.shape
+    if spread is None:
+        return np.asarray(np.eye(d) / level[:, None, None] ** 2)
+    information = np.empty((m, d, d))
+    _inform(*spread, graph.directions, level, information)
+    return information
 
 
 def _step(
@@ -193,7 +229,16 @@ def _step(
 def _unit(t: FloatArray) -> FloatArray:
     """Return the locations centred and of unit norm."""
     centred = t - t.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    return np.asarray(centred / np.sqrt(np.sum(centred * centred)))
+
+
+def _motion(t: FloatArray, moved: FloatArray) -> float:
+    """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
+
+    A few loose nodes may wander for long while nothing else changes; in a long chain the cost may hardly
+    fall while all of it still moves.
+    """
+    return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 
 def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -223,8 +268,26 @@ def _linearised(
 
 
 @kernel(exact=True)
+def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
+    """Write sum_a q_a q_a^T / (variance_a + level^2) + m v v^T."""
+    m, d = v.shape
+    for e in range(m):
+        out[e] = 0.0
+        mean = 0.0
+        for k in range(d - 1):
+            inverse = 1.0 / (variances[e, k] + level[e] ** 2)
+            mean += inverse / (d - 1)
+            for a in range(d):
+                for b in range(d):
+                    out[e, a, b] += inverse * axes[e, a, k] * axes[e, b, k]
+        for a in range(d):
+            for b in range(d):
+                out[e, a, b] += mean * v[e, a] * v[e, b]
+
+
+@kernel(exact=True)
 def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float) -> float:
-    """Return sum_e w_e / 2 * k^2 chi2 / (k^2 + chi2)."""
+    """Return sum_e w_e / 2 * k^2 atan(chi2 / k^2)."""
     m, d = v.shape
     total = 0.0
     residual = np.empty(d)
@@ -239,7 +302,7 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
         for a in range(d):
             for b in range(d):
                 chi2 += residual[a] * information[e, a, b] * residual[b]
-        total += 0.5 * w[e] * KERNEL_WIDTH**2 * chi2 / (KERNEL_WIDTH**2 + chi2)
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * np.arctan(chi2 / KERNEL_WIDTH**2)
     return total
 
 
@@ -247,7 +310,7 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
 def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, out: Any) -> None:
     """Write J^T M J, the damping's weight, and J^T M r of each pair, times the kernel's weight.
 
-    J = (I - u u^T) / |d|.
+    J = (I - u u^T) / |d|, and I / floor where |d| is below the floor, for u = d / floor there.
     """
     blocks, damped, gradient = out
     m, d = v.shape
@@ -257,12 +320,13 @@ def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, o
         length = 0.0
         for a in range(d):
             length += baselines[e, a] ** 2
+        radial = 1.0 if length > floor * floor else 0.0
         length = max(np.sqrt(length), floor)
         for a in range(d):
             u[a] = baselines[e, a] / length
         for a in range(d):
             for b in range(d):
-                across[a, b] = ((1.0 if a == b else 0.0) - u[a] * u[b]) / length
+                across[a, b] = ((1.0 if a == b else 0.0) - radial * u[a] * u[b]) / length
         chi2, trace = 0.0, 0.0
         for a in range(d):
             pull[a] = 0.0
@@ -270,7 +334,7 @@ def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, o
                 pull[a] += information[e, a, b] * (u[b] - v[e, b])
             chi2 += (u[a] - v[e, a]) * pull[a]
             trace += information[e, a, a]
-        weight = w[e] / (1.0 + chi2 / KERNEL_WIDTH**2) ** 2
+        weight = w[e] / (1.0 + (chi2 / KERNEL_WIDTH**2) ** 2)
         damped[e] = w[e] * trace / (d * length * length)
         for a in range(d):
             gradient[e, a] = 0.0

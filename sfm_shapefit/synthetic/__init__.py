@@ -12,12 +12,17 @@ if TYPE_CHECKING:
         GraphProblem,
         box_graph_problem,
         community_graph_problem,
+        corridor_graph_problem,
         expander_graph_problem,
+        lawn_graph_problem,
+        measured_problem,
         random_graph_problem,
+        ring_graph_problem,
         trajectory_graph_problem,
     )
     from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
+    from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
 _HOMES = {
     "graphs": (
@@ -25,12 +30,17 @@ _HOMES = {
         "GraphProblem",
         "box_graph_problem",
         "community_graph_problem",
+        "corridor_graph_problem",
         "expander_graph_problem",
+        "lawn_graph_problem",
+        "measured_problem",
         "random_graph_problem",
+        "ring_graph_problem",
         "trajectory_graph_problem",
     ),
     "options": ("SceneOptions", "WorkspaceOptions"),
     "scenes": ("Scene", "make_scene", "project_points"),
+    "streets": ("StreetProblem", "street_problem"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -39,13 +49,19 @@ __all__ = [
     "GraphProblem",
     "Scene",
     "SceneOptions",
+    "StreetProblem",
     "WorkspaceOptions",
     "box_graph_problem",
     "community_graph_problem",
+    "corridor_graph_problem",
     "expander_graph_problem",
+    "lawn_graph_problem",
     "make_scene",
+    "measured_problem",
     "project_points",
     "random_graph_problem",
+    "ring_graph_problem",
+    "street_problem",
     "trajectory_graph_problem",
 ]
 

@@ -1,10 +1,16 @@
-"""Bare graphs of directions whose truth is known: the paper's random model, and four families of view graphs.
+"""Bare graphs of directions whose truth is known: the paper's random model, and families of view graphs.
 
     random       Erdos-Renyi G(n, p), locations N(0, I_d): the model of the theorems
     expander     the same with a given mean degree, for sizes where all pairs cannot be drawn
     box          an area mapped from a drone: each camera joined to its nearest
-    trajectory   a video: each camera joined to the next ones, and a few loop closures
     community    an internet collection: clusters with hubs, loosely joined
+
+and long chains, where errors add up:
+
+    trajectory   a video: each camera joined to the next ones, and a few loop closures; of varying speed too
+    ring         once round, and five far links
+    lawn         strips flown back and forth
+    corridor     a corridor with five side branches, no loops
 
 Each direction is the true one plus sigma times a random unit vector, normalised, or with probability q a
 wrong one. What wrong directions are like is the corruption:
@@ -122,23 +128,136 @@ def trajectory_graph_problem(
     q: float = 0.0,
     seed: Seed = 0,
     corruption: Corruption = "uniform",
+    speed_ratio: float = 1.0,
 ) -> GraphProblem:
     """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
 
-    The model of a video. A loop closure joins a random camera and one of its 60 nearest in space.
+    The model of a video. A loop closure joins a random camera and one of its 60 nearest in space. The speed
+    varies smoothly, three times up and down, by the factor `speed_ratio`: equal steps are a cue that methods
+    with a bound on each length profit from by chance.
     """
     rng = np.random.default_rng(seed)
     heading = np.cumsum(0.15 * rng.standard_normal(n))
     steps = np.stack([np.cos(heading), np.sin(heading), 0.2 * rng.standard_normal(n)], axis=1)
+    steps *= _speeds(n, speed_ratio)[:, None]
     locations = np.cumsum(steps, axis=0) + 0.3 * rng.standard_normal((n, 3))
-    reach = min(max(round(degree / 2.0), 1), n - 1)
-    i = np.concatenate([np.arange(n - step) for step in range(1, reach + 1)])
-    j = np.concatenate([np.arange(step, n) for step in range(1, reach + 1)])
+    i, j = _next_ones(n, degree)
     nearest = _nearest(locations, 60)
     closing = rng.integers(n, size=len(i) // 50)
     closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
     edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
     return _measured(locations, edges, sigma, q, rng, corruption)
+
+
+def ring_graph_problem(
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
+) -> GraphProblem:
+    """Return cameras round a circle, a step of 1 apart, each joined to the next degree / 2, and 5 far links.
+
+    The model of a walk round a large building.
+    """
+    rng = np.random.default_rng(seed)
+    angle = 2.0 * np.pi * np.arange(n) / n
+    circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1) * n / (2.0 * np.pi)
+    locations = circle + 0.3 * rng.standard_normal((n, 3))
+    reach = min(max(round(degree / 2.0), 1), n - 1)
+    i = np.repeat(np.arange(n), reach)
+    j = (i + np.tile(np.arange(1, reach + 1), n)) % n
+    far = rng.integers(n, size=5)
+    across = (far + rng.integers(n // 4, max(n - n // 4, n // 4 + 1), size=5)) % n
+    edges = _unique_pairs(np.concatenate([i, far]), np.concatenate([j, across]))
+    return _measured(locations, edges, sigma, q, rng, corruption)
+
+
+def lawn_graph_problem(
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
+) -> GraphProblem:
+    """Return strips of 50 cameras, each joined to the next degree / 4 along and to as many across.
+
+    The model of an area mapped strip by strip with little overlap. Strips are 3 steps apart.
+    """
+    rng = np.random.default_rng(seed)
+    strip, place = np.divmod(np.arange(n), 50)
+    locations = np.stack([place, 3.0 * strip, np.zeros(n)], axis=1) + 0.2 * rng.standard_normal((n, 3))
+    reach = max(round(degree / 4.0), 1)
+    pairs = []
+    for shift in range(1, reach + 1):
+        along = np.flatnonzero(place + shift < 50)
+        pairs.append(np.stack([along, along + shift], axis=1))
+    for shift in range(-(reach // 2), reach - reach // 2):
+        across = np.flatnonzero((place + shift >= 0) & (place + shift < 50))
+        pairs.append(np.stack([across, across + 50 + shift], axis=1))
+    i, j = np.concatenate(pairs).T
+    edges = _unique_pairs(i[j < n], j[j < n])
+    return _measured(locations, edges, sigma, q, rng, corruption)
+
+
+def corridor_graph_problem(
+    n: int,
+    degree: float = 20.0,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
+) -> GraphProblem:
+    """Return a corridor of about n / 2 cameras with 5 side branches.
+
+    The model of a building's inside. Cameras within degree / 2 steps of one another are joined. Nothing
+    closes a loop: each branch hangs on its junction.
+    """
+    rng = np.random.default_rng(seed)
+    length = n // 10
+    main = n - 5 * length
+    walks = [_walk(np.zeros(2), 0.0, main, rng)]
+    junctions = ((np.arange(5) + 0.5) * main / 5.0).astype(np.int64)
+    for k, junction in enumerate(junctions.tolist()):
+        walks.append(_walk(walks[0][junction], (-1.0) ** k * np.pi / 2.0, length, rng))
+    flat = np.concatenate(walks)
+    locations = np.concatenate([flat, np.zeros((n, 1))], axis=1) + 0.3 * rng.standard_normal((n, 3))
+    reach = max(round(degree / 2.0), 1)
+    i, j = _next_ones(main, degree)
+    pairs = [np.stack([i, j], axis=1)]
+    for k, junction in enumerate(junctions.tolist()):
+        first = main + k * length
+        i, j = _next_ones(length, degree)
+        pairs.append(np.stack([i, j], axis=1) + first)
+        steps = np.add.outer(np.arange(1, length + 1), np.abs(np.arange(main) - junction))
+        i, j = np.nonzero(steps <= reach)
+        pairs.append(np.stack([i + first, j], axis=1))
+    i, j = np.concatenate(pairs).T
+    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
+
+
+def _walk(start: FloatArray, heading: float, n: int, rng: np.random.Generator) -> FloatArray:
+    """Return (n, 2) a walk of unit steps away from a point, turning a little."""
+    headings = heading + np.cumsum(0.03 * rng.standard_normal(n))
+    walk: FloatArray = start + np.cumsum(np.stack([np.cos(headings), np.sin(headings)], axis=1), axis=0)
+    return walk
+
+
+def _speeds(n: int, ratio: float) -> FloatArray:
+    """Return (n,) lengths of steps that vary smoothly by a factor `ratio` around 1."""
+    speeds: FloatArray = ratio ** (0.5 * np.sin(6.0 * np.pi * np.arange(n) / n))
+    return speeds
+
+
+def _next_ones(n: int, degree: float) -> tuple[IntArray, IntArray]:
+    """Return the pairs of each of n cameras in a row with the next degree / 2."""
+    reach = max(min(max(round(degree / 2.0), 1), n - 1), 0)
+    i = [np.arange(n - step) for step in range(1, reach + 1)]
+    j = [np.arange(step, n) for step in range(1, reach + 1)]
+    none = [np.zeros(0, dtype=np.int64)]
+    return np.concatenate(none + i), np.concatenate(none + j)
 
 
 def community_graph_problem(
@@ -179,6 +298,18 @@ def community_graph_problem(
     i = np.concatenate([i, *(a for a, _ in backbone)])
     j = np.concatenate([j, *(b for _, b in backbone)])
     return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
+
+
+def measured_problem(
+    locations: FloatArray,
+    edges: IntArray,
+    sigma: float = 0.0,
+    q: float = 0.0,
+    seed: Seed = 0,
+    corruption: Corruption = "uniform",
+) -> GraphProblem:
+    """Return directions between given locations (n, d) along given pairs (m, 2)."""
+    return _measured(locations, edges, sigma, q, np.random.default_rng(seed), corruption)
 
 
 def _measured(

@@ -1,0 +1,361 @@
+"""Families of graphs whose truth is known: ShapeFit, LUD and what is placed, against the best that can be.
+
+The oracle knows which directions are right: unweighted (streets: weighted) least squares in angles on those
+alone, started at the truth and run to convergence. It is pinned at two cameras and never pulled to the truth:
+a little damping would hide most of the drift of a long chain, which is in the data.
+"""
+
+import argparse
+import statistics
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from benchmarks.graphs import GraphSpec, draw, relative_error, view_graph
+from benchmarks.metrics import Check, Quantity, number, verdict
+from benchmarks.record import environment, legend, table, write_section
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.synthetic import GraphProblem
+    from sfm_shapefit.viewgraph import ViewGraph
+
+HELP = "Families of graphs against the oracle: expanders, areas, communities, long chains, streets."
+ROOT = Path(__file__).parents[2]
+DATA = ROOT.parent / "shared" / "data"
+MADRID = "1dsfm-Madrid_Metropolis"
+PACKAGES = ("numpy", "scipy", "numba")
+EXACT = 1e-9
+"""Error that counts as exact, where right directions have no noise."""
+MEAN_OVER_MEDIAN = 3.0
+_MIN_TRUST = 0.6  # as `locate` keeps cameras by default
+_ORACLE_STEPS = 8
+_ORACLE_NODES = 20_000  # beyond, the oracle's factorisation takes too long
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Problem:
+    """What is drawn, once per seed, and what it has to reach."""
+
+    spec: GraphSpec
+    """The family "street" has cameras and points; "madrid" is the pairs of 1DSfM's Madrid_Metropolis."""
+    jitter: float = 0.0
+    """Of a street, in metres."""
+    over_oracle: float | None = None
+    error: float | None = None
+    below_lud: bool = False
+    seconds: float | None = None
+
+
+def _usual(family: str, n: int, degree: float = 0.0) -> dict[str, Problem]:
+    specs = [GraphSpec(family=family, n=n, degree=degree, sigma=sigma) for sigma in (0.01, 0.05)]
+    return {f"{family}-{n} {spec.sigma:g}": Problem(spec=spec, over_oracle=1.08) for spec in specs}
+
+
+def _chain(family: str, n: int, degree: float) -> dict[str, Problem]:
+    spec = GraphSpec(family=family, n=n, degree=degree, sigma=0.01)
+    return {f"{family}-{n}": Problem(spec=spec, over_oracle=1.3, below_lud=True)}
+
+
+def _street(n: int, jitter: float, error: float, seconds: float | None = None) -> dict[str, Problem]:
+    spec = GraphSpec(family="street", n=n, sigma=0.01, q=0.15)
+    name = f"street-{n} {f'jitter {jitter:.0%}' if jitter else 'straight'}"
+    return {name: Problem(spec=spec, jitter=jitter, error=error, seconds=seconds)}
+
+
+PROBLEMS: dict[str, Problem] = {
+    **_usual("er2", 100),
+    **_usual("geo", 500, 40.0),
+    **_usual("comm", 500, 67.0),
+    "er2-100 0.05, q 0.4": Problem(spec=GraphSpec(family="er2", n=100, sigma=0.05, q=0.4), over_oracle=1.15),
+    "seq-300 exact, q 0.1": Problem(spec=GraphSpec(family="seq", n=300, degree=36.0, q=0.1), error=EXACT),
+    **_chain("seq", 300, 36.0),
+    **_chain("seqv", 300, 36.0),
+    **_chain("ring", 500, 20.0),
+    **_chain("corr", 500, 20.0),
+    **_chain("lawn", 1000, 20.0),
+    **_chain("seq", 1000, 36.0),
+    **_chain("seqv", 1000, 36.0),
+    **_chain("seqv", 10_000, 36.0),
+    **_street(500, 0.0, 3e-3),
+    **_street(500, 0.01, 3e-3),
+    **_street(500, 0.05, 3e-3),
+    **_street(5000, 0.0, 9e-3, 30.0),
+    "Madrid, q 0.3 on few": Problem(spec=GraphSpec(family="madrid", n=394, sigma=0.01, q=0.3)),
+}
+
+QUANTITIES = (
+    Quantity(
+        name="ShapeFit, LUD, placed, oracle",
+        unit="1",
+        better="lower",
+        rel_tol=0.05,
+        meaning="error of the cameras, both sets centred and of unit norm, median of the seeds; "
+        "LUD is the second start, 50 iterations; placed is what `solve` and `locate` give",
+    ),
+    Quantity(
+        name="/ oracle",
+        unit="1",
+        better="lower",
+        rel_tol=0.05,
+        meaning="placed over the oracle, median of the seeds' ratios",
+    ),
+    Quantity(
+        name="mean / median",
+        unit="1",
+        better="lower",
+        rel_tol=0.1,
+        meaning="of the distances of cameras after least squares alignment, those whose trust is "
+        f"{_MIN_TRUST:g} or more; largest of the seeds",
+    ),
+    Quantity(name="kept", unit="cameras", better="higher", rel_tol=0.0, meaning="these, fewest of the seeds"),
+    Quantity(
+        name="seconds", unit="s", better="lower", rel_tol=0.5, meaning="`place`, wall-clock, median, 1 thread"
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Drawn:
+    """A graph with its truth."""
+
+    graph: "ViewGraph"
+    truth: "FloatArray"
+    """(n, 3) of all nodes."""
+    right: "FloatArray"
+    """(m,) 1 / variance of right directions, 0 for wrong ones."""
+    num_cameras: int
+    covariance: "FloatArray | None" = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One graph, solved."""
+
+    shapefit: float
+    lud: float
+    placed: float
+    oracle: float
+    """NaN where the graph is too large for it, and for Madrid, where the right pairs leave cameras loose."""
+    over_oracle: float
+    mean_over_median: float
+    kept: int
+    seconds: float
+
+
+# --- the subcommand --------------------------------------------------------------------------------
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `graphs`."""
+    parser.add_argument(
+        "--problems", type=problems, default=list(PROBLEMS), help="beginnings of names, with commas"
+    )
+    parser.add_argument("--seeds", type=int, default=5, help="graphs per problem (default 5)")
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the sets, for Madrid")
+    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+
+
+def problems(text: str) -> list[str]:
+    """Parse `--problems`."""
+    asked = [part.strip() for part in text.split(",") if part.strip()]
+    unknown = [part for part in asked if not any(name.startswith(part) for name in PROBLEMS)]
+    if unknown or not asked:
+        raise argparse.ArgumentTypeError(
+            f"unknown problem {', '.join(unknown) or '(none)'}; known: {'; '.join(PROBLEMS)}"
+        )
+    return [name for name in PROBLEMS if any(name.startswith(part) for part in asked)]
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the section and write it; a missed limit is no failure."""
+    chosen = "" if args.problems == list(PROBLEMS) else f' --problems "{",".join(args.problems)}"'
+    about = environment(PACKAGES, f"python scripts/benchmark.py graphs --seeds {args.seeds}{chosen}")
+    measured = {}
+    for name in args.problems:
+        problem = PROBLEMS[name]
+        if problem.spec.family == "madrid" and not (args.data / MADRID).is_dir():
+            print(f"{name}: skipped, there is no {MADRID} in {args.data}", file=sys.stderr)
+            continue
+        seeds = range(1 if problem.spec.n >= 5000 else args.seeds)
+        measure(replace(problem, spec=replace(problem.spec, n=min(problem.spec.n, 100))), 0, args.data)
+        measured[name] = [measure(problem, seed, args.data) for seed in seeds]
+        print(f"{name}: {_row(name, measured[name])[1:]}", file=sys.stderr, flush=True)
+    body = section(measured, about)
+    print(body)
+    write_section(args.out, "graphs", body)
+    return 0
+
+
+# --- measuring -------------------------------------------------------------------------------------
+
+
+def drawn(problem: Problem, seed: int, data: Path = DATA) -> Drawn:
+    """Return the problem's graph for a seed."""
+    import numpy as np
+
+    from sfm_shapefit import ViewGraph
+    from sfm_shapefit.synthetic import street_problem
+
+    spec = problem.spec
+    if spec.family == "street":
+        street = street_problem(spec.n, jitter=problem.jitter, seed=seed)
+        return Drawn(
+            graph=ViewGraph(len(street.locations), street.edges, street.directions),
+            truth=street.locations,
+            right=np.where(street.corrupted, 0.0, 1.0 / street.covariance[:, 0, 0]),
+            num_cameras=spec.n,
+            covariance=street.covariance,
+        )
+    bare = _madrid(spec, seed, data) if spec.family == "madrid" else draw(spec, seed=seed)
+    return Drawn(
+        graph=view_graph(bare),
+        truth=bare.locations,
+        right=np.where(bare.corrupted, 0.0, 1.0),
+        num_cameras=len(bare.locations),
+    )
+
+
+def _madrid(spec: GraphSpec, seed: int, data: Path) -> "GraphProblem":
+    """Return drawn positions, in a flat square, on the pairs of a real collection."""
+    import numpy as np
+
+    from sfm_shapefit.synthetic import measured_problem
+
+    with np.load(data / MADRID / "viewgraph.npz") as file:
+        edges, n = file["edges"].astype(np.int64), len(file["names"])
+    rng = np.random.default_rng(seed)
+    locations = rng.standard_normal((n, 3)) * [1.0, 1.0, 0.2]
+    pairs = np.unique(np.sort(edges, axis=1), axis=0)
+    return measured_problem(locations, pairs, spec.sigma, spec.q, rng, "concentrated")
+
+
+def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
+    """Place one graph of a problem and compare with its truth."""
+    import numpy as np
+
+    from sfm_shapefit.geometry import fit_similarity
+    from sfm_shapefit.placement import place
+
+    one = drawn(problem, seed, data)
+    start = time.perf_counter()
+    placement = place(one.graph, covariance=one.covariance, num_cameras=one.num_cameras)
+    seconds = time.perf_counter() - start
+    rows, count = placement.cameras, len(placement.cameras)
+    truth, lud = one.truth[rows], placement.finish.lud
+    kept = placement.assessment.trust[:count] >= _MIN_TRUST
+    aligned = fit_similarity(placement.locations[kept], truth[kept], rotate=False)
+    distances = np.linalg.norm(aligned.apply(placement.locations[kept]) - truth[kept], axis=1)
+    best = np.nan
+    if one.graph.num_cameras <= _ORACLE_NODES and problem.spec.family != "madrid":
+        best = relative_error(oracle(one)[rows], truth)
+    placed = relative_error(placement.locations, truth)
+    return Trial(
+        shapefit=relative_error(placement.solve.locations[:count], truth),
+        lud=np.nan if lud is None else relative_error(lud.locations[:count], truth),
+        placed=placed,
+        oracle=best,
+        over_oracle=placed / max(best, EXACT) if np.isfinite(best) else np.nan,
+        mean_over_median=float(distances.mean() / max(np.median(distances), EXACT * np.ptp(truth))),
+        kept=int(kept.sum()),
+        seconds=seconds,
+    )
+
+
+def oracle(one: Drawn) -> "FloatArray":
+    """Return weighted least squares of |u_e - v_e| on the right directions alone, (n, 3), from the truth.
+
+    Cameras that no right direction holds stay where they are.
+    """
+    import numpy as np
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    right = one.right > 0.0
+    edges, v, root = one.graph.edges[right], one.graph.directions[right], np.sqrt(one.right[right])
+    (m, d), t = v.shape, one.truth.copy()
+    row = np.repeat(np.arange(m * d), d)
+    column = edges[:, :, None] * d + np.arange(d)
+    columns = np.concatenate([np.repeat(column[:, k, None, :], d, axis=1).ravel() for k in (0, 1)])
+    free = np.ones(t.size, dtype=bool)
+    free[:d] = False  # the origin, and of the farthest camera the coordinate that sets the scale
+    far = int(np.argmax(np.abs(t - t[0]).max(axis=1)))
+    free[far * d + int(np.argmax(np.abs(t[far] - t[0])))] = False
+    for _ in range(_ORACLE_STEPS):
+        baselines = t[edges[:, 0]] - t[edges[:, 1]]
+        lengths = np.linalg.norm(baselines, axis=1)[:, None]
+        u = baselines / lengths
+        slope = (root[:, None] / lengths)[:, :, None] * (np.eye(d) - u[:, :, None] * u[:, None, :])
+        values = np.concatenate([slope.ravel(), -slope.ravel()])
+        jacobian = csc_array((values, (np.tile(row, 2), columns)), shape=(m * d, t.size))[:, free]
+        normal = (jacobian.T @ jacobian).tocsc()
+        held = np.where(normal.diagonal() > 0.0, 0.0, 1.0)
+        normal += csc_array((held, (np.arange(len(held)),) * 2), shape=normal.shape)
+        step = splu(normal, permc_spec="MMD_AT_PLUS_A").solve(jacobian.T @ (root[:, None] * (u - v)).ravel())
+        t.ravel()[free] -= step
+    return t
+
+
+# --- the section -----------------------------------------------------------------------------------
+
+
+def checks(problem: Problem, trials: Sequence[Trial]) -> Iterator[Check]:
+    """Yield the checks of one problem."""
+    if problem.over_oracle is not None:
+        yield Check(name="/ oracle", value=_median(trials, "over_oracle"), limit=problem.over_oracle)
+    if problem.error is not None:
+        yield Check(name="error", value=_median(trials, "placed"), limit=problem.error)
+    if problem.below_lud:
+        yield Check(name="placed against LUD", value=_median(trials, "placed"), limit=_median(trials, "lud"))
+    if problem.seconds is not None:
+        yield Check(name="seconds", value=_median(trials, "seconds"), limit=problem.seconds)
+    worst = max(trial.mean_over_median for trial in trials)
+    yield Check(name="mean / median", value=worst, limit=MEAN_OVER_MEDIAN)
+
+
+def section(measured: dict[str, list[Trial]], about: str) -> str:
+    """Return the section of the results file."""
+    header = [
+        "problem",
+        "ShapeFit",
+        "LUD",
+        "placed",
+        "oracle",
+        "/ oracle",
+        "mean / median",
+        "kept",
+        "seconds",
+    ]
+    every = [check for name, trials in measured.items() for check in checks(PROBLEMS[name], trials)]
+    rows = [
+        [*_row(name, trials), verdict(list(checks(PROBLEMS[name], trials)))]
+        for name, trials in measured.items()
+    ]
+    parts = [
+        "## Families of graphs",
+        about,
+        f"**{sum(check.met for check in every)} of {len(every)} limits met.** Problems have a fifth of wrong"
+        " directions and noise of 0.01 unless they say otherwise; those of 5,000 nodes or more, one seed.",
+        table([*header, "verdict"], rows),
+        "### What the columns mean",
+        legend(QUANTITIES),
+    ]
+    return "\n\n".join(part.strip() for part in parts)
+
+
+def _row(name: str, trials: Sequence[Trial]) -> list[str]:
+    columns = ("shapefit", "lud", "placed", "oracle", "over_oracle")
+    return [
+        name,
+        *(number(_median(trials, column)) for column in columns),
+        number(max(trial.mean_over_median for trial in trials)),
+        str(min(trial.kept for trial in trials)),
+        number(_median(trials, "seconds")),
+    ]
+
+
+def _median(trials: Sequence[Trial], column: str) -> float:
+    return float(statistics.median(getattr(trial, column) for trial in trials))

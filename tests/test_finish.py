@@ -1,0 +1,224 @@
+"""Two starts, one answer: which is kept, what is said of it, and what is never touched."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.placement import place
+from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.robust import finish as finishing
+from sfm_shapefit.robust.finish import COLLAPSED, Start, disagreement, finish
+from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.solver import angular
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.synthetic import random_graph_problem, street_problem, trajectory_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def graph_of(problem) -> ViewGraph:
+    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
+
+
+def error(t, truth) -> float:
+    def unit(x):
+        centred = x - x.mean(axis=0)
+        return centred / np.linalg.norm(centred)
+
+    return float(np.linalg.norm(unit(t) - unit(truth)))
+
+
+def finished(problem, **options):
+    graph, settings = graph_of(problem), PlacementOptions(**options)
+    return finish(graph, solve(graph, settings), settings)
+
+
+@pytest.fixture(scope="module")
+def chain():
+    """A video of 200 cameras on which ShapeFit collapses."""
+    return trajectory_graph_problem(200, 36.0, sigma=0.01, q=0.2, seed=1, speed_ratio=4.0)
+
+
+@pytest.fixture(scope="module")
+def expander():
+    return random_graph_problem(40, 0.6, sigma=0.02, q=0.2, seed=1)
+
+
+# --- which start -----------------------------------------------------------------------------------
+
+
+def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
+    graph = graph_of(chain)
+    found = finished(chain)
+    assert error(solve(graph).locations, chain.locations) > 0.3
+    assert found.start == "LUD"
+    assert found.collapsed
+    assert found.disagreement > COLLAPSED
+    assert "disagree" in found.reason
+    assert found.statement().startswith("LUD, refined in angles")
+    assert error(found.locations, chain.locations) < 0.05
+    assert error(found.locations, chain.locations) < error(found.lud.locations, chain.locations)
+    assert found.costs["LUD"] < found.costs["ShapeFit"]
+
+
+def test_where_both_starts_agree_nothing_is_said_of_a_collapse(expander):
+    found = finished(expander)
+    assert not found.collapsed
+    assert "agree" in found.reason
+    assert error(found.locations, expander.locations) < 0.02
+    assert found.costs["LUD"] == pytest.approx(found.costs["ShapeFit"], rel=1e-3)
+
+
+def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_chain(chain):
+    graph = graph_of(chain)
+    options = PlacementOptions(objective="shapefit")
+    placement = place(graph, options)
+    assert np.array_equal(placement.locations, placement.solve.locations)
+    assert not placement.finish.refined
+    assert placement.finish.start == "ShapeFit"
+    assert "as asked" in placement.finish.statement()
+    warnings = [w for w in quality_warnings(placement) if "disagree about lengths" in w]
+    assert len(warnings) == 1
+    assert "--objective auto" in warnings[0]
+
+
+def test_lud_is_taken_whatever_its_fit_if_asked(expander):
+    found = finished(expander, objective="lud")
+    assert (found.start, found.refined) == ("LUD", True)
+    raw = finished(expander, objective="lud", refine=False)
+    assert error(raw.locations, raw.lud.locations) < 1e-12
+    assert not raw.refined
+    assert raw.statement() == "LUD, not refined: LUD, as asked"
+
+
+def test_without_refinement_the_start_that_fits_better_is_kept_as_it_is(chain):
+    found = finished(chain, refine=False)
+    assert found.start == "LUD"
+    assert not found.refined
+    assert found.moved == (0.0, 0.0)
+    assert error(found.locations, found.lud.locations) < 1e-12
+
+
+def start(name: str) -> Start:
+    return Start(name=name, locations=np.eye(3), refined=None)
+
+
+@pytest.mark.parametrize(
+    ("costs", "apart", "kept", "word"),
+    [
+        ((100.0, 99.0), 0.1, "LUD", "agree"),
+        ((100.0, 100.0), 0.1, "ShapeFit", "agree"),
+        ((100.0, 100.05), 1.0, "LUD", "alike"),  # within a thousandth: the one that cannot collapse
+        ((99.95, 100.0), 1.0, "LUD", "alike"),
+        ((100.0, 101.0), 1.0, "ShapeFit", "better"),
+        ((101.0, 100.0), 1.0, "LUD", "better"),
+    ],
+)
+def test_the_lower_cost_is_kept_and_a_tie_of_disagreeing_starts_goes_to_lud(costs, apart, kept, word):
+    starts = [start("ShapeFit"), start("LUD")]
+    by_name = dict(zip(("ShapeFit", "LUD"), costs, strict=True))
+    chosen, reason = finishing._choose(starts, by_name, apart, PlacementOptions())
+    assert chosen.name == kept
+    assert word in reason
+
+
+def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypatch, expander):
+    monkeypatch.setattr(finishing, "_LUD_PAIRS", 10)
+    for objective in ("auto", "lud"):
+        found = finished(expander, objective=objective)
+        assert found.start == "ShapeFit"
+        assert found.lud is None
+        assert found.disagreement is None
+        assert not found.collapsed
+        assert found.refined
+        assert "no second start" in found.reason
+
+
+# --- what the refinement may do --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_noise_free_answers_are_exact_and_not_made_worse(d):
+    problem = random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
+    graph = graph_of(problem)
+    certified = solve(graph)
+    found = finish(graph, certified, PlacementOptions())
+    assert error(found.locations, problem.locations) < 1e-9
+    # Rounding apart: the certified answer is exact to 1e-9 itself, or better.
+    assert error(found.locations, problem.locations) <= error(certified.locations, problem.locations) + 1e-12
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_the_smallest_graphs_are_finished(n):
+    problem = random_graph_problem(n, 1.0, sigma=1e-3, seed=2)
+    found = finished(problem)
+    assert np.isfinite(found.locations).all()
+    assert error(found.locations, problem.locations) < 0.02
+    assert (found.lud is None) == (n == 2)
+
+
+def test_the_answer_has_the_scale_of_the_solver(expander):
+    graph, found = graph_of(expander), finished(expander)
+    along = np.sum(differences(found.locations, graph.edges) * graph.directions, axis=1)
+    assert along.mean() == pytest.approx(1.0)
+    np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
+
+
+def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 10.0)
+    found = finished(expander)
+    assert not found.refined
+    assert found.statement().endswith("not refined, since the factor for that would be too large")
+    assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
+
+
+def test_what_the_refinement_changed_is_measured_by_the_extent(expander):
+    found = finished(expander, objective="lud")
+    median, largest = found.moved
+    assert 0.0 < median < largest < 1.0
+    assert f"{median:.2%}" in found.statement()
+
+
+def test_the_finish_is_the_same_to_the_bit_each_time_and_for_any_number_of_threads(expander):
+    one, again, two = finished(expander), finished(expander), finished(expander, threads=2)
+    assert np.array_equal(one.locations, again.locations)
+    assert np.array_equal(one.locations, two.locations)
+    assert one.costs == two.costs
+
+
+# --- disagreement ----------------------------------------------------------------------------------
+
+
+def test_disagreement_is_blind_to_scale_and_sees_stretched_lengths():
+    t = np.arange(40.0)[:, None] * [1.0, 0.2, 0.1]
+    graph = ViewGraph(40, [(i, i + 1) for i in range(39)], normalized(np.tile([-1.0, -0.2, -0.1], (39, 1))))
+    assert disagreement(graph, t, 5.0 * t + 1.0) < 1e-12
+    stretched = np.concatenate([t[:20], t[19] + 4.0 * (t[20:] - t[19])])
+    # Half of the node lengths are 4 times as long: the deviation of a fair coin of log 4 is log(4) / 2.
+    assert disagreement(graph, t, stretched) == pytest.approx(np.log(4.0) / 2.0, rel=0.02)
+
+
+def test_cameras_at_one_place_have_a_finite_disagreement():
+    t = np.zeros((4, 3))
+    t[3] = 1.0
+    graph = ViewGraph(4, [(0, 1), (0, 2), (1, 2), (2, 3)], normalized(np.ones((4, 3))))
+    assert np.isfinite(disagreement(graph, t, np.arange(12.0).reshape(4, 3)))
+
+
+# --- points as nodes -------------------------------------------------------------------------------
+
+
+def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
+    street = street_problem(60, 10, seed=3)
+    n = street.num_cameras
+    graph = ViewGraph(len(street.locations), street.edges, street.directions)
+    joint = place(graph, covariance=street.covariance, num_cameras=n)
+    assert error(joint.locations, street.locations[joint.cameras]) < 0.01
+    pairs = (street.edges < n).all(axis=1)
+    bare = place(
+        ViewGraph(n, street.edges[pairs], street.directions[pairs]), covariance=street.covariance[pairs]
+    )
+    assert error(bare.locations, street.locations[bare.cameras]) > 0.03
+    pair_level, ray_level = joint.finish.levels_deg  # 0.01 / sqrt(3) and 0.001 / sqrt(3) rad, and some excess
+    assert pair_level == pytest.approx(0.33, rel=0.5)
+    assert ray_level == pytest.approx(0.033, rel=0.5)
