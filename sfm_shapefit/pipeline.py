@@ -446,7 +446,15 @@ def _further_pieces(
             seeded = triangulate(seed, tracks, options.for_structure())
         if matches is not None:
             seeded = colored(seeded, model.reconstruction)
-        found.append(FurtherPiece(placement=placed, kept=kept, gauge=gauge, reconstruction=seeded))
+        found.append(
+            FurtherPiece(
+                placement=placed,
+                kept=kept,
+                gauge=gauge,
+                reconstruction=seeded,
+                image_ids=model.image_ids[placed.cameras],
+            )
+        )
     return tuple(found)
 
 

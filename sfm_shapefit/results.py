@@ -107,10 +107,8 @@ class LocateResult:
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
-        kept_ids = self.model.image_ids[self.placement.cameras[self.kept]].tolist()
-        images = [self.reconstruction.image(image_id) for image_id in kept_ids]
-        centers = np.full((len(self.kept), 3), np.nan)
-        centers[self.kept] = [image.projection_center() for image in images]
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
         solved_pieces = [piece.placement for piece in self.further]
         rows = camera_rows(self.placement, centers, self.gauge.similarity.scale, solved_pieces)
         for camera, reason in _without_direction(self.directions, self.placement.graph).items():
@@ -149,12 +147,13 @@ class FurtherPiece:
     """From the solver's units to those of its model, a unit of its own."""
     reconstruction: "pycolmap.Reconstruction"
     """Its seeded model."""
+    image_ids: IntArray
+    """(k,) the images of the placement's cameras."""
 
     @property
     def cameras(self) -> list[CameraRow]:
         """One row per camera of the piece."""
-        centers = self.gauge.similarity.apply(self.placement.locations)
-        centers = np.where(self.kept[:, None], centers, np.nan)
+        centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
         return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
 
 
@@ -181,6 +180,15 @@ class GraphResult:
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
         return pair_rows(self.placement, support, self.further)
+
+
+def _centers_of(
+    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
+) -> FloatArray:
+    """Return the centres (k, 3) of images, NaN for those that are not kept."""
+    centers = np.full((len(kept), 3), np.nan)
+    centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
+    return centers
 
 
 def camera_rows(

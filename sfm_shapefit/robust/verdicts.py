@@ -24,7 +24,7 @@ from scipy.special import chdtri
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
+from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.robust.conditioning import LooseGroup, condition
 from sfm_shapefit.robust.trust import Evidence, judge_cameras
@@ -41,8 +41,6 @@ _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
 _BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
-_LARGEST_DILUTION = 1e4
-"""Spreads per radian beyond which nothing holds a node: 1e-3 degrees move it by a sixth of all."""
 _LOOSENING_RAD = 1e-4
 """Noise for which it is asked at least which nodes are loose: with none, none would be."""
 _UNCHECKED_LEVERAGE = 0.99
@@ -126,12 +124,12 @@ def assess(
         errors = _with_excess(evidence.errors, excess) @ bases.transpose(0, 2, 1)
     angles = np.linalg.norm(residuals, axis=1)
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
-    level = float(np.median(sigma_of_pair))
-    scale = min(level / _LOOSENING_RAD, 1.0)  # exact directions are propagated as if they had some noise
+    # Exact directions are propagated as if they had some noise, and scaled back.
+    scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if errors is None else errors / scale
     sigmas, leverages = _propagated(graph, locations, inliers, information, k, errors)
-    sigmas = _open_where_singular(scale * sigmas, level, median_spread(locations[:k]))
+    sigmas = scale * sigmas
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
     judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, evidence)
     return Assessment(
@@ -145,20 +143,6 @@ def assess(
         loose_groups=conditioning.groups,
         sigmas=sigmas,
     )
-
-
-def _open_where_singular(sigmas: FloatArray, level: float, spread: float) -> FloatArray:
-    """Return standard deviations (n, d), infinite where only a ridge keeps them from being so.
-
-    With exact directions a camera that may slide freely has a small one: next to no noise, times a lot.
-
-    Args:
-        sigmas: as propagated.
-        level: standard deviation of a typical direction in radians.
-        spread: of the cameras, in the units of `sigmas`.
-    """
-    largest: FloatArray = sigmas.max(axis=1, keepdims=True)
-    return np.where(largest > _LARGEST_DILUTION * level * spread, np.inf, sigmas)
 
 
 def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> FloatArray:

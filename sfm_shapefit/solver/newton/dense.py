@@ -43,7 +43,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 """By bytes per number: first and last multiple of the identity added to M, per mean eigenvalue."""
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
-"""By bytes per number: in single precision each gains two digits and more, or the matrix is too ill-conditioned."""
+"""By bytes per number: in single precision each gains two digits, or the matrix is too ill-conditioned."""
 _SINGLE_FROM = 450  # unknowns from which a factor in single precision saves more than its refinements cost
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
