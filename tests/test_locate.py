@@ -216,12 +216,8 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(tmp_path):
         rows = list(csv.DictReader(stream))
     assert [row["name"] for row in rows] == [f"000{k}.jpg" for k in range(1, 5)]
     assert {(row["placed"], row["piece"]) for row in rows} == {("true", "1")}
-<<<<<<< HEAD
     assert {int(row["degree"]) for row in rows} <= {2, 3}  # a pair without enough parallax has no direction
     np.testing.assert_allclose([[float(row[k]) for k in "xyz"] for row in rows], centers, atol=1e-12)
-=======
-    np.testing.assert_array_equal([[float(row[k]) for k in "xyz"] for row in rows], centers)
->>>>>>> diagnose
     verdicts = {(row.name1, row.name2): row.verdict for row in found.pairs}
     assert verdicts["0001.jpg", "0002.jpg"] == "inlier"
 
