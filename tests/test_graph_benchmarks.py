@@ -242,7 +242,7 @@ def test_a_peer_is_beaten_by_error_or_by_time():
     [
         (["solver", "--sizes", "50,x"], "'50,x' is not a list of sizes"),
         (["scale", "--families", "geo,star"], "unknown family star; known: geo, comm, er, seq"),
-        (["peers-graphs", "--problems", "er2-9"], "unknown problem er2-9; known: er2-300"),
+        (["peers-graphs", "--problems", "er2-9"], "unknown problem er2-9; known: er2-100"),
     ],
 )
 def test_wrong_usage_is_explained(arguments, message, capsys):

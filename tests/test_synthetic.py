@@ -23,9 +23,14 @@ from sfm_shapefit.synthetic import (
     WorkspaceOptions,
     box_graph_problem,
     community_graph_problem,
+    corridor_graph_problem,
+    lawn_graph_problem,
     make_scene,
+    measured_problem,
     project_points,
     random_graph_problem,
+    ring_graph_problem,
+    street_problem,
     trajectory_graph_problem,
 )
 
@@ -531,6 +536,10 @@ FAMILIES = {
     "random": lambda **kw: random_graph_problem(120, p=0.5, **kw),
     "box": lambda **kw: box_graph_problem(500, degree=20.0, **kw),
     "trajectory": lambda **kw: trajectory_graph_problem(500, degree=20.0, **kw),
+    "varying speed": lambda **kw: trajectory_graph_problem(500, degree=20.0, speed_ratio=4.0, **kw),
+    "ring": lambda **kw: ring_graph_problem(300, degree=20.0, **kw),
+    "lawn": lambda **kw: lawn_graph_problem(500, degree=20.0, **kw),
+    "corridor": lambda **kw: corridor_graph_problem(500, degree=20.0, **kw),
     "community": lambda **kw: community_graph_problem(1200, degree=30.0, **kw),
 }
 
@@ -592,3 +601,79 @@ def test_the_paper_model_has_any_dimension_and_one_answer_per_seed(d):
     np.testing.assert_array_equal(problem.directions, again.directions)
     other = random_graph_problem(30, 0.5, d, 0.05, 0.2, 10)
     assert not np.array_equal(problem.locations, other.locations)
+
+
+def smooth_speeds(problem: GraphProblem) -> np.ndarray:
+    steps = np.linalg.norm(np.diff(problem.locations, axis=0), axis=1)
+    return np.convolve(steps, np.ones(50) / 50, "valid")
+
+
+def test_the_speed_of_a_trajectory_varies_by_the_factor_asked_for():
+    varying = smooth_speeds(trajectory_graph_problem(900, seed=1, speed_ratio=4.0))
+    assert 2.5 < varying.max() / varying.min() < 5.0  # jitter of 0.3 per axis adds more to short steps
+    even = smooth_speeds(trajectory_graph_problem(900, seed=1))
+    assert even.max() / even.min() < 1.5
+
+
+def test_a_ring_closes_and_has_five_far_links():
+    n = 300
+    edges = ring_graph_problem(n, degree=20.0, seed=2).edges
+    apart = np.minimum(edges[:, 1] - edges[:, 0], n - (edges[:, 1] - edges[:, 0]))
+    assert np.sum(apart > 10) == 5
+    assert apart[apart > 10].min() >= n // 4
+    assert np.sum(apart <= 10) == 10 * n
+    assert any((edges == [0, n - 1]).all(axis=1))
+
+
+def test_strips_of_a_lawn_are_tied_to_the_next_ones_only():
+    strip = lawn_graph_problem(500, degree=20.0, seed=3).edges // 50
+    apart = strip[:, 1] - strip[:, 0]
+    assert set(np.unique(apart).tolist()) == {0, 1}
+    assert np.bincount(apart)[1] == pytest.approx(np.bincount(apart)[0], rel=0.1)
+
+
+def test_a_corridor_falls_apart_at_its_junctions_only():
+    """Each branch of 50 cameras is tied to the main corridor near its junction, and to no other branch."""
+    edges = corridor_graph_problem(500, degree=20.0, seed=4).edges
+    part = np.where(edges < 250, -1, (edges - 250) // 50)
+    crossing = edges[part[:, 0] != part[:, 1]]
+    assert (crossing[:, 0] < 250).all()
+    for branch in range(5):
+        ties = crossing[(crossing[:, 1] - 250) // 50 == branch]
+        assert np.ptp(ties[:, 0]) <= 18
+        assert ((ties[:, 1] - 250) % 50).max() == 9  # within 10 steps
+
+
+def test_given_pairs_and_locations_are_kept():
+    t = np.random.default_rng(1).standard_normal((20, 3))
+    edges = np.array([(i, i + 1) for i in range(19)])
+    problem = measured_problem(t, edges, sigma=0.0, q=0.0, seed=1)
+    np.testing.assert_array_equal(problem.edges, edges)
+    np.testing.assert_allclose(problem.directions, true_directions(problem), atol=1e-15)
+    assert measured_problem(t, edges, q=1.0, seed=1).corrupted.all()
+
+
+def test_a_street_is_straight_and_its_points_stand_beside_it():
+    street = street_problem(60, 5, seed=5)
+    cameras, points = street.locations[:60], street.locations[60:]
+    assert np.abs(cameras[:, 1:]).max() == 0.0
+    speed = np.diff(cameras[:, 0])
+    assert speed.max() / speed.min() == pytest.approx(3.0, rel=0.1)
+    aside = np.abs(points[:, 1])
+    assert (aside.min() >= 3.0, aside.max() <= 10.0) == (True, True)
+    assert len(points) == 300
+
+
+def test_street_tracks_have_four_to_eight_views_and_noise_as_the_covariance_says():
+    street = street_problem(200, 10, seed=6)
+    to_point = street.edges[:, 1] >= street.num_cameras
+    assert np.flatnonzero(to_point).min() == np.sum(~to_point)  # pairs of cameras come first
+    views = np.bincount(street.edges[to_point, 1])[street.num_cameras :]
+    assert set(np.unique(views).tolist()) == {4, 5, 6, 7, 8}
+    i, j = street.edges.T
+    off = np.linalg.norm(street.directions - normalized(street.locations[i] - street.locations[j]), axis=1)
+    for kind, share in ((~to_point, 0.1), (to_point, 0.15)):
+        assert street.corrupted[kind].mean() == pytest.approx(share, abs=0.02)
+        right = kind & ~street.corrupted
+        variance = np.trace(street.covariance[right], axis1=1, axis2=2)
+        assert np.mean(off[right] ** 2 / variance) == pytest.approx(1.0, rel=0.05)

@@ -143,7 +143,7 @@ def _determined(graph: "ViewGraph", placement: "Placement") -> "ViewGraph":
 
 def _locations(placement: "Placement") -> "FloatArray":
     """Return the locations of the placed cameras."""
-    return placement.solve.locations
+    return placement.locations
 
 
 # --- the section -----------------------------------------------------------------------------------

@@ -19,7 +19,7 @@ from benchmarks.metrics import Check, Quantity, number, verdict
 from benchmarks.record import environment, legend, table, write_section
 
 if TYPE_CHECKING:
-    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
     from sfm_shapefit.synthetic import GraphProblem
     from sfm_shapefit.viewgraph import ViewGraph
 
@@ -268,13 +268,13 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
 def oracle(one: Drawn) -> "FloatArray":
     """Return weighted least squares of |u_e - v_e| on the right directions alone, (n, 3), from the truth.
 
-    Cameras that no right direction holds stay where they are.
+    What fewer than two right directions hold stays where it is.
     """
     import numpy as np
     from scipy.sparse import csc_array
     from scipy.sparse.linalg import splu
 
-    right = one.right > 0.0
+    right = _holding(one.right > 0.0, one.graph.edges)
     edges, v, root = one.graph.edges[right], one.graph.directions[right], np.sqrt(one.right[right])
     (m, d), t = v.shape, one.truth.copy()
     row = np.repeat(np.arange(m * d), d)
@@ -297,6 +297,18 @@ def oracle(one: Drawn) -> "FloatArray":
         step = splu(normal, permc_spec="MMD_AT_PLUS_A").solve(jacobian.T @ (root[:, None] * (u - v)).ravel())
         t.ravel()[free] -= step
     return t
+
+
+def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
+    """Return the right directions without those to nodes that have no second one, again and again."""
+    import numpy as np
+
+    while True:
+        degree = np.bincount(edges[right].ravel(), minlength=int(edges.max()) + 1)
+        left = right & (degree[edges] >= 2).all(axis=1)
+        if (left == right).all():
+            return right
+        right = left
 
 
 # --- the section -----------------------------------------------------------------------------------
