@@ -137,7 +137,7 @@ def test_a_start_is_kept_if_nothing_better_is_found(monkeypatch):
     problem = random_graph_problem(20, 0.6, sigma=0.01, seed=3)
     graph = graph_of(problem)
     worse = unit(shaken(problem, 0.5))
-    monkeypatch.setattr(angular, "_step", lambda *_: (worse, 1e-4, 1.0, 1.0))
+    monkeypatch.setattr(angular, "_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
     found = refined(graph, problem.locations)
     np.testing.assert_allclose(found.locations, unit(problem.locations), rtol=1e-12)
 

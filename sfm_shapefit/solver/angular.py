@@ -11,7 +11,8 @@ eigenvalue of the first term. It counts by the arctangent kernel, with k = 3,
     minimise  sum_e w_e / 2 * k^2 atan(chi2_e / k^2),
 
 flat where residuals are noise and as deaf to outliers as that of Geman and McClure, which takes 18 % more
-error than least squares on the right directions alone, where this takes 4 %.
+error than least squares on the right directions alone, where this takes 4 %. While the level falls, that one
+is used all the same: it lets go of a wrong direction early, where this may settle for a larger level.
 
 The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
 A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
@@ -123,7 +124,7 @@ def refine_angles(
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
         information = _information(graph, spread, levels[metric.classes])
-        moved, damping, before, after = _step(graph, information, factor, t, damping)
+        moved, damping, before, after = _step(graph, information, factor, t, damping, steep=not settled)
         still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
         t, steps = moved, steps + 1
         if settled and still:
@@ -206,11 +207,17 @@ def _information(
 
 
 def _step(
-    graph: ViewGraph, information: FloatArray, factor: CholeskyFactor, t: FloatArray, damping: float
+    graph: ViewGraph,
+    information: FloatArray,
+    factor: CholeskyFactor,
+    t: FloatArray,
+    damping: float,
+    *,
+    steep: bool = False,
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
-    before = _cost(graph, information, t)
-    blocks, damped, gradient = _linearised(graph, information, t)
+    before = _cost(graph, information, t, steep)
+    blocks, damped, gradient = _linearised(graph, information, t, steep)
     right = -adjoint(gradient, graph.edges, graph.num_cameras)
     while damping <= _MOST_DAMPING:
         try:
@@ -219,7 +226,7 @@ def _step(
             damping *= 10.0
             continue
         proposed = _unit(t + factor.solve(right))
-        after = _cost(graph, information, proposed)
+        after = _cost(graph, information, proposed, steep)
         if after < before:
             return proposed, max(damping / 10.0, _LEAST_DAMPING), before, after
         damping *= 10.0
@@ -249,21 +256,22 @@ def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.norm(units - graph.directions, axis=1))
 
 
-def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray) -> float:
+def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False) -> float:
     baselines = differences(t, graph.edges)
     floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
-    return float(_sum_of_kernels(baselines, graph.directions, graph.weights, information, floor))
+    return float(_sum_of_kernels(baselines, graph.directions, graph.weights, information, floor, steep))
 
 
 def _linearised(
-    graph: ViewGraph, information: FloatArray, t: FloatArray
+    graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
     m, d = graph.directions.shape
     baselines = differences(t, graph.edges)
     floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
     blocks, damped, gradient = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
-    _linearise(baselines, graph.directions, graph.weights, information, floor, (blocks, damped, gradient))
+    out = (blocks, damped, gradient)
+    _linearise(baselines, graph.directions, graph.weights, information, floor, steep, out)
     return blocks, damped, gradient
 
 
@@ -286,8 +294,8 @@ def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
 
 
 @kernel(exact=True)
-def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float) -> float:
-    """Return sum_e w_e / 2 * k^2 atan(chi2 / k^2)."""
+def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool) -> float:
+    """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2), rho(x) = atan x, or x / (1 + x) if `steep`."""
     m, d = v.shape
     total = 0.0
     residual = np.empty(d)
@@ -302,12 +310,13 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
         for a in range(d):
             for b in range(d):
                 chi2 += residual[a] * information[e, a, b] * residual[b]
-        total += 0.5 * w[e] * KERNEL_WIDTH**2 * np.arctan(chi2 / KERNEL_WIDTH**2)
+        x = chi2 / KERNEL_WIDTH**2
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * (x / (1.0 + x) if steep else np.arctan(x))
     return total
 
 
 @kernel(exact=True)
-def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, out: Any) -> None:
+def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool, out: Any) -> None:
     """Write J^T M J, the damping's weight, and J^T M r of each pair, times the kernel's weight.
 
     J = (I - u u^T) / |d|, and I / floor where |d| is below the floor, for u = d / floor there.
@@ -334,7 +343,8 @@ def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, o
                 pull[a] += information[e, a, b] * (u[b] - v[e, b])
             chi2 += (u[a] - v[e, a]) * pull[a]
             trace += information[e, a, a]
-        weight = w[e] / (1.0 + (chi2 / KERNEL_WIDTH**2) ** 2)
+        x = chi2 / KERNEL_WIDTH**2
+        weight = w[e] / ((1.0 + x) ** 2 if steep else 1.0 + x * x)
         damped[e] = w[e] * trace / (d * length * length)
         for a in range(d):
             gradient[e, a] = 0.0
