@@ -9,7 +9,6 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.placement import place, place_further
 from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
-from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
@@ -44,11 +43,9 @@ def test_covariances_belong_to_the_pairs_of_the_solved_piece():
     sharp = np.tile((1e-3) ** 2 * np.eye(2), (len(edges), 1, 1))
     soft = sharp.copy()
     soft[bent] = 0.1**2 * np.eye(2)
-    # The pair is wrong by 50 of its own sigmas, or by half of one. Ten pairs of five cameras are too few for
-    # the refinement to tell one wrong pair from noise of all, so it is the optimum that is judged.
-    plain = PlacementOptions(objective="shapefit")
-    assert place(graph, plain, covariance=sharp).rejected_pairs.tolist() == [edges[bent].tolist()]
-    assert len(place(graph, plain, covariance=soft).rejected_pairs) == 0
+    # The pair is wrong by 50 of its own sigmas, or by half of one.
+    assert place(graph, covariance=sharp).rejected_pairs.tolist() == [edges[bent].tolist()]
+    assert len(place(graph, covariance=soft).rejected_pairs) == 0
 
 
 def test_rows_speak_of_the_whole_graph():
