@@ -187,8 +187,9 @@ def test_cameras_at_one_place_do_no_harm():
 def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_length():
     problem = random_graph_problem(12, 1.0, sigma=0.02, seed=6)
     t = unit(problem.locations)
-    t[1] = t[0] + 1e-5  # below the floor, a thousandth of the median length
     graph = graph_of(problem)
+    floor = angular._SHORTEST * np.median(np.linalg.norm(differences(t, graph.edges), axis=1))
+    t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = angular._information(graph, None, np.full(graph.num_edges, 0.05))
     _, _, per_edge = angular._linearised(graph, information, t)
     gradient = angular.adjoint(per_edge, graph.edges, 12)
