@@ -7,6 +7,7 @@ from graph_families import FAMILIES
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.admm import solve_admm
 from sfm_shapefit.solver.admm.linear import IterativeSolver
 from sfm_shapefit.solver.certificate import certify
@@ -194,3 +195,19 @@ def test_the_hybrid_gives_the_same_bits_for_one_and_two_threads():
     one, two = (solve_hybrid(graph, 1e-6, 500, threads=k) for k in (1, 2))
     np.testing.assert_array_equal(one.locations, two.locations)
     np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)
+
+
+@pytest.mark.parametrize("slides", [False, True])
+@pytest.mark.parametrize("n", [12, 160])  # with 13 or 161 cameras: double precision alone, and single first
+def test_uniqueness_is_judged_alike_by_a_dense_and_by_a_sparse_factor(n, slides, monkeypatch):
+    graph, t = complete(n)
+    if slides:  # the last camera hangs on the first by one pair, and fits wherever it stands along it
+        edges = np.vstack([graph.edges, [[0, n]]])
+        graph = ViewGraph(n + 1, edges, np.vstack([graph.directions, [[0.0, 0.0, 1.0]]]))
+        t = np.vstack([t, t[0] - [0.0, 0.0, 1.0]])
+    dual = np.zeros(graph.directions.shape)
+    by_dense = certify(graph, t, dual, uniqueness=True).unique
+    monkeypatch.setattr(certificate, "_SMALL", 0)
+    monkeypatch.setattr(certificate, "_LARGEST_DENSE", 0)
+    assert certify(graph, t, dual, uniqueness=True).unique is by_dense
+    assert by_dense is not slides

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,
@@ -263,3 +263,24 @@ def test_the_iteration_limit_is_kept(solver):
     t, y, count = solver(graph, 1e-10, 2)
     assert count == 2
     assert 0.0 < certify(graph, t, y).gap < 0.2  # a bound even so
+
+
+def test_the_dense_solver_gives_up_single_precision_where_it_cannot_reach_the_gap():
+    graph, truth = drawn(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
+    t, y = solved(graph, tol=1e-13)
+    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
+    violation = adjoint(y, graph.edges, graph.num_cameras)
+    violation -= np.sum(violation * t) / graph.num_edges * scale_functional(graph)
+    assert np.abs(violation).max() < 1e-12 * graph.degrees().max()
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.05])
+def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(sigma, monkeypatch):
+    graph, _ = drawn(71, n=30, sigma=sigma, weighted=True)
+    double = solved(graph, tol=1e-11)
+    monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
+    single = solved(graph, tol=1e-11)
+    assert (single[1] != double[1]).any()  # it did run in single precision
+    assert np.abs(shape(single[0]) - shape(double[0])).max() < 1e-7  # both within 1e-11 of a curved minimum
+    assert np.sum(scale_functional(graph) * single[0]) == pytest.approx(graph.weights.sum(), rel=1e-12)
+    assert certify(graph, *single).equality_residual < 1e-12

@@ -65,10 +65,7 @@ _EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound 
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
 _REGULAR_SINGLE = 1e-3  # the same for a factor in single precision: far above its rounding, n d eps
-_SMALL, _LARGEST_DENSE = (
-    450,
-    1800,
-)  # unknowns up to which, or up to which on dense graphs, the factor is dense
+_SMALL, _LARGEST_DENSE = 450, 1800  # unknowns up to which any graph, or a dense one, has a dense factor
 _DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination saves much
 _SINGLE_FROM = 450  # unknowns from which a factor in single precision is tried first
 _UNIQUENESS_EDGES = 500_000  # beyond it uniqueness is not examined: ordering alone takes seconds

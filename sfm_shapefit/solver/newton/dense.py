@@ -16,10 +16,8 @@ from sfm_shapefit.laplacian.dense import (
     work_integers,
 )
 from sfm_shapefit.solver.newton.steps import (
-    EDGE_WORK,
     MU_PER_GAP,
     REFINEMENTS,
-    SOLVE_WORK,
     STALL,
     STEPS_PER_FACTOR,
     Progress,
@@ -43,8 +41,12 @@ from sfm_shapefit.viewgraph import ViewGraph
 _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 """By bytes per number: first and last multiple of the identity added to M, per mean eigenvalue."""
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
-"""By bytes per number: in single precision each gains two digits, or the matrix is too ill-conditioned."""
+"""By bytes per number: in single precision each gains a digit or more, or M is too ill-conditioned."""
+_PATIENCE = {4: 3, 8: STALL}
+"""By bytes per number: factorisations without progress after which it is given up."""
 _SINGLE_FROM = 450  # unknowns from which a factor in single precision saves more than its refinements cost
+_EDGE_WORK = 1000.0  # a step passes over one edge in the time of so many operations of a dense factorisation
+_SOLVE_WORK = 10.0  # so many operations per entry of the matrix, in the same unit
 _OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
 
 
@@ -67,6 +69,9 @@ class DenseFactor(NamedTuple):
     ridge: tuple[float, float]
     """First and last multiple of the identity added to M, per mean eigenvalue."""
     refinements: int
+    """After which a step must fulfil its equations, or is not taken."""
+    patience: int
+    """Factorisations without progress after which more of this precision will not help."""
 
 
 def solve_newton_dense(
@@ -97,8 +102,6 @@ def solve_newton_dense(
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
-            if single and stalled:
-                single, factor, stalled = False, _allocate_factor(n, d, np.float64), 0
             limit = min(chunk, max_iterations - count)
             done, stalled, progress = _newton(
                 problem, iterate, model, factor, step, progress, tol, limit, stalled
@@ -106,6 +109,8 @@ def solve_newton_dense(
             count += done
             if is_cancelled(on_iteration, count, progress):
                 break
+            if single and stalled >= factor.patience:
+                single, factor, stalled = False, _allocate_factor(n, d, np.float64), 0
     return *answer(problem, iterate, progress, tol), count
 
 
@@ -123,6 +128,7 @@ def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFact
         integers=work_integers(),
         ridge=_RIDGES[size],
         refinements=_REFINEMENTS[size],
+        patience=_PATIENCE[size],
     )
 
 
@@ -140,11 +146,13 @@ def _newton(
 ) -> tuple[int, int, Progress]:
     """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
     count = 0
-    while count < limit and progress.gap > tol and stalled < (1 if factor.right.itemsize == 4 else STALL):
+    while count < limit and progress.gap > tol and stalled < factor.patience:
         before = progress.gap
         count += 1
         progress = _cycle(problem, iterate, model, factor, step, progress, tol)
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
+        if progress.gap == before and factor.right.itemsize == 4:
+            stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
     return count, stalled, progress
 
 
@@ -160,8 +168,8 @@ def _cycle(
     if _factorise(problem, model, factor) != 0:
         return Progress(mu, progress.multiplier, progress.objective, first)
     order = float(problem.c.size)
-    step_work = EDGE_WORK * len(problem.w) + SOLVE_WORK * order**2
-    work = order**3 / 3.0 + 0.5 * EDGE_WORK * len(problem.w)
+    step_work = _EDGE_WORK * len(problem.w) + _SOLVE_WORK * order**2
+    work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = min(mu, MU_PER_GAP * previous)

@@ -26,10 +26,8 @@ STALL = 6  # factorisations without progress after which more will not help
 EDGE_WORK = 500.0  # a step passes over one edge in the time of so many operations of a factorisation
 SOLVE_WORK = 5.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
 
-_EQUALITY_PER_GAP, _LEAST_EQUALITY = (
-    1e-5,
-    1e-13,
-)  # allowed violation of D^T y = lambda c, per gap and at least, per mean degree
+_EQUALITY = 1e-3  # allowed violation of D^T y = lambda c, per squared gap and mean degree
+_LEAST_EQUALITY = 1e-13  # allowed in any case, per mean degree
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _HALVINGS = 20
@@ -214,8 +212,11 @@ def pays(first: float, previous: float, gap: float, work: float, step_work: floa
 
 @kernel(inline=True)
 def allowed_violation(problem: Any, gap: float) -> float:
-    """Return how far D^T y+ may be from lambda+ c at a camera."""
-    return float(max(_EQUALITY_PER_GAP * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c))
+    """Return how far D^T y+ may be from lambda+ c at a camera.
+
+    By the square of the gap, for the last step may begin at 1e-5, and its dual should need no repair.
+    """
+    return float(max(_EQUALITY * gap * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c))
 
 
 @kernel(inline=True)
