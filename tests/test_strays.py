@@ -6,7 +6,7 @@ import pytest
 from sfm_shapefit.geometry import median_spread, normalized
 from sfm_shapefit.robust.finish import finish
 from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.robust.strays import put_back, strays
+from sfm_shapefit.robust.strays import left_scene, put_back, strays
 from sfm_shapefit.solver.angular import KERNEL_WIDTH
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
@@ -32,15 +32,19 @@ def joining(graph: ViewGraph, *nodes: int):
     return count > 0, count > 1
 
 
+def found_strays(graph: ViewGraph, start, refined, agreeing) -> list[int]:
+    return strays(graph, left_scene(start, refined), agreeing).tolist()
+
+
 def test_a_node_far_away_that_contradicts_the_rest_is_a_stray():
     graph, t, moved = scene(4)
     of_node, _ = joining(graph, 4)
-    assert strays(graph, t, moved, ~of_node).tolist() == [4]
+    assert found_strays(graph, t, moved, ~of_node) == [4]
 
 
 def test_a_node_far_away_that_the_rest_agrees_with_is_none():
     graph, t, moved = scene(4)
-    assert strays(graph, t, moved, np.ones(graph.num_edges, dtype=bool)).tolist() == []
+    assert found_strays(graph, t, moved, np.ones(graph.num_edges, dtype=bool)) == []
 
 
 @pytest.mark.parametrize(("agreed", "found"), [(19, []), (11, []), (9, [4]), (1, [4])])
@@ -49,13 +53,13 @@ def test_most_of_its_pairs_must_agree(agreed, found):
     of_node, _ = joining(graph, 4)
     agreeing = ~of_node
     agreeing[np.flatnonzero(of_node)[:agreed]] = True  # of 19
-    assert strays(graph, t, moved, agreeing).tolist() == found
+    assert found_strays(graph, t, moved, agreeing) == found
 
 
 def test_strays_do_not_vouch_for_one_another():
     graph, t, moved = scene(4, 5, 6)
     of_nodes, within = joining(graph, 4, 5, 6)
-    assert strays(graph, t, moved, ~of_nodes | within).tolist() == [4, 5, 6]
+    assert found_strays(graph, t, moved, ~of_nodes | within) == [4, 5, 6]
 
 
 def test_a_far_group_that_agrees_with_the_rest_stays_whole():
@@ -64,7 +68,7 @@ def test_a_far_group_that_agrees_with_the_rest_stays_whole():
     agreeing = ~of_nodes | within
     across = np.flatnonzero(of_nodes & ~within)  # 51 pairs; node 4 alone has few agreeing ones
     agreeing[across] = graph.edges[across].min(axis=1) != 4
-    assert strays(graph, t, moved, agreeing).tolist() == []
+    assert found_strays(graph, t, moved, agreeing) == []
 
 
 def test_one_agreeing_pair_holds_no_distance():
@@ -73,25 +77,25 @@ def test_one_agreeing_pair_holds_no_distance():
     one = np.flatnonzero(of_node)[:1]
     kept = np.sort(np.concatenate([np.flatnonzero(~of_node), one]))
     hanging = ViewGraph(N, graph.edges[kept], graph.directions[kept])
-    assert strays(hanging, t, moved, np.ones(len(kept), dtype=bool)).tolist() == [4]
+    assert found_strays(hanging, t, moved, np.ones(len(kept), dtype=bool)) == [4]
 
 
 def test_nobody_is_a_stray_within_three_times_the_radius_of_the_start():
     graph, t, _ = scene()
     none = np.zeros(graph.num_edges, dtype=bool)
-    assert strays(graph, t, t, none).tolist() == []
+    assert found_strays(graph, t, t, none) == []
     distances = np.linalg.norm(t - np.median(t, axis=0), axis=1)
     last = int(np.argmax(distances))
     for share, found in ((2.5, []), (3.5, [last])):
         moved = t.copy()
         moved[last] = np.median(t, axis=0) + share * (t[last] - np.median(t, axis=0))
-        assert strays(graph, t, moved, none).tolist() == found
+        assert found_strays(graph, t, moved, none) == found
 
 
 def test_scale_and_origin_do_not_matter_to_who_strays_nor_to_where_it_goes():
     graph, t, moved = scene(4)
     of_node, _ = joining(graph, 4)
-    assert strays(graph, 1e-3 * t + 7.0, 50.0 * moved - 1.0, ~of_node).tolist() == [4]
+    assert found_strays(graph, 1e-3 * t + 7.0, 50.0 * moved - 1.0, ~of_node) == [4]
     back = put_back(1e-3 * t + 7.0, 50.0 * moved - 1.0, np.array([4]))
     np.testing.assert_allclose(back, 50.0 * t - 1.0, atol=1e-9)
 

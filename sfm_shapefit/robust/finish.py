@@ -15,7 +15,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.robust.strays import put_back, strays
+from sfm_shapefit.robust.strays import left_scene, put_back, strays
 from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
 from sfm_shapefit.solver.angular import (
     AngularResult,
@@ -213,7 +213,10 @@ def _without_strays(
 ) -> tuple[AngularResult, int]:
     """Return a refinement whose strays are put back, and their number; of the start, if that fits better."""
     levels = refined.levels_rad
-    nodes = strays(graph, start, refined.locations, agreeing_pairs(graph, refined.locations, metric, levels))
+    far = left_scene(start, refined.locations)
+    if not far.any():
+        return refined, 0
+    nodes = strays(graph, far, agreeing_pairs(graph, refined.locations, metric, levels))
     if len(nodes) == 0:
         return refined, 0
     locations = _unit(put_back(start, refined.locations, nodes))

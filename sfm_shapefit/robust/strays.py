@@ -21,17 +21,24 @@ _FEWEST_AGREEING = 2  # of them with the rest: along a single direction a group 
 _FEWEST_OTHERS = 3  # nodes that say where the start lies
 
 
-def strays(graph: ViewGraph, start: FloatArray, refined: FloatArray, agreeing: BoolArray) -> IntArray:
+def left_scene(start: FloatArray, refined: FloatArray) -> BoolArray:
+    """Return the nodes that ended far outside the start's radius, (n,); scale and origin do not matter.
+
+    Args:
+        start, refined: (n, d) locations before and after the refinement.
+    """
+    far: BoolArray = _distances(refined) > _REACH * _distances(start).max()
+    return far if np.sum(~far) >= _FEWEST_OTHERS else np.zeros_like(far)
+
+
+def strays(graph: ViewGraph, far: BoolArray, agreeing: BoolArray) -> IntArray:
     """Return the nodes that left the scene without the agreement of the rest, ascending.
 
     Args:
         graph: the view graph.
-        start, refined: (n, d) locations before and after the refinement; scale and origin do not matter.
+        far: (n,) those that left it, see `left_scene`.
         agreeing: (m,) pairs that fit the refined locations.
     """
-    far = _distances(refined) > _REACH * _distances(start).max()
-    if not far.any() or np.sum(~far) < _FEWEST_OTHERS:
-        return np.zeros(0, dtype=np.int64)
     is_far = far[graph.edges]
     i, j = graph.edges[is_far.all(axis=1) & agreeing].T
     adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_cameras, graph.num_cameras))
