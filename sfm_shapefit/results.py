@@ -570,6 +570,8 @@ def _finish_summary(finish: Finish) -> dict[str, Any]:
         "levels_deg": list(finish.levels_deg),
         "moved_median": finish.moved[0],
         "moved_max": finish.moved[1],
+        "num_turned_pairs": finish.num_turned_pairs,
+        "num_put_back": finish.num_put_back,
         "lud": lud
         and {
             "objective": lud.objective,

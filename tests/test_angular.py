@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.geometry import median_spread, normalized
+from sfm_shapefit.geometry import median_spread, normalized, tangent_bases
 from sfm_shapefit.solver import angular
 from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles, residual_levels, robust_cost
 from sfm_shapefit.solver.program import differences
@@ -327,3 +327,86 @@ def test_the_refinement_improves_the_certified_optimum_on_noisy_data():
     graph = graph_of(problem)
     start = solve(graph).locations
     assert error(refined(graph, start).locations, problem.locations) < 0.8 * error(start, problem.locations)
+
+
+# --- symmetries ------------------------------------------------------------------------------------
+
+
+def test_the_answer_is_a_stationary_point_of_the_robust_cost():
+    problem = random_graph_problem(20, 0.9, sigma=0.02, q=0.15, seed=5)
+    graph = graph_of(problem)
+    found = refined(graph, shaken(problem, 0.05))
+    scale = np.abs(found.locations).max()
+
+    def slope(t, direction):
+        up, down = (
+            robust_cost(graph, t + h * direction, one_class(graph), found.levels_rad) for h in (1e-5, -1e-5)
+        )
+        return (up - down) / 2e-5
+
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        direction = scale * normalized(rng.standard_normal(found.locations.shape).reshape(1, -1)).reshape(
+            -1, 3
+        )
+        here, there = (
+            slope(found.locations, direction),
+            slope(found.locations + 0.01 * rng.standard_normal((20, 3)) * scale, direction),
+        )
+        # It ends where a step lowers the cost by no more than 3e-5 of itself.
+        assert abs(here) < 0.02 * found.cost
+        assert abs(there) > 0.2 * found.cost
+
+
+def test_a_direction_counts_in_its_own_metric():
+    """Errors are 0.05 along one axis and 1e-3 along the other: only the metric knows which."""
+    problem = random_graph_problem(40, 0.5, seed=6)
+    rng = np.random.default_rng(6)
+    bases = tangent_bases(problem.directions)
+    axis = np.array([0.05, 1e-3])
+    angle = rng.uniform(0.0, np.pi, len(problem.edges))
+    turn = np.stack(
+        [np.stack([np.cos(angle), -np.sin(angle)], 1), np.stack([np.sin(angle), np.cos(angle)], 1)], 1
+    )
+    off = turn @ (axis * rng.standard_normal((len(angle), 2)))[:, :, None]
+    graph = ViewGraph(40, problem.edges, normalized(problem.directions + (bases @ off)[:, :, 0]))
+    # The bases of the measured directions are turned by the error only: the same covariance holds in them.
+    covariance = turn @ np.diag(axis**2) @ turn.transpose(0, 2, 1)
+    classes = np.zeros(len(angle), dtype=np.int64)
+    start = shaken(problem, 0.02)
+    known = refined(graph, start, Metric(covariance, classes))
+    unknown = refined(graph, start, Metric(None, classes))
+    none_known = refined(graph, start, Metric(np.full_like(covariance, np.nan), classes))
+    truth = problem.locations
+    assert error(known.locations, truth) < 0.8 * error(unknown.locations, truth)
+    np.testing.assert_allclose(none_known.locations, unknown.locations, atol=1e-6)
+
+
+def test_origin_scale_and_axes_of_the_start_do_not_matter():
+    problem = random_graph_problem(30, 0.6, sigma=0.01, q=0.1, seed=10)
+    graph, start = graph_of(problem), shaken(problem, 0.05)
+    plain = refined(graph, start)
+    moved = refined(graph, 1e4 * start + [300.0, -20.0, 7.0])
+    np.testing.assert_allclose(moved.locations, plain.locations, atol=1e-7)
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
+    turned = refined(ViewGraph(30, graph.edges, graph.directions @ turn), start @ turn)
+    np.testing.assert_allclose(turned.locations, plain.locations @ turn, atol=1e-7)
+    assert np.linalg.norm(plain.locations) == pytest.approx(1.0)
+    np.testing.assert_allclose(plain.locations.mean(axis=0), 0.0, atol=1e-15)
+
+
+def test_an_edge_of_weight_two_counts_as_two():
+    problem = random_graph_problem(25, 0.5, sigma=0.02, seed=12)
+    graph = graph_of(problem)
+    weights = np.where(np.arange(graph.num_edges) % 3 == 0, 2.0, 1.0)
+    heavy = ViewGraph(25, graph.edges, graph.directions, weights)
+    levels = np.array([0.01])
+    single = [
+        robust_cost(
+            ViewGraph(25, graph.edges[keep], graph.directions[keep]), problem.locations, metric, levels
+        )
+        for keep in (weights == 2.0, weights == 1.0)
+        for metric in [Metric(None, np.zeros(int(keep.sum()), dtype=np.int64))]
+    ]
+    total = robust_cost(heavy, problem.locations, one_class(heavy), levels)
+    assert total == pytest.approx(2.0 * single[0] + single[1])

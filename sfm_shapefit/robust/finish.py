@@ -7,7 +7,7 @@ whether ShapeFit's optimum can be believed by itself: the standard deviation, ov
 of their node lengths, a camera's node length being the median length of its pairs.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,10 +15,12 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.strays import left_scene, put_back, strays
 from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
 from sfm_shapefit.solver.angular import (
     AngularResult,
     Metric,
+    agreeing_pairs,
     plan_refinement,
     refine_angles,
     residual_levels,
@@ -49,6 +51,8 @@ class Start:
     """(n, d) as solved."""
     refined: AngularResult | None
     """None where it was not refined."""
+    put_back: int = 0
+    """Nodes that the refinement threw out of the scene, and that are where the start had them instead."""
 
     @property
     def best(self) -> FloatArray:
@@ -77,6 +81,10 @@ class Finish:
     moved: tuple[float, float]
     """Median and largest move of a node by the refinement, as a share of the median distance from the
     centre."""
+    num_turned_pairs: int
+    """Pairs that fit the start and not the refined locations, or the other way round, at `levels_deg`."""
+    num_put_back: int
+    """Nodes that the refinement threw out of the scene; they are where the start had them instead."""
     lud: LudResult | None
     """The second start, with its own dual bound (0 where that was not computed)."""
 
@@ -90,9 +98,10 @@ class Finish:
         if not self.refined:
             return f"{self.start}, not refined: {self.reason}"
         median, largest = self.moved
+        back = f"; {self.num_put_back} thrown out of the scene and put back" if self.num_put_back else ""
         return (
-            f"{self.start}, refined in angles (moved by {median:.2%} of the extent, at most {largest:.2%}): "
-            f"{self.reason}"
+            f"{self.start}, refined in angles (moved by {median:.2%} of the extent, at most {largest:.2%}; "
+            f"{self.num_turned_pairs} pairs changed sides{back}): {self.reason}"
         )
 
 
@@ -142,6 +151,8 @@ def finish(
         costs=costs,
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=moved,
+        num_turned_pairs=_turned_pairs(graph, kept, metric, levels),
+        num_put_back=kept.put_back,
         lud=lud,
     )
 
@@ -188,10 +199,39 @@ def _refined(
     rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
-    refined = None if plan is None else refine_angles(graph, locations, metric, plan, rival)
-    if refined is not None and projected_length(graph, refined.locations) <= 0.0:
-        refined = None
-    return Start(name=name, locations=locations, refined=refined)
+    if plan is None:
+        return Start(name=name, locations=locations, refined=None)
+    refined = refine_angles(graph, locations, metric, plan, rival)
+    refined, num_strays = _without_strays(graph, locations, refined, metric)
+    if projected_length(graph, refined.locations) <= 0.0:
+        return Start(name=name, locations=locations, refined=None)
+    return Start(name=name, locations=locations, refined=refined, put_back=num_strays)
+
+
+def _without_strays(
+    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric
+) -> tuple[AngularResult, int]:
+    """Return a refinement whose strays are put back, and their number; of the start, if that fits better."""
+    levels = refined.levels_rad
+    far = left_scene(start, refined.locations)
+    if not far.any():
+        return refined, 0
+    nodes = strays(graph, far, agreeing_pairs(graph, refined.locations, metric, levels))
+    if len(nodes) == 0:
+        return refined, 0
+    locations = _unit(put_back(start, refined.locations, nodes))
+    cost, first_cost = (robust_cost(graph, t, metric, levels) for t in (locations, start))
+    if first_cost < cost:
+        return replace(refined, locations=_unit(start), cost=first_cost), 0
+    return replace(refined, locations=locations, cost=cost), len(nodes)
+
+
+def _turned_pairs(graph: ViewGraph, kept: Start, metric: Metric, levels: FloatArray) -> int:
+    """Return how many pairs the refinement made fit, or not fit any more."""
+    if kept.refined is None:
+        return 0
+    before, after = (agreeing_pairs(graph, t, metric, levels) for t in (kept.locations, kept.best))
+    return int(np.sum(before != after))
 
 
 def _common_levels(graph: ViewGraph, starts: list[Start], metric: Metric) -> FloatArray:

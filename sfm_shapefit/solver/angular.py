@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread, tangent_bases
 from sfm_shapefit.jit import kernel
@@ -156,6 +156,21 @@ def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels:
     return _cost(graph, information, _unit(locations))
 
 
+def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
+    """Return which pairs fit the locations, (m,): those of chi2 below k^2.
+
+    Args:
+        graph: the view graph.
+        locations: (n, d).
+        metric: covariance and class of each pair.
+        levels: (number of classes,) in radians.
+    """
+    information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    residuals = _residuals(graph, _unit(locations))
+    chi2 = np.einsum("ea,eab,eb->e", residuals, information, residuals)
+    return np.asarray(chi2 < KERNEL_WIDTH**2)
+
+
 def residual_levels(
     graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray
 ) -> FloatArray:
@@ -248,12 +263,17 @@ def _motion(t: FloatArray, moved: FloatArray) -> float:
     return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
 
-def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
-    """Return |u_e - v_e|, (m,), which is the residual angle where that is small."""
+def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return u_e - v_e, (m, d)."""
     baselines = differences(t, graph.edges)
     lengths = np.linalg.norm(baselines, axis=1, keepdims=True)
     units = baselines / np.maximum(lengths, _SHORTEST * np.median(lengths))
-    return np.asarray(np.linalg.norm(units - graph.directions, axis=1))
+    return np.asarray(units - graph.directions)
+
+
+def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return |u_e - v_e|, (m,), which is the residual angle where that is small."""
+    return np.asarray(np.linalg.norm(_residuals(graph, t), axis=1))
 
 
 def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False) -> float:

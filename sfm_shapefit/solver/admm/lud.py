@@ -29,7 +29,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _LEAST_LENGTH = 1.0
 _REPAIRS = 12
-_CG_TOL = 1e-12
+_CG_TOL = 1e-7  # twice, which makes 1e-14
 _CG_STEPS = 300
 
 
@@ -115,6 +115,9 @@ def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner
     for _ in range(_REPAIRS):
         y = _balanced(graph, dual, bound_active, precondition)
         still_active = bound_active & (along(y, v) <= 0.0)
+        if (still_active == bound_active).all():  # then once more, to rounding
+            y = _balanced(graph, y, bound_active, precondition)
+            still_active = bound_active & (along(y, v) <= 0.0)
         if (still_active == bound_active).all():
             break
         bound_active = still_active
@@ -136,14 +139,12 @@ def _balanced(
         return np.where(free[:, None], z, across(z, v))
 
     y = allowed(dual)
-    for _ in range(2):  # the second pass removes the rounding of the first
-        h = conjugate_gradients(
-            lambda x: adjoint(allowed(differences(x, edges)), edges, n),
-            precondition,
-            adjoint(y, edges, n),
-            tol=_CG_TOL,
-            max_iterations=_CG_STEPS,
-            coupled=True,
-        ).x
-        y = allowed(y - allowed(differences(h, edges)))
-    return y
+    h = conjugate_gradients(
+        lambda x: adjoint(allowed(differences(x, edges)), edges, n),
+        precondition,
+        adjoint(y, edges, n),
+        tol=_CG_TOL,
+        max_iterations=_CG_STEPS,
+        coupled=True,
+    ).x
+    return np.asarray(y - allowed(differences(h, edges)))

@@ -1,0 +1,147 @@
+"""What the refinement throws out of the scene without the others' agreement comes back; what is far stays."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.geometry import median_spread, normalized
+from sfm_shapefit.robust.finish import finish
+from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.strays import left_scene, put_back, strays
+from sfm_shapefit.solver.angular import KERNEL_WIDTH
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+N = 20
+
+
+def scene(*far: int):
+    """A complete graph, its places, and the same with some nodes a hundred times as far away."""
+    t = np.random.default_rng(0).standard_normal((N, 3))
+    edges = np.array([(i, j) for i in range(N) for j in range(i + 1, N)])
+    graph = ViewGraph(N, edges, normalized(differences(t, edges)))
+    moved = t.copy()
+    moved[list(far)] *= 100.0
+    return graph, t, moved
+
+
+def joining(graph: ViewGraph, *nodes: int):
+    """Which pairs have any of the nodes, and which have two of them."""
+    count = np.isin(graph.edges, nodes).sum(axis=1)
+    return count > 0, count > 1
+
+
+def found_strays(graph: ViewGraph, start, refined, agreeing) -> list[int]:
+    return strays(graph, left_scene(start, refined), agreeing).tolist()
+
+
+def test_a_node_far_away_that_contradicts_the_rest_is_a_stray():
+    graph, t, moved = scene(4)
+    of_node, _ = joining(graph, 4)
+    assert found_strays(graph, t, moved, ~of_node) == [4]
+
+
+def test_a_node_far_away_that_the_rest_agrees_with_is_none():
+    graph, t, moved = scene(4)
+    assert found_strays(graph, t, moved, np.ones(graph.num_edges, dtype=bool)) == []
+
+
+@pytest.mark.parametrize(("agreed", "found"), [(19, []), (11, []), (9, [4]), (1, [4])])
+def test_most_of_its_pairs_must_agree(agreed, found):
+    graph, t, moved = scene(4)
+    of_node, _ = joining(graph, 4)
+    agreeing = ~of_node
+    agreeing[np.flatnonzero(of_node)[:agreed]] = True  # of 19
+    assert found_strays(graph, t, moved, agreeing) == found
+
+
+def test_strays_do_not_vouch_for_one_another():
+    graph, t, moved = scene(4, 5, 6)
+    of_nodes, within = joining(graph, 4, 5, 6)
+    assert found_strays(graph, t, moved, ~of_nodes | within) == [4, 5, 6]
+
+
+def test_a_far_group_that_agrees_with_the_rest_stays_whole():
+    graph, t, moved = scene(4, 5, 6)
+    of_nodes, within = joining(graph, 4, 5, 6)
+    agreeing = ~of_nodes | within
+    across = np.flatnonzero(of_nodes & ~within)  # 51 pairs; node 4 alone has few agreeing ones
+    agreeing[across] = graph.edges[across].min(axis=1) != 4
+    assert found_strays(graph, t, moved, agreeing) == []
+
+
+def test_one_agreeing_pair_holds_no_distance():
+    graph, t, moved = scene(4)
+    of_node, _ = joining(graph, 4)
+    one = np.flatnonzero(of_node)[:1]
+    kept = np.sort(np.concatenate([np.flatnonzero(~of_node), one]))
+    hanging = ViewGraph(N, graph.edges[kept], graph.directions[kept])
+    assert found_strays(hanging, t, moved, np.ones(len(kept), dtype=bool)) == [4]
+
+
+def test_nobody_is_a_stray_within_three_times_the_radius_of_the_start():
+    graph, t, _ = scene()
+    none = np.zeros(graph.num_edges, dtype=bool)
+    assert found_strays(graph, t, t, none) == []
+    distances = np.linalg.norm(t - np.median(t, axis=0), axis=1)
+    last = int(np.argmax(distances))
+    for share, found in ((2.5, []), (3.5, [last])):
+        moved = t.copy()
+        moved[last] = np.median(t, axis=0) + share * (t[last] - np.median(t, axis=0))
+        assert found_strays(graph, t, moved, none) == found
+
+
+def test_scale_and_origin_do_not_matter_to_who_strays_nor_to_where_it_goes():
+    graph, t, moved = scene(4)
+    of_node, _ = joining(graph, 4)
+    assert found_strays(graph, 1e-3 * t + 7.0, 50.0 * moved - 1.0, ~of_node) == [4]
+    back = put_back(1e-3 * t + 7.0, 50.0 * moved - 1.0, np.array([4]))
+    np.testing.assert_allclose(back, 50.0 * t - 1.0, atol=1e-9)
+
+
+def test_those_that_stay_say_where_the_others_go_and_nothing_turns():
+    t = np.random.default_rng(1).standard_normal((N, 3))
+    moved = 2.0 * t
+    moved[:12] += 1000.0  # most of them, together
+    np.testing.assert_allclose(put_back(t, moved, np.arange(12)), 2.0 * t, atol=1e-6)
+    turned = t @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.abs(put_back(t, turned, np.array([3]))[3] - turned[3]).max() > 0.1  # directions know the axes
+
+
+def test_cameras_without_a_right_pair_stay_in_the_scene():
+    """A fifth of the cameras have three random directions each, the others a sound graph among them."""
+    problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.1, seed=1)
+    rng = np.random.default_rng(1)
+    loose = 48
+    sound = problem.edges.max(axis=1) < loose
+    wrong = np.array([(i, j) for j in range(loose, 60) for i in sorted(rng.choice(j, 3, replace=False))])
+    edges = np.concatenate([problem.edges[sound], wrong])
+    random_ones = normalized(rng.standard_normal((len(wrong), 3)))
+    graph = ViewGraph(60, edges, np.concatenate([problem.directions[sound], random_ones]))
+    found = finish(graph, solve(graph), PlacementOptions())
+    distances = np.linalg.norm(found.locations - np.median(found.locations, axis=0), axis=1)
+    # A convex start has all within about 10 median distances here, and 3 times that is allowed.
+    assert distances.max() < 30.0 * median_spread(found.locations)
+    assert found.num_put_back > 0
+    assert f"{found.num_put_back} thrown out of the scene and put back" in found.statement()
+    body, truth = found.locations[:loose], problem.locations[:loose]
+    body, truth = (x - x.mean(axis=0) for x in (body, truth))
+    assert np.linalg.norm(body / np.linalg.norm(body) - truth / np.linalg.norm(truth)) < 0.01
+
+
+def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
+    problem = random_graph_problem(40, 0.5, sigma=0.02, q=0.2, seed=2)
+    graph = ViewGraph(40, problem.edges, problem.directions)
+    found = finish(graph, solve(graph), PlacementOptions())
+    assert found.num_put_back == 0
+    start = solve(graph).locations if found.start == "ShapeFit" else found.lud.locations
+    before, after = (
+        np.linalg.norm(normalized(differences(t, graph.edges)) - graph.directions, axis=1)
+        < KERNEL_WIDTH * np.radians(found.levels_deg[0])
+        for t in (start, found.locations)
+    )
+    assert found.num_turned_pairs == np.sum(before != after) > 0
+    assert f"{found.num_turned_pairs} pairs changed sides)" in found.statement()
+    unrefined = finish(graph, solve(graph), PlacementOptions(refine=False))
+    assert (unrefined.num_turned_pairs, unrefined.num_put_back) == (0, 0)
