@@ -270,7 +270,7 @@ def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step
     monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
     monkeypatch.setitem(dense._REFINEMENTS, 4, 0)  # without refinement, no step fulfils its equations
     t, _ = solved(graph, tol=1e-13)
-    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
+    assert np.linalg.norm(shape(t) - shape(truth)) < 5e-12  # 16 times the gap on this graph
 
 
 def test_larger_noiseless_graphs_are_recovered_to_rounding_too():
