@@ -1,4 +1,4 @@
-"""Where the cameras of a synthetic scene stand, and which surface points lie before them: one layout per shape.
+"""Where the cameras of a synthetic scene stand, and which surface points lie before them, for each shape.
 
 World axes: z is up; one unit is a metre. Every surface is convex towards its cameras, so that which way a
 point faces also decides whether it is hidden.
@@ -74,7 +74,7 @@ def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
 def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     """Cameras every 1.5 m on a winding street, looking ahead; facades 7 m left and right, and the ground."""
     at = 1.5 * np.arange(n)
-    road, ahead, left = _road(at)
+    road, ahead, left = street(at)
     centers = road + 0.1 * rng.standard_normal((n, 1)) * left
     centers[:, 2] = 1.5 + 0.05 * rng.standard_normal(n)
 
@@ -83,7 +83,7 @@ def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     on_ground = side == 0.0
     lateral = np.where(on_ground, rng.uniform(-6.5, 6.5, p), side * rng.uniform(6.5, 7.5, p))
     height = np.where(on_ground, 0.0, rng.uniform(0.0, 8.0, p))
-    foot, _, across = _road(along)
+    foot, _, across = street(along)
     points = foot + lateral[:, None] * across
     points[:, 2] = height
     normals = np.where(on_ground[:, None], [0.0, 0.0, 1.0], -side[:, None] * across)
@@ -98,7 +98,7 @@ def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     )
 
 
-def _road(along_m: npt.NDArray[np.floating]) -> tuple[FloatArray, FloatArray, FloatArray]:
+def street(along_m: npt.NDArray[np.floating]) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return position, unit tangent and unit left normal (k, 3) of the street y = 18 sin(x / 60) at x."""
     slope = 0.3 * np.cos(along_m / 60.0)
     zero = np.zeros_like(along_m)
@@ -158,6 +158,17 @@ LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], Layout]] = {
     "courtyard": _courtyard,
 }
 """By shape: (number of images, number of points, generator) -> layout."""
+
+
+def turned_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:
+    """Return the rotations (n, 3, 3) after small random turns, N(0, sigma^2) about each camera axis."""
+    from scipy.spatial.transform import Rotation
+
+    if sigma_rad == 0.0:
+        return rotations
+    turns = Rotation.from_rotvec(sigma_rad * rng.standard_normal((len(rotations), 3))).as_matrix()
+    turned: FloatArray = turns @ rotations
+    return turned
 
 
 def _looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:

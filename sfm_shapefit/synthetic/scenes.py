@@ -24,7 +24,7 @@ from scipy.sparse import coo_array, csr_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout
+from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turned_at_random
 from sfm_shapefit.synthetic.options import SceneOptions
 
 _NEAREST_DEPTH_M = 0.3  # nothing is photographed closer than this
@@ -127,7 +127,9 @@ def make_scene(options: SceneOptions) -> Scene:
         calibration=options.calibration,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=_turned(layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng),
+        stated_rotations=turned_at_random(
+            layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng
+        ),
         points=layout.points,
         colors=layout.colors,
         keypoints=tuple(keypoints),
@@ -396,18 +398,7 @@ def _relative_poses(
     for e, false in false_lists.items():
         centers[e, false.displaced] = false.center
     rotation_i, rotation_j = layout.rotations[pairs].swapaxes(0, 1)
-    rotation = _turned(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
+    rotation = turned_at_random(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
     translation = normalized(np.einsum("eab,eb->ea", rotation_j, centers[:, 0] - centers[:, 1]))
     noise = _RELATIVE_POSE_DIRECTION_FACTOR * ray_noise_rad * rng.standard_normal(translation.shape)
     return rotation, normalized(translation + noise)
-
-
-def _turned(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:
-    """Return the rotations (n, 3, 3) after small random turns, N(0, sigma^2) about each camera axis."""
-    from scipy.spatial.transform import Rotation
-
-    if sigma_rad == 0.0:
-        return rotations
-    turns = Rotation.from_rotvec(sigma_rad * rng.standard_normal((len(rotations), 3))).as_matrix()
-    turned: FloatArray = turns @ rotations
-    return turned
