@@ -87,9 +87,9 @@ _SMALLEST_INTEGERS = {
 class RenderOptions:
     """How a scene is drawn, where images are asked for. Every field is a flag of `sfm-shapefit synth`."""
 
-    repeat_m: float = 0.0
-    """Width of the houses where all of them look the same, so that matches of different houses are wrong and
-    agree; 0: none looks like another."""
+    repeated_fraction: float = 0.0
+    """Fraction of the houses (of the tower's sides in a ring) that look the same, so that matches of
+    different ones are wrong and agree."""
     radial_k1: float = -0.05
     """First radial distortion coefficient of the lens, as OpenCV and COLMAP define it."""
     radial_k2: float = 0.01
@@ -102,12 +102,10 @@ class RenderOptions:
     """Of the image files, 1 to 100."""
 
     def __post_init__(self) -> None:
-        if self.repeat_m != 0.0 and not 1.0 <= self.repeat_m < np.inf:
-            raise ValueError(f"RenderOptions.repeat_m must be 0 or at least 1, got {self.repeat_m}")
         for name in ("radial_k1", "radial_k2"):
             if not -0.5 <= getattr(self, name) <= 0.5:
                 raise ValueError(f"RenderOptions.{name} must lie in [-0.5, 0.5], got {getattr(self, name)}")
-        for name, most in (("gray_noise", 100.0), ("exposure_spread", 0.3)):
+        for name, most in (("repeated_fraction", 1.0), ("gray_noise", 100.0), ("exposure_spread", 0.3)):
             if not 0.0 <= getattr(self, name) <= most:
                 raise ValueError(f"RenderOptions.{name} must lie in [0, {most}], got {getattr(self, name)}")
         if not 1 <= self.jpeg_quality <= 100:

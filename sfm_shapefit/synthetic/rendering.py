@@ -98,7 +98,7 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
         rotations=layout.rotations,
         centers=layout.centers,
         stated_rotations=turned_at_random(layout.rotations, np.radians(options.rotation_noise_deg), rngs[5]),
-        surfaces=make_surfaces(options.shape, options.num_images, render.repeat_m, surface_rng),
+        surfaces=make_surfaces(options.shape, options.num_images, render.repeated_fraction, surface_rng),
     )
     _refuse_folding(scene)
     return scene

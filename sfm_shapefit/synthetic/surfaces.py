@@ -1,8 +1,8 @@
 """The textured surfaces of a rendered scene: houses, a tower, the ground, and boxes that stand about.
 
 Every surface is a closed trimesh mesh whose triangles carry a picture by planar mapping, in the axes of the
-thing that it belongs to: along its front, into it, and up. Where houses repeat, all of them are one house:
-same picture, same balconies. Boxes and ground never repeat.
+thing that it belongs to: along its front, into it, and up. Where houses repeat, they are one house: same
+picture, same balconies. Boxes and ground never repeat.
 
 The surfaces stand where the layout of the same shape has its points, and its cameras look at them. World
 axes: z is up; one unit is a metre.
@@ -22,7 +22,8 @@ from sfm_shapefit.synthetic.options import Shape
 from sfm_shapefit.synthetic.textures import facade_texture, ground_texture
 
 _HOUSE_DEPTH_M = 4.0
-_HOUSE_WIDTH_M = 8.0  # where houses do not repeat
+_HOUSE_WIDTH_M = 8.0
+_TOWER_SIDES = 8  # with a picture each
 _STOREY_M = 2.6
 _MOST_TEXELS = 2048  # along either side of the ground's picture
 _TEXELS_PER_M = 64.0
@@ -82,13 +83,13 @@ class _Place:
 _UPRIGHT = _Place(origin=np.zeros(3), along=np.array([1.0, 0.0, 0.0]), inward=np.array([0.0, 1.0, 0.0]))
 
 
-def make_surfaces(shape: Shape, num_images: int, repeat_m: float, rng: np.random.Generator) -> Surfaces:
+def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
     """Return the surfaces that the cameras of a layout look at.
 
     Args:
         shape: of the layout.
         num_images: of the layout; it decides how long a facade or a street is.
-        repeat_m: width of the houses where all of them are one and the same; 0 where none is like another.
+        repeated: fraction of the houses, or of the tower's sides, that are one and the same.
         rng: every draw comes from it.
 
     Raises:
@@ -98,7 +99,7 @@ def make_surfaces(shape: Shape, num_images: int, repeat_m: float, rng: np.random
         raise InputError(
             f"a {shape} has no surfaces to draw; choose one of the shapes {', '.join(_BUILDERS)}"
         )
-    parts = _BUILDERS[shape](num_images, repeat_m, rng)
+    parts = _BUILDERS[shape](num_images, repeated, rng)
     pictures = {id(part.texture): part.texture for part in parts}
     index = {key: k for k, key in enumerate(pictures)}
     counts = [len(part.corners) for part in parts]
@@ -115,41 +116,41 @@ def make_surfaces(shape: Shape, num_images: int, repeat_m: float, rng: np.random
 # --- shapes ------------------------------------------------------------------------------------------------
 
 
-def _facade(num_images: int, repeat_m: float, rng: np.random.Generator) -> list[_Part]:
+def _facade(num_images: int, repeated: float, rng: np.random.Generator) -> list[_Part]:
     """Return a row of houses along x, their fronts at y = 0, with boxes and ground before them."""
     columns = int(np.ceil(np.sqrt(num_images)))
     rows = -(-num_images // columns)
-    low, high = -10.0, 2.0 * columns + 10.0
+    num_houses = int(np.ceil((2.0 * columns + 20.0) / _HOUSE_WIDTH_M))
+    low, high = -10.0, -10.0 + num_houses * _HOUSE_WIDTH_M
     start = _Place(origin=np.array([low, 0.0, 0.0]), along=_UPRIGHT.along, inward=_UPRIGHT.inward)
-    houses = _row(start, high - low, _house_maker(repeat_m, 2.0 * rows + 8.0, rng))
+    houses = _row(start, num_houses, _house_maker(num_houses, 2.0 * rows + 8.0, repeated, rng))
     at = np.column_stack([rng.uniform(low, high, 2 * columns), rng.uniform(-3.0, -1.0, 2 * columns)])
     return houses + _boxes(at, 1.0, rng) + [_ground((low, -16.0), (high, 4.0), rng)]
 
 
-def _courtyard(_num_images: int, repeat_m: float, rng: np.random.Generator) -> list[_Part]:
+def _courtyard(_num_images: int, repeated: float, rng: np.random.Generator) -> list[_Part]:
     """Return four rows of houses round a yard of 24 by 18 m, boxes along them, and the ground."""
     half = np.array([12.0, 9.0])
-    maker = _house_maker(repeat_m, 8.0, rng)
+    maker = _house_maker(12, 8.0, repeated, rng)
     parts = []
     for turn in range(4):
         x, y = [(1, 0), (0, 1), (-1, 0), (0, -1)][turn]
         along, inward = np.array([x, y, 0.0]), np.array([-y, x, 0.0])
         length, distance = 2.0 * half[turn % 2], half[1 - turn % 2]
         start = _Place(origin=-0.5 * length * along + distance * inward, along=along, inward=inward)
-        parts += _row(start, length, maker)
+        parts += _row(start, 3, maker)  # those that reach beyond a corner are hidden by the next row
     angle = rng.uniform(0.0, 2.0 * np.pi, 16)
     at = 0.85 * half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return parts + _boxes(at, 1.0, rng) + [_ground((-13.0, -10.0), (13.0, 10.0), rng)]
 
 
-def _drive(num_images: int, repeat_m: float, rng: np.random.Generator) -> list[_Part]:
+def _drive(num_images: int, repeated: float, rng: np.random.Generator) -> list[_Part]:
     """Return houses left and right of the street, boxes at its sides, and the ground."""
     end = 1.5 * (num_images - 1) + FARTHEST_M
-    maker = _house_maker(repeat_m, 8.0, rng)
-    width = repeat_m or _HOUSE_WIDTH_M
+    starts = np.arange(0.0, end, _HOUSE_WIDTH_M)
+    maker = _house_maker(2 * len(starts), 8.0, repeated, rng)
     parts = []
     for side in (-1.0, 1.0):
-        starts = np.arange(0.0, end, width)
         road, _, left = street(starts)
         feet = road + 7.0 * side * left
         next_feet = np.concatenate([feet[1:], feet[-1:] + (feet[-1:] - feet[-2:-1])])
@@ -164,24 +165,32 @@ def _drive(num_images: int, repeat_m: float, rng: np.random.Generator) -> list[_
     return parts + _boxes(at, 1.2, rng) + [_ground((-5.0, -30.0), (end + 10.0, 30.0), rng)]
 
 
-def _ring(_num_images: int, repeat_m: float, rng: np.random.Generator) -> list[_Part]:
+def _ring(_num_images: int, repeated: float, rng: np.random.Generator) -> list[_Part]:
     """Return a round tower of 2.4 m by 2.8 m about the origin, boxes at its foot, and the ground."""
     radius, height, floor = 1.2, 2.8, -1.4
-    tower = trimesh.creation.cylinder(radius=radius, height=height, sections=16)
-    around = repeat_m or 2.0 * np.pi * radius
-    picture = facade_texture(round(height * _TEXELS_PER_M_NEAR), round(around * _TEXELS_PER_M_NEAR), 100, rng)
+    tower = trimesh.creation.cylinder(radius=radius, height=height, sections=2 * _TOWER_SIDES)
     corners, normals = np.asarray(tower.triangles), np.asarray(tower.face_normals)
-    angle = np.arctan2(normals[:, 1], normals[:, 0])
+    angle = np.arctan2(normals[:, 1], normals[:, 0]) % (2.0 * np.pi)
+    side_angle = 2.0 * np.pi / _TOWER_SIDES
+    side = np.floor(angle / side_angle).astype(np.int64) % _TOWER_SIDES
     tangent = np.stack([-np.sin(angle), np.cos(angle), np.zeros(len(angle))], axis=1)
-    u = np.einsum("tca,ta->tc", corners, tangent) + radius * angle[:, None]
+    u = np.einsum("tca,ta->tc", corners, tangent) + radius * (angle - side_angle * side)[:, None]
     texels = _TEXELS_PER_M_NEAR * np.stack([u, 0.5 * height - corners[:, :, 2]], axis=2)
     cap = np.abs(normals[:, 2]) > 0.5
     texels[cap] = _TEXELS_PER_M_NEAR * corners[cap][:, :, :2]
-    part = _Part(corners=corners, texels=texels, normals=normals, texture=picture)
+    size = (round(height * _TEXELS_PER_M_NEAR), round(radius * side_angle * _TEXELS_PER_M_NEAR))
+    repeating = facade_texture(*size, 100, rng)
+    parts = []
+    for k, repeats in enumerate(_chosen(_TOWER_SIDES, repeated, rng)):
+        picture = repeating if repeats else facade_texture(*size, 100, rng)
+        rows = side == k
+        parts.append(
+            _Part(corners=corners[rows], texels=texels[rows], normals=normals[rows], texture=picture)
+        )
     around_foot = 2.0 * np.pi * np.arange(10) / 10.0
     at = 2.0 * np.stack([np.cos(around_foot), np.sin(around_foot)], axis=1) + rng.uniform(-0.2, 0.2, (10, 2))
     ground = _ground((-8.0, -8.0), (8.0, 8.0), rng, floor)
-    return [part, *_boxes(at, 0.45, rng, floor, _TEXELS_PER_M_NEAR), ground]
+    return [*parts, *_boxes(at, 0.45, rng, floor, _TEXELS_PER_M_NEAR), ground]
 
 
 _BUILDERS: dict[Shape, Callable[[int, float, np.random.Generator], list[_Part]]] = {
@@ -196,10 +205,10 @@ _BUILDERS: dict[Shape, Callable[[int, float, np.random.Generator], list[_Part]]]
 
 
 def _house_maker(
-    repeat_m: float, height_m: float, rng: np.random.Generator
+    num_houses: int, height_m: float, repeated: float, rng: np.random.Generator
 ) -> Callable[[_Place], list[_Part]]:
-    """Return what puts a house at a place: a new one each time, or the same one where houses repeat."""
-    width = repeat_m or _HOUSE_WIDTH_M
+    """Return what puts a house at each place it is given: at some the one that repeats, else a new one."""
+    width = _HOUSE_WIDTH_M
 
     def drawn() -> tuple[ByteArray, FloatArray, FloatArray]:
         size = (round(height_m * _TEXELS_PER_M), round(width * _TEXELS_PER_M))
@@ -209,10 +218,11 @@ def _house_maker(
         extent = rng.uniform([0.5, 0.2, 0.3], [1.0, 0.7, 0.9], (count, 3))
         return picture, low, extent
 
-    only_one = drawn() if repeat_m else None
+    repeating = drawn()
+    repeats = iter(_chosen(num_houses, repeated, rng))
 
     def house(place: _Place) -> list[_Part]:
-        picture, low, extent = only_one if only_one is not None else drawn()
+        picture, low, extent = repeating if next(repeats) else drawn()
         front = _box(place, np.zeros(3), np.array([width, _HOUSE_DEPTH_M, height_m]), picture)
         before = low - extent * [0.0, 1.0, 0.0]  # balconies stand out of the front
         balconies = [_box(place, a, a + e, picture) for a, e in zip(before, extent, strict=True)]
@@ -221,14 +231,18 @@ def _house_maker(
     return house
 
 
-def _row(start: _Place, length_m: float, maker: Callable[[_Place], list[_Part]]) -> list[_Part]:
-    """Return houses side by side from a place on, at least as long as asked for."""
-    first = maker(start)
-    width = float(np.ptp(first[0].corners.reshape(-1, 3) @ start.along))
-    parts = first
-    for k in range(1, int(np.ceil(length_m / width - 1e-9))):
-        origin = start.origin + k * width * start.along
-        parts = parts + maker(_Place(origin=origin, along=start.along, inward=start.inward))
+def _chosen(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
+    """Return which of so many things are among a random fraction of them."""
+    chosen: list[bool] = (rng.permutation(count) < round(fraction * count)).tolist()
+    return chosen
+
+
+def _row(start: _Place, num_houses: int, maker: Callable[[_Place], list[_Part]]) -> list[_Part]:
+    """Return houses side by side from a place on."""
+    parts = []
+    for k in range(num_houses):
+        origin = start.origin + k * _HOUSE_WIDTH_M * start.along
+        parts += maker(_Place(origin=origin, along=start.along, inward=start.inward))
     return parts
 
 
