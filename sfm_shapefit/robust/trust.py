@@ -26,7 +26,7 @@ they stand to the rest. Counted are only the pairs with the main body of cameras
 correlation clustering: two bodies join while the agreeing matches between them outweigh the contradicting
 ones, the strongest first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of
 image and mesh graphs by lifted multicuts", section 4). So each group is judged by all its pairs with the rest
-together.
+together. Bodies are about who agrees with whom, not about evidence: leverages do not count there.
 
 Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
 together they count at most half as much as all agreements.
@@ -127,12 +127,12 @@ def judge_cameras(
         evidence: support and contradicting pairs; unknown if None.
     """
     num_cameras = len(conditioning.num_pairs)
-    votes = _votes(graph, angles, sigmas_of_pairs, leverages, evidence)
+    votes = _votes(graph, angles, sigmas_of_pairs, evidence)
     body: BoolArray = np.ones(graph.num_cameras, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
         body = main_body(graph.num_cameras, votes.pairs, signed)
-    agreement = _shares(votes, body, num_cameras)
+    agreement = _shares(_checked(votes, leverages), body, num_cameras)
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
     trust = np.minimum(agreement / usual, 1.0) * hold
@@ -153,13 +153,9 @@ class _Votes:
 
 
 def _votes(
-    graph: ViewGraph,
-    angles: FloatArray,
-    sigmas_of_pairs: FloatArray,
-    leverages: FloatArray,
-    evidence: Evidence | None,
+    graph: ViewGraph, angles: FloatArray, sigmas_of_pairs: FloatArray, evidence: Evidence | None
 ) -> _Votes:
-    """Collect the pairs that speak, with the weight of their matches and, if they agree, of their checks."""
+    """Collect the pairs that speak, with the weight of their matches."""
     pairs = graph.edges
     agrees = angles <= np.maximum(_AGREEING_ANGLE_RAD, _AGREEING_SIGMAS * sigmas_of_pairs)
     weights = np.full(graph.num_edges, _UNKNOWN_SUPPORT)
@@ -168,14 +164,19 @@ def _votes(
         weights = np.minimum(weights, _MAX_SUPPORT)
         pairs = np.concatenate([pairs, evidence.contradicting.reshape(-1, 2)])
         agrees = np.concatenate([agrees, np.zeros(len(evidence.contradicting), dtype=np.bool_)])
-    checked = np.ones(len(pairs))
-    if np.isfinite(leverages).any():
-        checked[: graph.num_edges] = 1.0 - np.nan_to_num(leverages, nan=1.0)
-    weights[agrees] *= checked[agrees]
     against = float(weights[~agrees].sum())
     allowed = _LARGEST_CONTRADICTION * float(weights[agrees].sum())
     weights[~agrees] *= min(1.0, allowed / against) if against > 0.0 else 1.0
     return _Votes(pairs, agrees, weights)
+
+
+def _checked(votes: _Votes, leverages: FloatArray) -> _Votes:
+    """Return the votes with agreeing pairs counted by how far others check them; as they are if unknown."""
+    if not np.isfinite(leverages).any():
+        return votes
+    checked = np.ones(len(votes.pairs))
+    checked[: len(leverages)] = 1.0 - np.nan_to_num(leverages, nan=1.0)
+    return _Votes(votes.pairs, votes.agrees, np.where(votes.agrees, checked, 1.0) * votes.weights)
 
 
 def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
