@@ -61,7 +61,7 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
 
 
 def _places(plan: SymbolicFactor) -> IntArray:
-    """Return where the block of each supernode waits, (S,): one task at a time has the arena, see the plan."""
+    """Return where the block of each supernode waits, (S,): one task at a time has the arena."""
     places = plan.update_offsets.copy()
     for begin, end in plan.tasks.tolist():
         places[begin : end - 1] += plan.stack_size

@@ -17,8 +17,8 @@ hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, t
 
 So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. Where there is no
 evidence either way, trust is 2/3 in a clean scene, and 2/3 of the median share where pairs are wrong: what
-nothing checks is right as often as the rest. In a clean scene a camera whose matches speak against it as much as for it has
-1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
+nothing checks is right as often as the rest. In a clean scene a camera whose matches speak against it as much
+as for it has 1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
 
 Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
 symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
