@@ -5,7 +5,7 @@ its own. The largest is the answer; the others are kept apart.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
 from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.rival import Rival, find_rival
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
 from sfm_shapefit.solver.options import SolverResult
@@ -46,6 +47,8 @@ class Placement:
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    rival: Rival | None = None
+    """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
 
     @property
     def nodes(self) -> IntArray:
@@ -172,6 +175,8 @@ def _place_piece(
     solved = solve(piece, options)
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
+    assessment = assess(piece, finished.locations, known, heard, placed)
+    rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,
         num_cameras=num_cameras,
@@ -179,5 +184,6 @@ def _place_piece(
         piece=k,
         solve=solved,
         finish=finished,
-        assessment=assess(piece, finished.locations, known, heard, placed),
+        assessment=assessment,
+        rival=None if rival is None else replace(rival, cameras=nodes[rival.cameras]),
     )
