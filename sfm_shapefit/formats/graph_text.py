@@ -1,4 +1,4 @@
-"""Files of other programs: so far bare view graphs as text.
+"""Bare view graphs as text.
 
 A graph file has one pair per line,
 
