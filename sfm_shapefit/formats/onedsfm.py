@@ -16,7 +16,8 @@ directions in the axes of i are coplanar to 0.004 (0.065 if t is taken in the ax
 Source: Wilson, Snavely, "Robust global translations with 1DSfM", ECCV 2014, and the manual of its data.
 """
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -46,6 +47,15 @@ class EpipolarGeometries:
     """(m, 3, 3) cam_j_from_cam_i."""
     to_second: FloatArray
     """(m, 3) unit directions to camera j in the axes of camera i."""
+
+    def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
+        """Return some of the pairs of the same cameras."""
+        return EpipolarGeometries(
+            names=self.names,
+            pairs=self.pairs[rows],
+            rotations=self.rotations[rows],
+            to_second=self.to_second[rows],
+        )
 
     def view_graph(self, rotations: FloatArray, known: BoolArray) -> ViewGraph:
         """Return the directions in world axes of all pairs both of whose cameras have a rotation.
@@ -172,12 +182,10 @@ def _restricted(found: EpipolarGeometries, component: Path) -> EpipolarGeometrie
     kept = inside[found.pairs].all(axis=1)
     if not kept.any():
         raise InputError(f"{component} keeps no pair of {_PAIRS_FILE}; remove it, or correct its ids")
+    left = found.subset(np.flatnonzero(kept).tolist())
     renumbered = np.cumsum(inside) - 1
-    return EpipolarGeometries(
-        names=tuple(name for name in found.names if name in wanted),
-        pairs=renumbered[found.pairs[kept]],
-        rotations=found.rotations[kept],
-        to_second=found.to_second[kept],
+    return replace(
+        left, names=tuple(name for name in found.names if name in wanted), pairs=renumbered[left.pairs]
     )
 
 
