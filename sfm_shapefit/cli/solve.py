@@ -35,6 +35,15 @@ def solve_command(
             help="World-to-camera rotations for EGs.txt, i R11 R12 ... R33 per line; averaged if not given.",
         ),
     ] = None,
+    max_rotation_error: Annotated[
+        float,
+        typer.Option(
+            "--max-rotation-error",
+            metavar="DEG",
+            min=0.0,
+            help="Leave out pairs of EGs.txt whose rotation contradicts the cameras' by more.",
+        ),
+    ] = 10.0,
     reverse: Annotated[
         bool, typer.Option("--reverse", help="Directions point from i to j, as in 1DSfM's prob.txt.")
     ] = False,
@@ -63,7 +72,13 @@ def solve_command(
         from sfm_shapefit.results import graph_summary, write_graph_result
 
         catch_termination()
-        found = solve_graph_file(source, options, rotations=rotations, reverse=reverse)
+        found = solve_graph_file(
+            source,
+            options,
+            rotations=rotations,
+            max_rotation_error_deg=max_rotation_error,
+            reverse=reverse,
+        )
         write_graph_result(found, target, overwrite=overwrite, g2o=g2o, onedsfm=onedsfm, protect=inputs)
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201

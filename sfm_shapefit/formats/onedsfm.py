@@ -25,7 +25,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
@@ -56,6 +56,11 @@ class EpipolarGeometries:
             rotations=self.rotations[rows],
             to_second=self.to_second[rows],
         )
+
+    def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
+        """Return (m,) by how many degrees each relative rotation contradicts the cameras' (n, 3, 3)."""
+        i, j = self.pairs.T
+        return rotation_angles_deg(self.rotations @ rotations[i] @ rotations[j].swapaxes(1, 2))
 
     def view_graph(self, rotations: FloatArray, known: BoolArray) -> ViewGraph:
         """Return the directions in world axes of all pairs both of whose cameras have a rotation.

@@ -15,6 +15,8 @@ from sfm_shapefit.results import GraphResult
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
+MAX_ROTATION_ERROR_DEG = 10.0
+
 
 class _Rotations(NamedTuple):
     """Rotations of cameras and where they come from."""
@@ -29,6 +31,7 @@ def solve_graph_file(
     options: PlacementOptions | None = None,
     *,
     rotations: Path | str | None = None,
+    max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
     reverse: bool = False,
 ) -> GraphResult:
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
@@ -37,6 +40,8 @@ def solve_graph_file(
         path: a text file, see `formats.read_graph`, or a 1DSfM folder or EGs.txt, see `formats.read_onedsfm`.
         options: settings; defaults if None.
         rotations: rots.txt of a 1DSfM source, see `formats.read_rotations`; averaged by pycolmap if None.
+        max_rotation_error_deg: pairs of a 1DSfM source whose relative rotation contradicts those of the
+            cameras by more are left out, as `locate` leaves out such relative poses.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
 
     Raises:
@@ -45,7 +50,7 @@ def solve_graph_file(
     """
     options = options or PlacementOptions()
     clock = Clock()
-    geometries, found = None, None
+    geometries, found, statement = None, None, "directions as given"
     if is_onedsfm(path):
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
@@ -53,7 +58,7 @@ def solve_graph_file(
             geometries = read_onedsfm(path)
         with clock("rotations"):
             found = _rotations(geometries, rotations)
-        graph = geometries.view_graph(found.cam_from_world, found.known)
+        graph, statement = _consistent(geometries, found, max_rotation_error_deg)
     else:
         if rotations is not None:
             raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
@@ -67,13 +72,31 @@ def solve_graph_file(
         further = tuple(place_further(placement, options))
     return GraphResult(
         path=Path(path),
-        statement="directions as given" if found is None else found.statement,
+        statement=statement,
         options=options,
         placement=placement,
         further=further,
         timings_s=clock.seconds,
         geometries=geometries,
         rotations=None if found is None else found.cam_from_world,
+    )
+
+
+def _consistent(
+    geometries: EpipolarGeometries, found: _Rotations, max_rotation_error_deg: float
+) -> tuple[ViewGraph, str]:
+    """Return the directions of the pairs that agree with the rotations, and what was left out."""
+    agreeing = np.flatnonzero(geometries.mismatch_deg(found.cam_from_world) <= max_rotation_error_deg)
+    total, kept = len(geometries.pairs), len(agreeing)
+    if kept == 0:
+        raise InputError(
+            f"none of the {total} relative rotations agrees with those of the cameras; "
+            "check that they belong together"
+        )
+    graph = geometries.subset(agreeing.tolist()).view_graph(found.cam_from_world, found.known)
+    return graph, (
+        f"{found.statement}; {total - kept} of {total} pairs contradict them by more than "
+        f"{max_rotation_error_deg:g} deg and are left out"
     )
 
 
