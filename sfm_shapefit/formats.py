@@ -9,6 +9,8 @@ numbers, nor contiguous. All lines have the same number of columns. The last col
 positive and the columns before it are unit vectors, in every line; otherwise it belongs to the direction.
 """
 
+import re
+import stat
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,24 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
 _ROUNDED = 1e-7
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words: Python refuses to convert very long ones
 _MIN_COLUMNS = 4  # two ids and a direction in the plane
+
+
+def refuse_irregular_file(path: Path) -> None:
+    """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
+
+    Raises:
+        InputError: if `path` is, or links to, a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it says why it cannot be read
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path} cannot be read: Is a directory")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
 
 
 def read_graph(path: Path | str) -> ViewGraph:
@@ -31,6 +50,7 @@ def read_graph(path: Path | str) -> ViewGraph:
         InputError: if the file cannot be read, naming the first malformed line by its number.
     """
     file = Path(path)
+    refuse_irregular_file(file)
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -108,7 +128,7 @@ def _directions_and_weights(values: FloatArray) -> tuple[FloatArray, FloatArray]
 def _nodes(words: list[str]) -> tuple[list[str], IntArray]:
     """Return the distinct ids in order, and the index of every word among them."""
     distinct = set(words)
-    if all(word.lstrip("-").isascii() and word.lstrip("-").isdigit() for word in distinct):
+    if all(_IS_INTEGER.fullmatch(word) for word in distinct):
         ids = sorted(distinct, key=lambda word: (int(word), word))
     else:
         ids = sorted(distinct)
