@@ -1,4 +1,7 @@
-"""How sfm_shapefit holds up: `python scripts/reliability.py fuzz --help`. One subcommand per module of abuse."""
+"""How sfm_shapefit holds up against input, machine and users: `python scripts/reliability.py fuzz --help`.
+
+One subcommand per module of scripts/abuse.
+"""
 
 import argparse
 import os
@@ -11,9 +14,9 @@ for _name in ("OPENBLAS", "OMP", "MKL", "NUMBA", "RAYON"):
     os.environ[f"{_name}_NUM_THREADS"] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from abuse import fuzz  # noqa: E402
+from abuse import faults, fuzz  # noqa: E402
 
-SUBCOMMANDS = {"fuzz": fuzz}
+SUBCOMMANDS = {"fuzz": fuzz, "faults": faults}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

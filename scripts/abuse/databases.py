@@ -100,8 +100,8 @@ def impostor(path: Path, rng: Generator) -> bool:
         "huge blobs": "SELECT "
         + ", ".join(f"zeroblob(900000000) AS {name}" for name in columns)
         + " FROM real",
-        "function": f"SELECT {', '.join(f'load_extension({name!r}) AS {name}' for name in columns)} FROM real",
-        "file": f"SELECT {', '.join(f'readfile({name!r}) AS {name}' for name in columns)} FROM real",
+        "function": f"SELECT {', '.join(f'load_extension(1) AS {name}' for name in columns)} FROM real",
+        "file": f"SELECT {', '.join(f'readfile(1) AS {name}' for name in columns)} FROM real",
     }
     kind = str(pick(rng, (*computed, "virtual", "generated", "untyped", "without rowid", "trigger")))
     with _edited(path) as connection:

@@ -191,8 +191,8 @@ def reports(
         make = mutations.pick(rng, _KINDS)
         case = make(base, folder, rng)
         before = snapshot(folder)
-        main = partial(_main, case.arguments, folder / "tmp")
-        outcome = run_forked(main, folder, [folder, *_caches()], encoding=case.encoding)
+        main = partial(command_line, case.arguments, folder / "tmp")
+        outcome = run_forked(main, folder, [folder, *caches()], encoding=case.encoding)
         yield Report(
             number=number,
             case=case,
@@ -203,7 +203,7 @@ def reports(
             shutil.rmtree(folder)
 
 
-def _main(arguments: tuple[str, ...], temporary: Path) -> None:
+def command_line(arguments: tuple[str, ...], temporary: Path) -> None:
     """Be `sfm-shapefit`, in a child."""
     from sfm_shapefit.cli import main
 
@@ -212,7 +212,7 @@ def _main(arguments: tuple[str, ...], temporary: Path) -> None:
     main()
 
 
-def _caches() -> list[Path]:
+def caches() -> list[Path]:
     """Return where numba keeps compiled code."""
     own = Path(__file__).resolve().parents[2] / "sfm_shapefit"
     return [own, *([Path(os.environ["NUMBA_CACHE_DIR"])] if "NUMBA_CACHE_DIR" in os.environ else [])]

@@ -52,38 +52,72 @@ class Outcome:
     """What the child did outside the folders it may write to, and what nobody may do, from audit events."""
 
 
-def run_forked(
-    function: Callable[[], None], work: Path, writable: Sequence[Path], *, encoding: str = "utf-8"
-) -> Outcome:
-    """Call a function in a forked child and tell how it ended.
+@dataclass(frozen=True, slots=True)
+class Child:
+    """A forked child that is at work."""
+
+    pid: int
+    logs: tuple[Path, ...]
+
+    def finish(self) -> Outcome:
+        """Wait for its end and tell how it ended."""
+        _, status, usage = os.wait4(self.pid, 0)
+        texts = [log.read_text(encoding="utf-8", errors="replace") for log in self.logs]
+        for log in self.logs:
+            log.unlink()
+        return Outcome(
+            code=os.waitstatus_to_exitcode(status),
+            stdout=texts[0],
+            stderr=texts[1],
+            cpu_s=usage.ru_utime + usage.ru_stime,
+            peak_bytes=usage.ru_maxrss * 1024,
+            deeds=tuple(texts[2].splitlines()),
+        )
+
+
+def start_forked(
+    function: Callable[[], None],
+    work: Path,
+    writable: Sequence[Path],
+    *,
+    encoding: str = "utf-8",
+    logs: str = "log",
+) -> Child:
+    """Call a function in a forked child, and return as soon as it is called.
 
     Args:
         function: SystemExit gives the exit code; any other exception a traceback on stderr and code 1.
-        work: an existing folder that becomes the working directory; `stdout`, `stderr` and `deeds` are
-            written beside it.
+        work: an existing folder that becomes the working directory; what the child prints is kept beside it.
         writable: folders in which the child may change files.
         encoding: of the child's standard streams.
+        logs: distinguishes children at work at the same time.
     """
-    logs = [work.parent / f"{work.name}.{name}" for name in ("stdout", "stderr", "deeds")]
-    child = os.fork()
-    if child == 0:
-        _be_child(function, work, writable, logs, encoding)
-    _, status, usage = os.wait4(child, 0)
-    texts = [log.read_text(encoding="utf-8", errors="replace") for log in logs]
-    for log in logs:
-        log.unlink()
-    return Outcome(
-        code=os.waitstatus_to_exitcode(status),
-        stdout=texts[0],
-        stderr=texts[1],
-        cpu_s=usage.ru_utime + usage.ru_stime,
-        peak_bytes=usage.ru_maxrss * 1024,
-        deeds=tuple(texts[2].splitlines()),
-    )
+    kinds = ("stdout", "stderr", "deeds")
+    paths = tuple(work.parent / f"{work.name}.{logs}.{kind}" for kind in kinds)
+    ready, tell = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        _be_child(function, work, writable, paths, encoding, tell)
+    os.close(tell)
+    os.read(ready, 1)
+    os.close(ready)
+    return Child(pid, paths)
+
+
+def run_forked(
+    function: Callable[[], None], work: Path, writable: Sequence[Path], *, encoding: str = "utf-8"
+) -> Outcome:
+    """Call a function in a forked child and tell how it ended; see `start_forked`."""
+    return start_forked(function, work, writable, encoding=encoding).finish()
 
 
 def _be_child(
-    function: Callable[[], None], work: Path, writable: Sequence[Path], logs: Sequence[Path], encoding: str
+    function: Callable[[], None],
+    work: Path,
+    writable: Sequence[Path],
+    logs: Sequence[Path],
+    encoding: str,
+    ready: int,
 ) -> None:
     """Run the function and end the process; never returns."""
     code = 1
@@ -92,6 +126,7 @@ def _be_child(
         os.chdir(work)
         _limit()
         _watch(writable, os.open(logs[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND))
+        os.close(ready)
         function()
         code = 0
     except SystemExit as end:

@@ -32,18 +32,18 @@ def solve_command(
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(PlacementOptions, given)
-        check_output(target, overwrite=overwrite, protect=[source])
+        with claimed_output(target, overwrite=overwrite, protect=[source]):
+            from sfm_shapefit.pipeline import solve_graph_file
+            from sfm_shapefit.report import dumps
+            from sfm_shapefit.results import graph_summary, write_graph_result
 
-        from sfm_shapefit.pipeline import solve_graph_file
-        from sfm_shapefit.report import dumps
-        from sfm_shapefit.results import graph_summary, write_graph_result
-
-        catch_termination()
-        found = solve_graph_file(source, options)
-        write_graph_result(found, target, overwrite=overwrite)
+            catch_termination()
+            found = solve_graph_file(source, options)
+            write_graph_result(found, target, overwrite=overwrite)
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201
         elif not quiet:
