@@ -61,25 +61,25 @@ def solve_command(
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(PlacementOptions, given)
         inputs = [path for path in (source, rotations) if path is not None]
-        check_output(target, overwrite=overwrite, protect=inputs)
+        with claimed_output(target, overwrite=overwrite, protect=inputs):
+            from sfm_shapefit.pipeline import solve_graph_file
+            from sfm_shapefit.report import dumps
+            from sfm_shapefit.results import graph_summary, write_graph_result
 
-        from sfm_shapefit.pipeline import solve_graph_file
-        from sfm_shapefit.report import dumps
-        from sfm_shapefit.results import graph_summary, write_graph_result
-
-        catch_termination()
-        found = solve_graph_file(
-            source,
-            options,
-            rotations=rotations,
-            max_rotation_error_deg=max_rotation_error,
-            reverse=reverse,
-        )
-        write_graph_result(found, target, overwrite=overwrite, g2o=g2o, onedsfm=onedsfm, protect=inputs)
+            catch_termination()
+            found = solve_graph_file(
+                source,
+                options,
+                rotations=rotations,
+                max_rotation_error_deg=max_rotation_error,
+                reverse=reverse,
+            )
+            write_graph_result(found, target, overwrite=overwrite, g2o=g2o, onedsfm=onedsfm, protect=inputs)
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201
         elif not quiet:
