@@ -44,7 +44,8 @@ LAYERS = [
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
-    "cv2": {"synthetic/scenes.py"},
+    "cv2": {"synthetic"},
+    "trimesh": {"synthetic/surfaces.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
     "typer": {"cli"},
