@@ -81,12 +81,24 @@ def open_database(
             than two images of the model; later reads raise it for damaged rows, naming image or pair.
     """
     file = Path(path)
-    with ExitStack() as stack:
-        with _sqlite_errors(file):
-            connection = stack.enter_context(_readonly_connection(file))
-            _check_schema(file, connection)
+    with connect(file) as connection:
+        with sqlite_errors(file):
             database = MatchDatabase(file, connection, model, cache_bytes)
         yield database
+
+
+@contextmanager
+def connect(path: Path) -> Iterator[sqlite3.Connection]:
+    """Open a COLMAP database for reading by SQL; neither it nor its folder is changed.
+
+    Raises:
+        InputError: if the file is missing, is no COLMAP database, is locked or damaged.
+    """
+    with ExitStack() as stack:
+        with sqlite_errors(path):
+            connection = stack.enter_context(_readonly_connection(path))
+            _check_schema(path, connection)
+        yield connection
 
 
 class MatchDatabase:
@@ -129,7 +141,7 @@ class MatchDatabase:
         """
         if image not in self._id_of_index:
             return np.zeros((0, 2))
-        with _sqlite_errors(self.path):
+        with sqlite_errors(self.path):
             row = self._connection.execute(
                 "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (self._id_of_index[image],)
             ).fetchone()
@@ -186,7 +198,7 @@ class MatchDatabase:
         Raises:
             InputError: naming the pair whose pose is damaged.
         """
-        columns = _columns(self._connection, "two_view_geometries")
+        columns = table_columns(self._connection, "two_view_geometries")
         keep = np.flatnonzero(~np.isin(self._pairs.configs, _CONFIGS_WITHOUT_POSE))
         poses = np.full((len(keep), 7), np.nan)
         if {"qvec", "tvec"} <= columns:
@@ -213,7 +225,7 @@ class MatchDatabase:
 
     def _stored_pose(self, pair: int) -> FloatArray:
         """Return (qw, qx, qy, qz, tx, ty, tz) of a pair as stored, NaN if it has none."""
-        with _sqlite_errors(self.path):
+        with sqlite_errors(self.path):
             qvec, tvec = self._connection.execute(
                 "SELECT qvec, tvec FROM two_view_geometries WHERE rowid = ?", (int(self._pairs.rowids[pair]),)
             ).fetchone()
@@ -253,7 +265,7 @@ class MatchDatabase:
         """Return the stored matches (M, 2), image i first, and for each the position of its pair."""
         blobs = []
         for pair in chosen.tolist():
-            with _sqlite_errors(self.path):
+            with sqlite_errors(self.path):
                 cols, data = self._connection.execute(
                     "SELECT cols, data FROM two_view_geometries WHERE rowid = ?",
                     (int(self._pairs.rowids[pair]),),
@@ -290,7 +302,7 @@ class MatchDatabase:
 
 
 @contextmanager
-def _sqlite_errors(path: Path) -> Iterator[None]:
+def sqlite_errors(path: Path) -> Iterator[None]:
     """Turn sqlite's errors into one sentence that names the database."""
     try:
         yield
@@ -422,7 +434,7 @@ class _Pairs:
         return np.asarray(~np.isin(self.configs, _CONFIGS_WITHOUT_MATCHES), dtype=np.bool_)
 
 
-def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
+def table_columns(connection: sqlite3.Connection, table: str) -> set[str]:
     """Return the names of a table's columns, none if there is no such table."""
     return {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
 
@@ -430,7 +442,7 @@ def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
 def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
     """Refuse a database without the tables and columns that are read."""
     for table, required in _REQUIRED_COLUMNS.items():
-        columns = _columns(connection, table)
+        columns = table_columns(connection, table)
         if missing := [name for name in required if name not in columns]:
             what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
             raise InputError(f"{path} is not a COLMAP database: it has {what}")
