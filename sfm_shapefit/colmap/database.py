@@ -24,6 +24,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -81,24 +82,31 @@ def open_database(
             than two images of the model; later reads raise it for damaged rows, naming image or pair.
     """
     file = Path(path)
-    with connect(file) as connection:
-        with sqlite_errors(file):
+    with ExitStack() as stack:
+        with _sqlite_errors(file):
+            connection = stack.enter_context(_readonly_connection(file))
+            _check_schema(file, connection)
             database = MatchDatabase(file, connection, model, cache_bytes)
         yield database
 
 
-@contextmanager
-def connect(path: Path) -> Iterator[sqlite3.Connection]:
-    """Open a COLMAP database for reading by SQL; neither it nor its folder is changed.
+def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
+    """Return the rows of the first query whose columns `table` has; none if it fits none of them.
+
+    Args:
+        path: the database; it is not changed.
+        table: whose columns decide, for schemas differ from version to version.
+        queries: what to select, by the columns of `table` that it needs.
 
     Raises:
-        InputError: if the file is missing, is no COLMAP database, is locked or damaged.
+        InputError: if the file is missing, is no sqlite database, is locked or damaged.
     """
-    with ExitStack() as stack:
-        with sqlite_errors(path):
-            connection = stack.enter_context(_readonly_connection(path))
-            _check_schema(path, connection)
-        yield connection
+    with _sqlite_errors(path), _readonly_connection(path) as connection:
+        columns = _columns(connection, table)
+        for needed, query in queries.items():
+            if columns.issuperset(needed):
+                return connection.execute(query).fetchall()
+    return []
 
 
 class MatchDatabase:
@@ -141,7 +149,7 @@ class MatchDatabase:
         """
         if image not in self._id_of_index:
             return np.zeros((0, 2))
-        with sqlite_errors(self.path):
+        with _sqlite_errors(self.path):
             row = self._connection.execute(
                 "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (self._id_of_index[image],)
             ).fetchone()
@@ -198,7 +206,7 @@ class MatchDatabase:
         Raises:
             InputError: naming the pair whose pose is damaged.
         """
-        columns = table_columns(self._connection, "two_view_geometries")
+        columns = _columns(self._connection, "two_view_geometries")
         keep = np.flatnonzero(~np.isin(self._pairs.configs, _CONFIGS_WITHOUT_POSE))
         poses = np.full((len(keep), 7), np.nan)
         if {"qvec", "tvec"} <= columns:
@@ -225,7 +233,7 @@ class MatchDatabase:
 
     def _stored_pose(self, pair: int) -> FloatArray:
         """Return (qw, qx, qy, qz, tx, ty, tz) of a pair as stored, NaN if it has none."""
-        with sqlite_errors(self.path):
+        with _sqlite_errors(self.path):
             qvec, tvec = self._connection.execute(
                 "SELECT qvec, tvec FROM two_view_geometries WHERE rowid = ?", (int(self._pairs.rowids[pair]),)
             ).fetchone()
@@ -265,7 +273,7 @@ class MatchDatabase:
         """Return the stored matches (M, 2), image i first, and for each the position of its pair."""
         blobs = []
         for pair in chosen.tolist():
-            with sqlite_errors(self.path):
+            with _sqlite_errors(self.path):
                 cols, data = self._connection.execute(
                     "SELECT cols, data FROM two_view_geometries WHERE rowid = ?",
                     (int(self._pairs.rowids[pair]),),
@@ -302,7 +310,7 @@ class MatchDatabase:
 
 
 @contextmanager
-def sqlite_errors(path: Path) -> Iterator[None]:
+def _sqlite_errors(path: Path) -> Iterator[None]:
     """Turn sqlite's errors into one sentence that names the database."""
     try:
         yield
@@ -434,7 +442,7 @@ class _Pairs:
         return np.asarray(~np.isin(self.configs, _CONFIGS_WITHOUT_MATCHES), dtype=np.bool_)
 
 
-def table_columns(connection: sqlite3.Connection, table: str) -> set[str]:
+def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
     """Return the names of a table's columns, none if there is no such table."""
     return {row[0] for row in connection.execute("SELECT name FROM pragma_table_info(?)", (table,))}
 
@@ -442,7 +450,7 @@ def table_columns(connection: sqlite3.Connection, table: str) -> set[str]:
 def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
     """Refuse a database without the tables and columns that are read."""
     for table, required in _REQUIRED_COLUMNS.items():
-        columns = table_columns(connection, table)
+        columns = _columns(connection, table)
         if missing := [name for name in required if name not in columns]:
             what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
             raise InputError(f"{path} is not a COLMAP database: it has {what}")

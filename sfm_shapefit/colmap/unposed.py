@@ -12,10 +12,8 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.database import connect, sqlite_errors, table_columns
+from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.errors import InputError
-
-_CAMERA_COLUMNS = {"camera_id", "model", "width", "height", "params", "prior_focal_length"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,20 +34,15 @@ def read_images(path: Path) -> UnposedImages:
     Raises:
         InputError: if it is no COLMAP database, has fewer than two images, or a camera or image is damaged.
     """
-    with connect(path) as connection, sqlite_errors(path):
-        if missing := _CAMERA_COLUMNS - table_columns(connection, "cameras"):
-            raise InputError(
-                f"{path} is not a COLMAP database: no column {min(missing)} in its table cameras"
-            )
-        cameras = connection.execute(
-            "SELECT camera_id, model, width, height, params, prior_focal_length FROM cameras ORDER BY camera_id"
-        ).fetchall()
-        images = connection.execute(
-            "SELECT image_id, name, camera_id FROM images ORDER BY image_id"
-        ).fetchall()
-        has_rigs = "rig_sensors" in {
-            row[0] for row in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")
-        } and bool(connection.execute("SELECT count(*) FROM rig_sensors").fetchone()[0])
+    camera_columns = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
+    image_columns = ("image_id", "name", "camera_id")
+    cameras, images = (
+        readonly_rows(path, table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
+        for table, columns in (("cameras", camera_columns), ("images", image_columns))
+    )
+    has_rigs = bool(
+        readonly_rows(path, "rig_sensors", {("rig_id",): "SELECT rig_id FROM rig_sensors LIMIT 1"})
+    )
     if len(images) < 2:
         raise InputError(
             f"{path} has {len(images)} images, but two or more are needed; extract features first"

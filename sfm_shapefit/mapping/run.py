@@ -119,7 +119,7 @@ class _Run:
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
             with self.timed("rotation averaging"):
-                inside = relative.subset(np.isin(relative.pairs, members).all(axis=1))
+                inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 local = _renumbered(inside, members)
                 try:
                     answer = averaged(len(members), local, self.options.min_matches)
