@@ -13,12 +13,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
 _ROUNDED = 1e-7
+_FORM = "i j vx vy vz [weight]"
 _MIN_COLUMNS = 4  # two ids and a direction in the plane
 
 
@@ -31,27 +33,19 @@ def read_graph(path: Path | str) -> ViewGraph:
         InputError: if the file cannot be read, naming the first malformed line by its number.
     """
     file = Path(path)
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not a readable text file ({error})") from error
-    numbers, rows = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if words:
-            numbers.append(number)
-            rows.append(words)
-    if not rows:
-        raise InputError(f"{file} has no pairs; give lines of the form: i j vx vy vz [weight]")
-    values = _values(file, numbers, rows)
+    numbers, rows = read_lines(file, _FORM)
+    width = len(rows[0])
+    if width < _MIN_COLUMNS:
+        raise InputError(f"{file}, line {numbers[0]}: expected i j and a direction, got {width} columns")
+    values = number_table(file, numbers, rows, first=2, width=width)
     directions, weights = _directions_and_weights(values)
-    ids, nodes = _nodes([word for row in rows for word in row[:2]])
+    ids, nodes = node_indices([word for row in rows for word in row[:2]])
     edges = nodes.reshape(-1, 2)
 
     lengths = np.linalg.norm(directions, axis=1)
-    _refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
-    _refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
-    _refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
+    refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
+    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
+    refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
     rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
     directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
     try:
@@ -73,28 +67,6 @@ def graph_text(graph: ViewGraph) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _values(file: Path, numbers: list[int], rows: list[list[str]]) -> FloatArray:
-    """Return the numbers behind the two ids of every line, shape (m, columns - 2)."""
-    width = len(rows[0])
-    if width < _MIN_COLUMNS:
-        raise InputError(f"{file}, line {numbers[0]}: expected i j and a direction, got {width} columns")
-    for number, row in zip(numbers, rows, strict=True):
-        if len(row) != width:
-            raise InputError(
-                f"{file}, line {number}: has {len(row)} columns, line {numbers[0]} has {width}; "
-                "give every line the same columns"
-            )
-    try:
-        values = np.array([row[2:] for row in rows], dtype=np.float64)
-    except ValueError:
-        number, word = next(
-            (n, w) for n, row in zip(numbers, rows, strict=True) for w in row[2:] if not _is_number(w)
-        )
-        raise InputError(f"{file}, line {number}: {word!r} is not a number") from None
-    _refuse(file, numbers, np.asarray(~np.isfinite(values).all(axis=1)), "has a number that is not finite")
-    return values
-
-
 def _directions_and_weights(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Tell whether the last column is a weight, and split it off if it is."""
     head, last = values[:, :-1], values[:, -1]
@@ -103,28 +75,3 @@ def _directions_and_weights(values: FloatArray) -> tuple[FloatArray, FloatArray]
         if bool(np.all(is_unit)) and not np.all(last == 0.0):
             return head, last
     return values, np.ones(len(values))
-
-
-def _nodes(words: list[str]) -> tuple[list[str], IntArray]:
-    """Return the distinct ids in order, and the index of every word among them."""
-    distinct = set(words)
-    if all(word.lstrip("-").isascii() and word.lstrip("-").isdigit() for word in distinct):
-        ids = sorted(distinct, key=lambda word: (int(word), word))
-    else:
-        ids = sorted(distinct)
-    index = {word: k for k, word in enumerate(ids)}
-    return ids, np.fromiter((index[word] for word in words), dtype=np.int64, count=len(words))
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _refuse(file: Path, numbers: list[int], bad: BoolArray, reason: str) -> None:
-    """Raise InputError for the first line that is bad."""
-    if bad.any():
-        raise InputError(f"{file}, line {numbers[int(np.argmax(bad))]}: {reason}")
