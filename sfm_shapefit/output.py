@@ -3,8 +3,8 @@
 A rename inside one file system is atomic: nobody ever sees a folder that is half written. With `overwrite`
 the old folder is moved aside, the new one moved in, and only then is the old one removed.
 
-The folder of a `locate` run is known by its `locate.json`, that of `map` by its `map.json`; nothing else that holds
-files is ever replaced.
+The folder of a `locate` run is known by its `locate.json`, that of `map` by its `map.json`; nothing else
+that holds files is ever replaced.
 """
 
 import os
@@ -104,7 +104,8 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
         raise InputError(f"{folder} cannot be read ({error.strerror}); choose another folder") from error
     if not is_empty and not any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
         raise InputError(
-            f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; choose another folder"
+            f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; "
+            "choose another folder"
         )
 
 

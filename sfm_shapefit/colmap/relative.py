@@ -1,13 +1,14 @@
 """Relative rotations of the image pairs of a database, estimated from their inlier matches, or as stored.
 
 COLMAP leaves `cam2_from_cam1` out by default, and databases of other tools hold inlier matches and nothing
-else. So the relative pose of a pair is estimated from its inlier matches and the calibrated rays, by COLMAP's own
-estimator (essential matrix and homography in competition, refined). A pair without parallax has a rotation
-too: for averaging, cameras that only turn are as good as others.
+else. So the relative pose of a pair is estimated from its inlier matches and the calibrated rays, by
+COLMAP's own estimator (essential matrix and homography in competition, refined). A pair without parallax
+has a rotation too: for averaging, cameras that only turn are as good as others.
 
-Estimating anew is worth its 10 ms a pair even where poses are stored. The estimator calls a pair uncalibrated if
-a fundamental matrix explains its matches better than an essential one; where the focal lengths are known, that
-is the mark of a false pair. Pairs within 5 degrees of the truth, of all pairs, and 25 % quantile of the error:
+Estimating anew is worth its 10 ms a pair even where poses are stored. The estimator calls a pair
+uncalibrated if a fundamental matrix explains its matches better than an essential one; where the focal
+lengths are known, that is the mark of a false pair. Pairs within 5 degrees of the truth, of all pairs, and
+25 % quantile of the error:
 
                   stored               estimated, calibrated only
     castle-P30    230 of 378, 0.20     193 of 210, 0.08

@@ -1,8 +1,8 @@
 """The images of a COLMAP database as a model without rotations: what `map` starts from.
 
-Every image stands in a frame of its own, at the origin with the identity as its rotation, so that rays of its
-keypoints in "world" axes are rays in camera axes. Intrinsics are those of the database: calibrated, or COLMAP's
-guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
+Every image stands in a frame of its own, at the origin with the identity as its rotation, so that rays of
+its keypoints in "world" axes are rays in camera axes. Intrinsics are those of the database: calibrated, or
+COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
 """
 
 from dataclasses import dataclass
@@ -65,7 +65,7 @@ def read_images(path: Path) -> UnposedImages:
 def posed_at_origin(
     images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
 ) -> pycolmap.Reconstruction:
-    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, all centres at the origin."""
+    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centres 0."""
     model = pycolmap.Reconstruction()
     for camera_id in sorted({images.image(i).camera_id for i in image_ids}):
         model.add_camera_with_trivial_rig(images.camera(camera_id))

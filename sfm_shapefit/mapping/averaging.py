@@ -1,8 +1,8 @@
 """Averaged rotations that can be trusted: several averagings, the most consistent kept, checked on its pairs.
 
-Rotation averaging has no certificate, and its answer depends on which pairs it sees: on lego100 with the stored
-poses of all pairs of 15 matches nine cameras end up to 166 degrees off, with those of 30 none. So several limits
-and two losses are tried, and each answer is judged on the same pairs, all of them:
+Rotation averaging has no certificate, and its answer depends on which pairs it sees: on lego100 with the
+stored poses of all pairs of 15 matches nine cameras end up to 166 degrees off, with those of 30 none. So
+several limits and two losses are tried, and each answer is judged on the same pairs, all of them:
 
     w_ij       sqrt(number of matches): a false pair of a thousand matches is not a thousand witnesses
     agree_ij   both cameras have a rotation, and R_j R_i^T is within 5 degrees of the pair's own

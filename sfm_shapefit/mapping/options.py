@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from sfm_shapefit.gauge import Scale
 from sfm_shapefit.options import LocateOptions
 
 Relative = Literal["matches", "stored"]
@@ -19,8 +18,6 @@ class MapOptions(LocateOptions):
     refine_rotations: bool = True
     """Refine the averaged rotations on the matches before cameras are placed, camera by camera where there
     is evidence. With bundle_adjust a draft is adjusted instead, and its rotations are taken."""
-    scale: Scale = "unit"
-    """Gauge of the output: a database has no camera centres, so the scale is free."""
     relative: Relative = "matches"
     """Relative rotations to be averaged: estimated from each pair's inlier matches, or those the database
     stores, which is faster but less exact and keeps more false pairs."""

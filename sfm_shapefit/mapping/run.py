@@ -2,9 +2,9 @@
 
     images and matches -> relative rotations -> components -> averaged rotations -> locate -> models
 
-With bundle adjustment, a draft is placed and adjusted in one loose round first; the rotations of the draft are
-far finer than averaged ones, so directions, verdicts and trust are measured anew from them before the final
-adjustment. Images that the averaging drops form components of their own.
+With bundle adjustment, a draft is placed and adjusted in one loose round first; the rotations of the draft
+are far finer than averaged ones, so directions, verdicts and trust are measured anew from them before the
+final adjustment. Images that the averaging drops form components of their own.
 """
 
 import time
@@ -146,6 +146,9 @@ class _Run:
         """Place one component; with bundle adjustment, from the rotations of an adjusted draft."""
         image_ids = unposed.image_ids[members].tolist()
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
+        known = self.options.known_distance
+        if known is not None and not {*known[:2]} <= {unposed.names[k] for k in members.tolist()}:
+            settings |= {"known_distance": None, "scale": "unit"}  # it belongs to another component
         rotations = averaging.rotations
         if self.options.bundle_adjust:
             with self.timed("draft"):
@@ -163,7 +166,7 @@ class _Run:
         rotations: FloatArray,
         settings: dict[str, object],
     ) -> FloatArray:
-        """Return rotations (k, 3, 3) from a loose adjustment of a draft; those of images it lacks as given."""
+        """Return rotations (k, 3, 3) from a loose adjustment of a draft, as given for images it lacks."""
         limit = _DRAFT_WIDENING * self.options.max_reprojection_error_px
         draft_settings = settings | {
             "refine_rotations": False,
@@ -223,8 +226,8 @@ def _nothing_placed(path: Path, relative: RelativeRotations, reasons: dict[int, 
     """Say why no component could be placed."""
     if len(relative.pairs) == 0:
         return (
-            f"no pair of images in {path} has {LEAST_MATCHES} inlier matches and a relative rotation; match the "
-            "images and verify them geometrically first"
+            f"no pair of images in {path} has {LEAST_MATCHES} inlier matches and a relative rotation; match "
+            "the images and verify them geometrically first"
         )
     causes = list(reasons.values())
     most = max(set(causes), key=lambda cause: (causes.count(cause), cause))
@@ -237,22 +240,22 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         yield "the database's rigs are not used: every camera is placed on its own"
     if images.num_guessed_cameras:
         yield (
-            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; calibrate "
-            "them first (pycolmap.calibrate_view_graph) if the result is poor"
+            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; "
+            "calibrate them first (pycolmap.calibrate_view_graph) if the result is poor"
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
         if share < _ALARMING_SHARE:
             yield (
-                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not trust it "
-                "without a look"
+                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
+                "trust it without a look"
             )
         doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
         if len(doubtful):
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
-                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, above "
-                f"all those of {worst}"
+                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, "
+                f"above all those of {worst}"
             )
     if left_out:
         name, reason = next(iter(left_out.items()))
