@@ -38,6 +38,7 @@ LAYERS = [
     "report",
     "results",
     "pipeline",
+    "mapping",
     "cli",
 ]
 
