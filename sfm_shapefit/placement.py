@@ -16,12 +16,14 @@ from sfm_shapefit.robust.finish import Finish, finish
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import IterationInfo, SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
+_MOST_WATCHED = 100_000
+"""Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,6 +48,8 @@ class Placement:
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    history: tuple[IterationInfo, ...] = ()
+    """The iterations of the solve; empty for graphs so large that watching them would take long."""
 
     @property
     def nodes(self) -> IntArray:
@@ -169,7 +173,8 @@ def _place_piece(
     known = None if covariance is None else covariance[edges]
     classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
     heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
-    solved = solve(piece, options)
+    history: list[IterationInfo] = []
+    solved = solve(piece, options, history.append if piece.num_edges <= _MOST_WATCHED else None)
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
     return Placement(
@@ -180,4 +185,5 @@ def _place_piece(
         solve=solved,
         finish=finished,
         assessment=assess(piece, finished.locations, known, heard, placed),
+        history=tuple(history),
     )
