@@ -33,7 +33,7 @@ _MAX_BARS = 400  # of the chart of trust
 _MARGIN = 0.03  # of the scene's size, around it
 _FLATTEST = 0.02  # least side of the box around the scene, of the largest
 _MAX_HINGES = 20  # that are named per piece
-_STARTING_ITERATIONS = 3  # whose objectives may be far out of scale
+_STARTING_ITERATIONS = 2  # whose objectives may be far out of scale
 _AXES = "xyz"
 _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
@@ -83,6 +83,7 @@ def page_data(scene: Scene, facts: dict[str, Any]) -> dict[str, Any]:
         "looks": [_look(hint, rank, pairs) for hint in first_looks(scene, facts)],
         "dimension": scene.dimension,
         "shownAxes": min(scene.dimension, len(_AXES)),
+        "frustum": scene.frustum_depth,
         "box": [*display.low.tolist(), *display.high.tolist()],
         "cameras": _cameras(scene, cameras, display, reasons),
         "pairs": _pairs(scene, pairs, rank, reasons),
@@ -200,13 +201,13 @@ def _convergence(scene: Scene) -> dict[str, Any]:
     """Return the history; the axis leaves out the first iterations where those are far out of scale."""
     objectives = [objective for _, objective, _ in scene.history]
     bounds = [bound for _, _, bound in scene.history if bound is not None]
-    later = objectives[_STARTING_ITERATIONS:] or objectives
-    top = 1.1 * max([*later, *bounds, 0.0])
+    shown = (objectives[_STARTING_ITERATIONS:] or objectives) + (bounds[_STARTING_ITERATIONS:] or bounds)
+    margin = 0.1 * (max(shown) - min(shown)) if shown else 0.0
     return {
         "iterations": [iteration for iteration, _, _ in scene.history],
         "objectives": objectives,
         "bounds": [bound for _, _, bound in scene.history],
-        "range": [0.0, top] if top > 0.0 else None,
+        "range": [min(shown) - margin, max(shown) + margin] if margin > 0.0 else None,
     }
 
 

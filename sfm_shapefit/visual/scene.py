@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import angle_between_deg
+from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.report import CameraRow, PairRow
 from sfm_shapefit.robust.verdicts import Verdict
 
@@ -309,7 +309,7 @@ def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatAr
     known = np.isfinite(baselines).all(axis=1) & np.isfinite(directions).all(axis=1)
     known &= np.linalg.norm(baselines, axis=1) > 0.0
     angles = np.full(len(ends), np.nan)
-    angles[known] = angle_between_deg(directions[known], baselines[known])
+    angles[known] = angle_between_deg(directions[known], normalized(baselines[known]))
     return angles
 
 

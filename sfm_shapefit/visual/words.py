@@ -74,17 +74,16 @@ def _placed(scene: Scene) -> str:
     if placed == total:
         return f"All {total:,} {_noun(scene)} were placed."
     elsewhere = int(np.sum(~scene.cameras.placed & (scene.cameras.pieces > 0)))
-    note = f", {elsewhere:,} of them belong to smaller pieces" if elsewhere else ""
-    return (
-        f"{placed:,} of {total:,} {_noun(scene)} were placed; {total - placed:,} are not in this model{note}."
-    )
+    note = f" ({elsewhere:,} in smaller pieces)" if elsewhere else ""
+    missing = f"{total - placed:,} {'is' if total - placed == 1 else 'are'} not in this model"
+    return f"{placed:,} of {total:,} {_noun(scene)} were placed; {missing}{note}."
 
 
 def _pairs(scene: Scene, facts: dict[str, Any]) -> str:
     counts = np.bincount(scene.pairs.classes, minlength=len(PairClass)).tolist()
     text = (
         f"Of {len(scene.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the solution "
-        f"(their angles are off by {facts['residual_level_deg']:.2g} degrees per axis, as a level) and "
+        f"(a standard deviation of {facts['residual_level_deg']:.2g} degrees per axis) and "
         f"{counts[PairClass.CONTRADICTS]:,} contradict it"
     )
     if counts[PairClass.UNDETERMINED]:

@@ -11,7 +11,7 @@
   const STATES = {
     input: "at the input's centres", optimum: "at the convex optimum", output: "at the output's centres",
   };
-  const ROWS_PER_PAGE = 25;
+  const ROWS_PER_PAGE = 12;
   const MANY_PAIRS = 4000; // agreeing pairs from here on are not drawn until asked for
   const $ = (id) => document.getElementById(id);
 
@@ -183,6 +183,20 @@
   };
   const nothing = () => ({ x: [null], y: [null], z: [null] });
 
+  // Dark points would vanish on a dark page and light ones on a light page; points without colours are grey.
+  const pointColors = () => {
+    const { colors } = points;
+    if (colors.every((part) => part === 0)) return new Array(colors.length / 3).fill(color("--soft"));
+    const isDark = getComputedStyle(document.documentElement).colorScheme === "dark"
+      || (!document.documentElement.dataset.theme && matchMedia("(prefers-color-scheme: dark)").matches);
+    const shade = (part) => Math.round(isDark ? 64 + 0.75 * part : 0.8 * part);
+    const shades = [];
+    for (let k = 0; k < colors.length; k += 3) {
+      shades.push(`rgb(${shade(colors[k])},${shade(colors[k + 1])},${shade(colors[k + 2])})`);
+    }
+    return shades;
+  };
+
   const LAYERS = []; // name, label, colour variable or null, traces, whether it is shown at first
   const traces = [];
   const addLayer = (name, label, variable, shown, made) => {
@@ -205,10 +219,7 @@
       }),
     ]);
     if (points.positions.length) {
-      const shades = [];
-      for (let k = 0; k < points.colors.length; k += 3) {
-        shades.push(`rgb(${points.colors[k]},${points.colors[k + 1]},${points.colors[k + 2]})`);
-      }
+      const shades = pointColors();
       addLayer("points", `Points (${count(shades.length)})`, null, true, [trace({
         mode: "markers", hoverinfo: "skip", marker: { size: 1.6, color: shades, line: { width: 0 } },
         x: axis(points.positions, 0), y: axis(points.positions, 1), z: axis(points.positions, 2),
@@ -249,7 +260,15 @@
   const spans = [0, 1, 2].map((c) => box[3 + c] - box[c]);
   const largest = Math.max(...spans);
   const normal = (p) => p.map((x, c) => (x - (box[c] + box[3 + c]) / 2) / largest);
-  const startCamera = () => ({ up: { x: 0, y: 0, z: 1 }, center: { x: 0, y: 0, z: 0 }, eye: data.dimension === 2 ? { x: 0, y: -0.01, z: 1.2 } : { x: 0.45, y: -1.05, z: 0.6 } });
+  // The view starts around the cameras; points may reach far beyond them.
+  const reach = Math.max(...placedCameras.map((k) => Math.hypot(...at(cameras.center, k))), 0.5 * data.frustum) / largest;
+  const startCamera = () => {
+    const [x, y, z] = normal([0, 0, 0]);
+    const distance = 2.1 * Math.max(reach, 0.15);
+    const from = data.dimension === 2 ? [0, -0.01, 1] : [0.35, -0.84, 0.42];
+    const [u, v, w] = from.map((part) => part * distance);
+    return { up: { x: 0, y: 0, z: 1 }, center: { x, y, z }, eye: { x: x + u, y: y + v, z: z + w } };
+  };
   const sceneLayout = () => {
     const hidden = (c) => ({ visible: false, showspikes: false, range: [box[c], box[3 + c]], autorange: false });
     return {
@@ -358,10 +377,10 @@
     if (centred && marks.length) {
       const middle = normal([0, 1, 2].map((c) => marks.reduce((sum, p) => sum + p[c], 0) / marks.length));
       const view = plot.layout.scene.camera;
-      const keep = kind === "camera" ? 0.55 : 0.75; // distance kept, within limits
+      const keep = kind === "camera" ? 0.7 : 0.85; // of the distance, down to a limit
       const offset = ["x", "y", "z"].map((c) => view.eye[c] - view.center[c]);
       const distance = Math.hypot(...offset);
-      const wanted = Math.min(distance, Math.max(distance * keep, 0.45));
+      const wanted = Math.min(distance, Math.max(distance * keep, 0.9 * Math.max(reach, 0.15)));
       const [x, y, z] = offset.map((v, c) => middle[c] + (v * wanted) / distance);
       layout["scene.camera"] = { up: view.up, center: { x: middle[0], y: middle[1], z: middle[2] }, eye: { x, y, z } };
     }
@@ -636,7 +655,7 @@
     if (bounds.some((b) => b !== null)) {
       made.push({ type: "scatter", mode: "lines+markers", name: "lower bound", x: iterations, y: bounds, line: { color: color("--contradicts"), width: 2, dash: "dot" }, marker: { size: 5 }, hoverinfo: "none" });
     }
-    return [made, layout({ xaxis: { title: title("iteration") }, yaxis: { title: title("objective"), rangemode: "tozero", range: data.convergence.range } })];
+    return [made, layout({ xaxis: { title: title("iteration") }, yaxis: { title: title("objective"), ...(data.convergence.range ? { range: data.convergence.range } : {}) } })];
   }, (event) => {
     const { iterations, objectives, bounds } = data.convergence;
     const k = event.points[0].pointNumber;
@@ -680,7 +699,7 @@
     const body = table.createTBody();
     data.pieces.forEach((piece) => {
       const row = body.insertRow();
-      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none", "name"), element("td", piece.scale, "name"), element("td", piece.folder || "not written"));
+      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none", "name"), element("td", piece.scale, "name"), element("td", piece.folder === "." ? "this folder" : piece.folder || "not written"));
     });
     const scroll = element("div", "", "scroll");
     scroll.append(table);
@@ -691,6 +710,8 @@
   const recolor = () => {
     if (plot.data) {
       const style = LAYERS.filter((layer) => layer.variable);
+      const cloud = LAYERS.find((layer) => layer.name === "points");
+      if (cloud) Plotly.restyle(plot, { "marker.color": [pointColors()] }, cloud.indices);
       for (const layer of style) Plotly.restyle(plot, { "line.color": color(layer.variable) }, layer.indices);
       Plotly.update(plot, { "line.color": color("--chosen"), "marker.color": color("--chosen"), "marker.line.color": color("--chosen") }, { paper_bgcolor: color("--card"), "scene.bgcolor": color("--card") }, [traces.length - 2, traces.length - 1]);
     }
