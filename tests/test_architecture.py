@@ -36,6 +36,7 @@ LAYERS = [
     "diagnosis",
     "options",
     "report",
+    "visual",
     "results",
     "pipeline",
     "cli",
@@ -47,6 +48,9 @@ DOORS = {
     "cv2": {"synthetic/scenes.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
+    "plotly": {"visual/report_page.py"},
+    "trimesh": {"visual/mesh.py"},
+    "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

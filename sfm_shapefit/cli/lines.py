@@ -23,3 +23,8 @@ def objective_line(solve: "SolverResult") -> str:
     """Say what the solver reached, how sure that is, and which solver it was."""
     chosen = f"{solve.method}: {solve.method_reason}"
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
+
+
+def pictures_line(report: bool, scene: bool) -> str:
+    """Name the pictures that were written, to follow the names of other files."""
+    return ", report.html" * report + ", scene.glb, scene.ply" * scene

@@ -7,8 +7,18 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened
-from sfm_shapefit.cli.flags import Json, OutArgument, Overwrite, Quiet, one_path, options_from, takes
-from sfm_shapefit.cli.lines import objective_line, pieces_line
+from sfm_shapefit.cli.flags import (
+    Json,
+    OutArgument,
+    Overwrite,
+    Quiet,
+    Report,
+    Scene,
+    one_path,
+    options_from,
+    takes,
+)
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
 from sfm_shapefit.robust.options import PlacementOptions
 
 if TYPE_CHECKING:
@@ -24,6 +34,8 @@ def solve_command(
     out: OutArgument = None,
     *,
     overwrite: Overwrite = False,
+    report: Report = True,
+    scene: Scene = False,
     as_json: Json = False,
     quiet: Quiet = False,
     **given: Any,
@@ -43,14 +55,14 @@ def solve_command(
 
         catch_termination()
         found = solve_graph_file(source, options)
-        write_graph_result(found, target, overwrite=overwrite)
+        write_graph_result(found, target, overwrite=overwrite, report=report, scene=scene)
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{found.placement.graph.num_cameras} nodes of {source}", _solve_table(found, target))
+            print_table(f"{found.placement.graph.num_cameras} nodes of {source}", _solve_table(found, target, pictures_line(report, scene)))
 
 
-def _solve_table(found: "GraphResult", out: Path) -> Rows:
+def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
     from sfm_shapefit.results import graph_summary, quality_warnings
 
@@ -69,5 +81,5 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
         ("locations", placement.finish.statement()),
         *[("warning", warning) for warning in quality_warnings(placement)],
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
-        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv"),
+        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{pictures}"),
     ]

@@ -1,4 +1,4 @@
-"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`.
+"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`, and scenes if asked for.
 
 Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each.
 """
@@ -13,10 +13,18 @@ from sfm_shapefit.report import CameraRow, PairRow, write_json, write_rows
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
 from sfm_shapefit.results.summary import graph_summary, summary
 from sfm_shapefit.results.values import GraphResult, LocateResult
+from sfm_shapefit.visual.files import write_pictures
+from sfm_shapefit.visual.sources import scene_of_graph, scene_of_model
 
 
 def write_result(
-    found: LocateResult, out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
+    found: LocateResult,
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path | str] = (),
+    report: bool = True,
+    scene: bool = False,
 ) -> None:
     """Write the seeded model and its tables into a folder that appears whole or not at all.
 
@@ -25,6 +33,8 @@ def write_result(
         out: the folder to be made.
         overwrite: replace an earlier output of this package.
         protect: paths that `out` must not be or contain, beside the inputs of `found`.
+        report: write report.html, one page that explains the result and works offline.
+        scene: write scene.glb and scene.ply, cameras and points for any 3D viewer.
 
     Raises:
         InputError: if the folder exists, cannot be written, or would hit a protected path.
@@ -32,7 +42,7 @@ def write_result(
     inputs = [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     with atomic_folder(out, overwrite=overwrite, protect=[*inputs, *protect]) as folder:
         write_model(found.reconstruction, folder)
-        _write_tables(found, summary(found), folder)
+        _write_tables(found, summary(found), folder, report=report, scene=scene)
         for piece in found.further:
             subfolder = folder / folder_of(piece.placement.piece)
             subfolder.mkdir(parents=True)
@@ -40,10 +50,12 @@ def write_result(
             write_rows(piece.cameras, CameraRow, 3, subfolder / "cameras.csv")
 
 
-def write_graph_result(found: GraphResult, out: Path | str, *, overwrite: bool = False) -> None:
-    """Write the tables of a bare graph like `write_result`; there is no model."""
+def write_graph_result(
+    found: GraphResult, out: Path | str, *, overwrite: bool = False, report: bool = True, scene: bool = False
+) -> None:
+    """Write the tables and pictures of a bare graph like `write_result`; there is no model."""
     with atomic_folder(out, overwrite=overwrite, protect=[found.path]) as folder:
-        _write_tables(found, graph_summary(found), folder)
+        _write_tables(found, graph_summary(found), folder, report=report, scene=scene)
         for piece in found.further:
             subfolder = folder / folder_of(piece.piece)
             subfolder.mkdir(parents=True)
@@ -51,8 +63,17 @@ def write_graph_result(found: GraphResult, out: Path | str, *, overwrite: bool =
             write_rows(rows, CameraRow, piece.graph.dimension, subfolder / "cameras.csv")
 
 
-def _write_tables(found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path) -> None:
+def _write_tables(
+    found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path, *, report: bool, scene: bool
+) -> None:
     dimension = found.placement.graph.dimension
-    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
-    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    cameras, pairs = found.cameras, found.pairs
+    write_rows(cameras, CameraRow, dimension, folder / "cameras.csv")
+    write_rows(pairs, PairRow, dimension, folder / "pairs.csv")
     write_json(facts, folder / MARKER)
+    if report or scene:
+        if isinstance(found, GraphResult):
+            drawn = scene_of_graph(found, cameras, pairs)
+        else:
+            drawn = scene_of_model(found, cameras, pairs)
+        write_pictures(drawn, facts, folder, report=report, meshes=scene)

@@ -8,7 +8,7 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -142,6 +142,7 @@ def build_scene(
     pairs: Sequence[PairRow],
     *,
     model: "PosedModel | None" = None,
+    original: "PosedModel | None" = None,
     points: "pycolmap.Reconstruction | None" = None,
     certified: FloatArray | None = None,
     input_is_aligned: bool = False,
@@ -152,7 +153,8 @@ def build_scene(
 
     Args:
         cameras, pairs: rows of the tables.
-        model: the input: rotations, pictures, centres; unknown if None.
+        model: where rotations and pictures come from; unknown if None.
+        original: the input, for its centres; unknown if None.
         points: the reconstruction whose 3D points are drawn; none if None.
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
         input_is_aligned: the input's centres are in the output's units.
@@ -160,7 +162,10 @@ def build_scene(
         history: iteration, objective and bound of the solve.
     """
     names = tuple(row.name for row in cameras)
-    poses = _unknown_poses(len(names)) if model is None else poses_of(model, names)
+    poses, before = (
+        _unknown_poses(len(names)) if source is None else poses_of(source, names) for source in (model, original)
+    )
+    poses = replace(poses, centers=before.centers)
     own = _cameras(cameras, names, poses)
     positions = own.centers[own.placed]
     drawn = _points(points, positions)
