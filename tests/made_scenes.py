@@ -30,7 +30,9 @@ def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0
     ]
     pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
     history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
-    scene = build_scene(cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape))
+    scene = build_scene(
+        cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape)
+    )
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
     poses = Poses(rotations=rotations, centers=centers + rng.normal(0, 0.3, centers.shape), half_sizes=halves)
     points = Points(
@@ -42,7 +44,9 @@ def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0
     scene = replace(
         scene, cameras=replace(scene.cameras, poses=poses), points=points, pairs=pairs, input_is_aligned=True
     )
-    return replace(scene, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(names)
+    return replace(scene, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(
+        names
+    )
 
 
 def _ring(n, rng):
@@ -80,14 +84,24 @@ def _pair(e, names, centers, rng):
 
 def _facts(names):
     return {
-        "inputs": {"model": "project/sparse/0", "database": "project/database.db", "directions": "inlier matches"},
+        "inputs": {
+            "model": "project/sparse/0",
+            "database": "project/database.db",
+            "directions": "inlier matches",
+        },
         "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
         "residual_level_deg": 0.07,
         "mean_reprojection_error_px": 0.62,
         "scale": "input: scale and origin of the input's centres",
         "loose_groups": [{"cameras": list(names[:2]), "cause": "two agreeing pairs or fewer hold it"}],
         "pieces": [
-            {"num_cameras": len(names), "scale": "input", "hinges": [names[0]], "folder": ".", "num_placed": len(names) - 1},
+            {
+                "num_cameras": len(names),
+                "scale": "input",
+                "hinges": [names[0]],
+                "folder": ".",
+                "num_placed": len(names) - 1,
+            },
             {"num_cameras": 4, "scale": "unit", "hinges": [names[0]], "folder": "pieces/1", "num_placed": 4},
         ],
         "solve": {"objective": 0.02, "gap": 3e-9, "unique": True, "status": "converged"},

@@ -26,7 +26,9 @@ def report_command(out: Output = None, *, scene: Scene = False) -> None:
         try:
             write_pictures(drawn, facts, folder, report=True, meshes=scene)
         except OSError as error:
-            raise InputError(f"{folder} cannot be written ({error.strerror}); copy it elsewhere first") from error
+            raise InputError(
+                f"{folder} cannot be written ({error.strerror}); copy it elsewhere first"
+            ) from error
 
 
 @app.command("view")

@@ -59,7 +59,10 @@ def solve_command(
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{found.placement.graph.num_cameras} nodes of {source}", _solve_table(found, target, pictures_line(report, scene)))
+            print_table(
+                f"{found.placement.graph.num_cameras} nodes of {source}",
+                _solve_table(found, target, pictures_line(report, scene)),
+            )
 
 
 def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:

@@ -56,7 +56,9 @@ def write_meshes(scene: Scene, folder: Path) -> None:
         shown.add_geometry(_mesh(turned(vertices), faces, colors), geom_name="cameras")
     if len(scene.points.positions):
         positions = turned(scene.points.positions)
-        shown.add_geometry(trimesh.PointCloud(positions, colors=_opaque(scene.points.colors)), geom_name="points")
+        shown.add_geometry(
+            trimesh.PointCloud(positions, colors=_opaque(scene.points.colors)), geom_name="points"
+        )
     for kind in PairClass:
         mine = (line_colors == PAIR_COLORS[kind]).all(axis=1)
         if mine.any():

@@ -280,7 +280,11 @@ def _pairs_note(scene: Scene) -> str:
 
 def _notes(scene: Scene, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
-    named = {"input": "at the input's centres", "optimum": "at the convex optimum", "output": "at the output's"}
+    named = {
+        "input": "at the input's centres",
+        "optimum": "at the convex optimum",
+        "output": "at the output's",
+    }
     medians = ", ".join(f"{value:.3g}° {named[state]}" for state, value in medians_deg.items())
     known = int(np.isfinite(scene.cameras.trust).sum())
     per_cell = -(-len(scene.cameras.names) // 200)

@@ -163,7 +163,8 @@ def build_scene(
     """
     names = tuple(row.name for row in cameras)
     poses, before = (
-        _unknown_poses(len(names)) if source is None else poses_of(source, names) for source in (model, original)
+        _unknown_poses(len(names)) if source is None else poses_of(source, names)
+        for source in (model, original)
     )
     poses = replace(poses, centers=before.centers)
     own = _cameras(cameras, names, poses)

@@ -128,7 +128,9 @@ class _View:
         top = int(scene.pairs.support.max(initial=0))
         self._support = gui.add_slider("least matches", 0, max(top, 1), 1, 0)
         self._trust = gui.add_slider("least trust", 0.0, 1.0, 0.01, 0.0)
-        names = [f"{k + 1}: {shortened(scene.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)]
+        names = [
+            f"{k + 1}: {shortened(scene.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
+        ]
         self._picked = gui.add_dropdown("pairs of", [_NOBODY, *names], initial_value=_NOBODY)
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
         self._counts = gui.add_text("pairs drawn", "", disabled=True)

@@ -139,7 +139,9 @@ def _least_trusted(scene: Scene) -> Iterator[Hint]:
     low = np.flatnonzero(trust < _LOW_TRUST)
     for row in low[np.argsort(trust[low], kind="stable")][:_SHOWN].tolist():
         reason = shortened(scene.cameras.reasons[row] or "its pairs speak against it")
-        yield Hint(text=f"{shortened(scene.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row)
+        yield Hint(
+            text=f"{shortened(scene.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row
+        )
 
 
 def _contradictions(scene: Scene) -> Iterator[Hint]:
@@ -166,4 +168,6 @@ def _loose(facts: dict[str, Any]) -> Iterator[Hint]:
 def _unchecked(scene: Scene) -> Iterator[Hint]:
     count = int(np.sum(scene.pairs.classes == PairClass.UNDETERMINED))
     if count:
-        yield Hint(text=f"{count:,} pairs cannot be judged: no other pair checks them, or their piece is not solved")
+        yield Hint(
+            text=f"{count:,} pairs cannot be judged: no other pair checks them, or their piece is not solved"
+        )
