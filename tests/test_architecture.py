@@ -36,6 +36,7 @@ LAYERS = [
     "diagnosis",
     "options",
     "report",
+    "visual",
     "results",
     "pipeline",
     "mapping",
@@ -49,6 +50,9 @@ DOORS = {
     "trimesh": {"synthetic/surfaces.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
+    "plotly": {"visual/report_page.py"},
+    "trimesh": {"visual/mesh.py"},
+    "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

@@ -9,7 +9,6 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 
-
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words: Python refuses to convert very long ones
 
 
