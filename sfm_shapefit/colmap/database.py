@@ -579,8 +579,9 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
 
 def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     """Return whether `data` is a blob of rows x cols items."""
-    whole = isinstance(rows, int) and isinstance(cols, int)
-    return whole and isinstance(data, bytes) and len(data) == rows * cols * itemsize
+    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
+        return False
+    return len(data) == rows * cols * itemsize
 
 
 def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
