@@ -36,9 +36,11 @@ LAYERS = [
     "diagnosis",
     "options",
     "report",
+    "visual",
     "results",
     "pipeline",
     "synthetic/fixtures",
+    "mapping",
     "cli",
 ]
 
@@ -46,9 +48,11 @@ DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "cv2": {"synthetic"},
-    "trimesh": {"synthetic/surfaces.py"},
+    "trimesh": {"synthetic/surfaces.py", "visual/mesh.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
+    "plotly": {"visual/report_page.py"},
+    "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }
