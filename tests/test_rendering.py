@@ -12,6 +12,7 @@ from sfm_shapefit import evaluate, locate
 from sfm_shapefit.cli import app
 from sfm_shapefit.colmap.photographs import judge_matches, write_rendered_workspace
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.mapping.run import map_database
 from sfm_shapefit.synthetic import (
     RenderedScene,
     RenderOptions,
@@ -268,6 +269,14 @@ def test_the_photographed_courtyard_is_placed_in_spite_of_its_repeated_houses():
     assert len(errors.names) >= 13
     assert errors.position.median < 0.007
     assert errors.position.max < 0.017
+
+
+def test_rotations_averaged_from_the_photographs_alone_place_the_median_camera():
+    found = map_database(PHOTOGRAPHED / "database.db").models[0].located.reconstruction
+    errors = evaluate(found, PHOTOGRAPHED / "truth")
+    # Measured: 14 of 16 placed, 34 mm median in a yard of 24 m; two cameras follow the repeated houses.
+    assert len(errors.names) >= 13
+    assert errors.position.median < 0.07
 
 
 @pytest.mark.slow
