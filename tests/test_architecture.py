@@ -17,6 +17,7 @@ LAYERS = [
     "jit",
     "geometry",
     "viewgraph",
+    "bodies",
     "formats",
     "rigidity",
     "laplacian",
