@@ -46,6 +46,8 @@ class Placement:
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    unit: float | None = None
+    """Length of the unit of the offsets inside rigid bodies, in the solver's units; None without bodies."""
 
     @property
     def nodes(self) -> IntArray:

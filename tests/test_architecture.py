@@ -29,6 +29,7 @@ LAYERS = [
     "epipolar",
     "rotations",
     "placement",
+    "body_placement",
     "gauge",
     "evaluation",
     "synthetic",

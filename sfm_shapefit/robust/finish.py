@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.robust.options import PlacementOptions
@@ -26,6 +27,7 @@ from sfm_shapefit.solver.angular import (
     residual_levels,
     robust_cost,
 )
+from sfm_shapefit.solver.bodies import ReducedFactor, lud_over_bodies
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
 from sfm_shapefit.viewgraph import ViewGraph
@@ -111,6 +113,7 @@ def finish(
     options: PlacementOptions,
     covariance: FloatArray | None = None,
     classes: IntArray | None = None,
+    bodies: Bodies | None = None,
 ) -> Finish:
     """Return the locations to keep for a solved view graph.
 
@@ -121,14 +124,16 @@ def finish(
         covariance: (m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
             unknown, None where all are.
         classes: (m,) 0 for pairs of cameras, 1 for directions to points; None: all 0.
+        bodies: the rigid bodies that the nodes belong to; then every pair joins two of them, and the
+            locations are theirs.
     """
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     metric = Metric(covariance, classes)
-    lud = _lud_start(graph, classes, options.threads) if has_second_start(graph) else None
-    plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
+    lud, second = _second_start(graph, classes, options.threads, bodies)
+    plan = _plan(graph, bodies) if options.refine and options.objective != "shapefit" else None
 
-    apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
-    candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
+    apart = None if second is None else disagreement(graph, solved.locations, second)
+    candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
     if apart is not None and apart > COLLAPSED:
         candidates.reverse()  # the likely better one first: the other ends early where it loses
     starts: list[Start] = []
@@ -157,6 +162,29 @@ def finish(
     )
 
 
+def _plan(graph: ViewGraph, bodies: Bodies | None) -> SymbolicFactor | ReducedFactor | None:
+    """Return what the refinement factors with, or None if its factor would be too large."""
+    return plan_refinement(graph) if bodies is None else ReducedFactor(graph.edges, bodies.normalised())
+
+
+def _second_start(
+    graph: ViewGraph, classes: IntArray, threads: int, bodies: Bodies | None
+) -> tuple[LudResult | None, FloatArray | None]:
+    """Return LUD's solution, which bodies have none of, and its locations."""
+    if bodies is None:
+        lud = _lud_start(graph, classes, threads) if has_second_start(graph) else None
+        return lud, None if lud is None else lud.locations
+    locations = lud_over_bodies(_weighted(graph, classes), bodies)
+    usable = locations is not None and projected_length(graph, locations) > 0.0
+    return None, locations if usable else None
+
+
+def _weighted(graph: ViewGraph, classes: IntArray) -> ViewGraph:
+    """Return the graph with the weights that directions to points have in LUD."""
+    weights = np.where(classes > 0, _POINT_WEIGHT, 1.0) * graph.weights
+    return ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
+
+
 def has_second_start(graph: ViewGraph) -> bool:
     """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
     return graph.num_edges <= _LUD_PAIRS and graph.num_cameras > 2
@@ -182,10 +210,8 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
     """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
-    weights = np.where(classes > 0, _POINT_WEIGHT, 1.0) * graph.weights
-    weighted = ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
     certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
-    found = solve_lud(weighted, _LUD_STEPS, certified=certified, threads=threads)
+    found = solve_lud(_weighted(graph, classes), _LUD_STEPS, certified=certified, threads=threads)
     usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
     return found if usable else None
 
@@ -195,14 +221,16 @@ def _refined(
     locations: FloatArray,
     graph: ViewGraph,
     metric: Metric,
-    plan: SymbolicFactor | None,
+    plan: SymbolicFactor | ReducedFactor | None,
     rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
     if plan is None:
         return Start(name=name, locations=locations, refined=None)
     refined = refine_angles(graph, locations, metric, plan, rival)
-    refined, num_strays = _without_strays(graph, locations, refined, metric)
+    num_strays = 0
+    if not isinstance(plan, ReducedFactor):  # of which no node can be put back by itself
+        refined, num_strays = _without_strays(graph, locations, refined, metric)
     if projected_length(graph, refined.locations) <= 0.0:
         return Start(name=name, locations=locations, refined=None)
     return Start(name=name, locations=locations, refined=refined, put_back=num_strays)

@@ -32,7 +32,11 @@ _SEED = 0
 
 
 def largest_tied(
-    edges: IntArray, bodies: Bodies, sizes: IntArray, locations: FloatArray | None = None
+    edges: IntArray,
+    bodies: Bodies,
+    sizes: IntArray,
+    locations: FloatArray | None = None,
+    around: int | None = None,
 ) -> IntArray:
     """Return the largest set of bodies, ascending, that the pairs tie to one another if s is known.
 
@@ -41,6 +45,7 @@ def largest_tied(
         bodies: of the nodes.
         sizes: (B,) what counts of each body, such as its number of cameras; sets are compared by their sum.
         locations: (n, d) where they are asked about; random positions with the bodies' offsets if None.
+        around: a body; then the set that holds it, whatever its size.
 
     Returns:
         (k,) bodies; a single one if no pair ties any two.
@@ -48,6 +53,8 @@ def largest_tied(
     used = edges[bodies.joins(edges)]
     if locations is None:
         locations = general_positions(bodies)
+    if around is not None:  # outweighs all others together
+        sizes = np.where(np.arange(bodies.num_bodies) == around, sizes.sum() + 1, sizes)
     best = np.array([int(np.argmax(sizes))])
     ends = bodies.body_of[used]
     for members in _components(ends, bodies.num_bodies):
