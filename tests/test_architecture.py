@@ -49,8 +49,8 @@ DOORS = {
     "cv2": {"synthetic/scenes.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
-    "typer": {"cli.py"},
-    "rich": {"cli.py"},
+    "typer": {"cli"},
+    "rich": {"cli"},
 }
 
 MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # which imports lazily, from all

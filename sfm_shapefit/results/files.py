@@ -1,0 +1,58 @@
+"""OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`.
+
+Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from sfm_shapefit.colmap.seed import write_model
+from sfm_shapefit.output import MARKER, atomic_folder
+from sfm_shapefit.report import CameraRow, PairRow, write_json, write_rows
+from sfm_shapefit.results.rows import folder_of, own_camera_rows
+from sfm_shapefit.results.summary import graph_summary, summary
+from sfm_shapefit.results.values import GraphResult, LocateResult
+
+
+def write_result(
+    found: LocateResult, out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
+) -> None:
+    """Write the seeded model and its tables into a folder that appears whole or not at all.
+
+    Args:
+        found: what `locate` returned.
+        out: the folder to be made.
+        overwrite: replace an earlier output of this package.
+        protect: paths that `out` must not be or contain, beside the inputs of `found`.
+
+    Raises:
+        InputError: if the folder exists, cannot be written, or would hit a protected path.
+    """
+    inputs = [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
+    with atomic_folder(out, overwrite=overwrite, protect=[*inputs, *protect]) as folder:
+        write_model(found.reconstruction, folder)
+        _write_tables(found, summary(found), folder)
+        for piece in found.further:
+            subfolder = folder / folder_of(piece.placement.piece)
+            subfolder.mkdir(parents=True)
+            write_model(piece.reconstruction, subfolder)
+            write_rows(piece.cameras, CameraRow, 3, subfolder / "cameras.csv")
+
+
+def write_graph_result(found: GraphResult, out: Path | str, *, overwrite: bool = False) -> None:
+    """Write the tables of a bare graph like `write_result`; there is no model."""
+    with atomic_folder(out, overwrite=overwrite, protect=[found.path]) as folder:
+        _write_tables(found, graph_summary(found), folder)
+        for piece in found.further:
+            subfolder = folder / folder_of(piece.piece)
+            subfolder.mkdir(parents=True)
+            rows = own_camera_rows(piece, piece.locations, 1.0)
+            write_rows(rows, CameraRow, piece.graph.dimension, subfolder / "cameras.csv")
+
+
+def _write_tables(found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path) -> None:
+    dimension = found.placement.graph.dimension
+    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    write_json(facts, folder / MARKER)
