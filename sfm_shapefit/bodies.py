@@ -59,12 +59,12 @@ class Bodies:
     @property
     def num_bodies(self) -> int:
         """Number of bodies, B."""
-        return int(self.body_of.max(initial=-1)) + 1
+        return int(self.body_of.max(initial=-1) + 1)
 
     @property
     def num_unknowns(self) -> int:
         """Length of x, B d + 1."""
-        return self.num_bodies * self.offsets.shape[1] + 1
+        return int(self.num_bodies * self.offsets.shape[1] + 1)
 
     def expand(self, x: FloatArray) -> FloatArray:
         """Return A x, the locations (n, d) for x = (f, s)."""
@@ -106,7 +106,8 @@ class Bodies:
         return Bodies(body_of=self.body_of, offsets=moved)
 
     def normalised(self) -> "Bodies":
-        """Return the same bodies centred, in a unit in which offsets have root mean square 1 unless all are 0."""
+        """Return the same bodies centred, in a unit in which offsets have root mean square 1 unless all are
+        0."""
         centred = self.centred()
         moved = np.linalg.norm(centred.offsets, axis=1)
         size = float(np.sqrt(np.mean(moved[moved > 0.0] ** 2))) if moved.any() else 1.0

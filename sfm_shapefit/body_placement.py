@@ -7,7 +7,7 @@ The answer is a `Placement` like any other, whose `unit` is the length of the of
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.placement import Placement
@@ -71,28 +71,16 @@ def place_bodies(
         solve=solved,
         finish=finished,
         assessment=assessment,
+        bodies=bodies,
         unit=unit,
     )
 
 
 def is_scaled(bodies: Bodies, edges: IntArray) -> bool:
-    """Return whether any body has two nodes apart that pairs with other bodies see: else the scale is open."""
+    """Return whether any body has two nodes apart that pairs with other bodies see: else the scale is
+    open."""
     nodes = np.unique(edges[bodies.joins(edges)])
     return bool(len(nodes)) and bool(bodies.restricted_to(nodes).centred().offsets.any())
-
-
-def without_bodies(placement: Placement, bodies: Bodies, kept: BoolArray) -> IntArray:
-    """Return further cameras that are placed with their bodies although no pair of theirs takes part.
-
-    Args:
-        placement: of the bodies.
-        bodies: of the nodes of its whole graph.
-        kept: which of the placement's cameras are in the output.
-    """
-    placed = np.unique(bodies.body_of[placement.cameras[kept]])
-    cameras = np.arange(placement.num_cameras)
-    with_them = np.isin(bodies.body_of[: placement.num_cameras], placed)
-    return cameras[with_them & ~np.isin(cameras, placement.cameras)]
 
 
 def _tied_bodies(graph: ViewGraph, bodies: Bodies, num_cameras: int, held: int | None) -> IntArray:
@@ -128,4 +116,3 @@ def _checked_unit(graph: ViewGraph, bodies: Bodies, locations: FloatArray) -> fl
             f"{unit * size / baseline:.1e} of a baseline; check the rigs, or which cameras are fixed"
         )
     return unit
-

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 
+FIX_SOLVED = "solved"
+"""In place of a file of names: fix every image that observes a 3D point of the input."""
+
 _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time of the solve
 
 
@@ -44,7 +47,12 @@ class LocateOptions:
     """Certified gap at which the solve counts as converged."""
     scale: Scale = "input"
     """Gauge of the output: scale and origin of the input's centres ("unit" where it has none), or
-    "unit": centroid 0 and median distance from it 1."""
+    "unit": centroid 0 and median distance from it 1, or "rig": the unit of the sensors' offsets in their
+    rigs, which is also what "input" means for a model with rigs of several cameras."""
+    fix: str = ""
+    """Cameras that stay exactly where the input has them, while the others are placed around them: a text
+    file with one image name per line, or "solved": every image that observes a 3D point of the input, for new
+    images in a solved model. With two or more the scale is theirs, with one only the origin."""
     min_inliers: int = 15
     """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
     min_inlier_ratio: float = 0.5

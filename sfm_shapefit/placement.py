@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
@@ -46,6 +47,8 @@ class Placement:
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    bodies: Bodies | None = None
+    """The rigid bodies of all nodes of the graph, if nodes do not move one by one."""
     unit: float | None = None
     """Length of the unit of the offsets inside rigid bodies, in the solver's units; None without bodies."""
 

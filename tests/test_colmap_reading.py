@@ -452,7 +452,7 @@ def test_a_rig_of_two_cameras_is_refused_as_not_supported_yet():
 def test_a_rig_serves_where_only_poses_are_compared(tmp_path):
     rig = rig_of_two_cameras()
     rig.write(tmp_path)
-    model = read_model(tmp_path, poses_only=True)
+    model = read_model(tmp_path)
     images = [rig.image(i) for i in model.image_ids.tolist()]
     assert len(images) == 6
     assert any(not image.is_ref_in_frame() for image in images)

@@ -144,7 +144,7 @@ def _errors(found: "LocateResult", cameras: Sequence[int], locations: object, tr
     from sfm_shapefit.colmap.model import read_model
     from sfm_shapefit.evaluation import evaluate_poses
 
-    model, reference = found.model, read_model(truth, poses_only=True)
+    model, reference = found.model, read_model(truth)
     position = evaluate_poses(
         [model.names[c] for c in cameras],
         model.rotations[cameras],

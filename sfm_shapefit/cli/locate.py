@@ -48,7 +48,8 @@ def locate_command(
         from sfm_shapefit.output import check_output
 
         options = options_from(LocateOptions, given, config)
-        protect = [path for path in (source, database, config) if path is not None]
+        names = Path(options.fix) if options.fix else None
+        protect = [path for path in (source, database, config, names) if path is not None]
         check_output(target, overwrite=overwrite, protect=protect)
 
         from sfm_shapefit.pipeline import locate
@@ -75,6 +76,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", shortened(left_out))] if left_out else []),
+        *_bodies_line(facts),
         *pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", objective_line(found.solve)),
@@ -87,6 +89,15 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
     ]
+
+
+def _bodies_line(facts: dict[str, Any]) -> Rows:
+    bodies = facts["bodies"]
+    if bodies is None:
+        return []
+    fixed = f", {bodies['num_fixed']} cameras fixed" if bodies["num_fixed"] else ""
+    inner = f"; {bodies['num_inner_pairs']} pairs inside them give no constraint"
+    return [("rigid bodies", f"{bodies['num_placed']} of {bodies['num_bodies']} placed{fixed}{inner}")]
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:

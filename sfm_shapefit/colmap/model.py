@@ -5,7 +5,8 @@ trusted: the centres of the input are carried along for comparison and never pla
 
 Poses live in frames (`rig_from_world`); for a model of an older COLMAP, pycolmap makes one frame per
 image. In a rig of several sensors cam_from_world = sensor_from_rig * rig_from_world, so that a camera stands
-at C = C_frame + R_frame^T o, with the metric offset o = -R_s^T t_s of its sensor; the frames are the unknowns.
+at C = C_frame + R_frame^T o, with the metric offset o = -R_s^T t_s of its sensor; the frames are the
+unknowns.
 
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
@@ -116,7 +117,9 @@ def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
         InputError: if frames have several images, which cannot turn one by one.
     """
     if model.has_rigs:
-        raise InputError("the rotations of a rig's cameras are not refined one by one; leave refine_rotations out")
+        raise InputError(
+            "the rotations of a rig's cameras are not refined one by one; leave refine_rotations out"
+        )
     copy = pycolmap.Reconstruction(model.reconstruction)
     for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
         image = copy.image(int(model.image_ids[index]))
@@ -266,7 +269,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
 def _refuse_uncalibrated(label: str, image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> None:
     """Refuse an image whose sensor has no pose in its rig: nothing says where it stands in its frame."""
     rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
-    sensor = image.camera.sensor_id
+    sensor = reconstruction.camera(image.camera_id).sensor_id
     if not rig.is_ref_sensor(sensor) and not rig.has_sensor_from_rig(sensor):
         raise InputError(
             f"{label}: camera {image.camera_id} has no pose in rig {rig.rig_id} (sensor_from_rig), so that "
@@ -277,12 +280,13 @@ def _refuse_uncalibrated(label: str, image: pycolmap.Image, reconstruction: pyco
 def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> FloatArray:
     """Return C - C_frame of a posed image in world axes, exactly 0 for the reference sensor."""
     frame = reconstruction.frame(image.frame_id)
-    sensor, rig = image.camera.sensor_id, reconstruction.rig(frame.rig_id)
+    sensor, rig = reconstruction.camera(image.camera_id).sensor_id, reconstruction.rig(frame.rig_id)
     if rig.is_ref_sensor(sensor):
         return np.zeros(3)
-    pose = rig.sensor_from_rig(sensor)
-    in_rig = -pose.rotation.matrix().T @ pose.translation
-    return np.asarray(frame.rig_from_world.rotation.matrix().T @ in_rig)
+    sensor_from_rig, rig_from_world = rig.sensor_from_rig(sensor), frame.rig_from_world
+    assert sensor_from_rig is not None and rig_from_world is not None
+    in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
+    return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
 
 
 def _checked_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:

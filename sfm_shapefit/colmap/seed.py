@@ -1,8 +1,8 @@
 """A seeded model: the input's rotations and intrinsics, our camera centres, and no 3D points yet.
 
 COLMAP keeps poses in frames, x_rig = R x_world + t with t = -R C. Moving a frame replaces t and hands on
-the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in their
-rigs are not touched: all images of a frame move with it.
+the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in
+their rigs are not touched: all images of a frame move with it.
 """
 
 from collections.abc import Callable, Mapping
@@ -57,7 +57,9 @@ def build_seed(
         image = seed.image(image_id)
         if placed[index] and image.frame_id not in settled:
             frame = seed.frame(image.frame_id)
-            rotation = frame.rig_from_world.rotation
+            old = frame.rig_from_world
+            assert old is not None  # a posed image's frame has a pose
+            rotation = old.rotation
             translation = -(rotation.matrix() @ (centers[index] - model.frame_offsets[index]))
             frame.rig_from_world = pycolmap.Rigid3d(rotation, translation)
             settled.add(image.frame_id)

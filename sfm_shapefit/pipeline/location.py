@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.gauge import Gauge, choose_gauge
+from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.measurement import (
@@ -19,10 +19,11 @@ from sfm_shapefit.pipeline.measurement import (
     shared_errors,
     with_points,
 )
+from sfm_shapefit.pipeline.rigid_bodies import chosen_gauge, placed, rigid_parts
 from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
 from sfm_shapefit.pipeline.sources import MatchSource, choose_inputs, open_source
-from sfm_shapefit.placement import Placement, place
+from sfm_shapefit.placement import Placement
 from sfm_shapefit.results import LocateResult, quality_warnings, trust_warnings
 
 if TYPE_CHECKING:
@@ -56,6 +57,7 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        rigid = rigid_parts(model, options)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
@@ -66,16 +68,13 @@ def locate(
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = place(
-                joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras
-            )
-            kept = trusted(placement, options.min_trust)
-            locations = placement.locations[kept]
-            gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
+            placement = placed(joint, rigid, evidence, options)
+            kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+            gauge = chosen_gauge(model, placement, rigid, kept, options)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        located = kept, gauge.similarity.apply(locations)
-        seeded, adjusted = seeded_model(source, placement, located, options, clock)
+        located = kept, gauge.similarity.apply(placement.locations[kept])
+        seeded, adjusted = seeded_model(source, placement, located, options, clock, rigid.fixed)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
@@ -91,6 +90,7 @@ def locate(
         warnings=warnings,
         turned_deg=turned_deg,
         further=further,
+        fixed=rigid.fixed,
     )
 
 

@@ -15,6 +15,8 @@ from sfm_shapefit.robust.verdicts import Verdict
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
 
 
@@ -95,7 +97,10 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             weight=float(graph.weights[edge]),
         )
         if edge not in judged:
-            rows.append(replace(row, reason="outside the pieces that are solved"))
+            inner = placement.bodies is not None and bool(
+                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            )
+            rows.append(replace(row, reason=_INNER if inner else _OUTSIDE))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

@@ -1,7 +1,7 @@
 """How uncertain the locations of rigid bodies are, and how much each direction decides for itself.
 
-As in `uncertainty`, with the centres f of the bodies as unknowns and their scale s held: it is the unit in which
-positions are given. The information about f is the Laplacian of the graph of bodies, its null space the
+As in `uncertainty`, with the centres f of the bodies as unknowns and their scale s held: it is the unit in
+which positions are given. The information about f is the Laplacian of the graph of bodies, its null space the
 translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T f held fixed: the mean of the
 cameras, or one body that stays where it is. All nodes of a body share its covariance.
 """

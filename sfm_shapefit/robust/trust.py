@@ -120,8 +120,8 @@ def judge_cameras(
         conditioning: how well the pairs hold its k cameras; nodes beyond are points, whose rays speak for or
             against a camera like pairs.
         evidence: support and contradicting pairs; unknown if None.
-        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of all
-            its cameras together; every node is its own if None.
+        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of
+            all its cameras together; every node is its own if None.
     """
     num_cameras = len(conditioning.num_pairs)
     votes = _votes(graph, angles, sigmas_of_pairs, evidence)

@@ -96,7 +96,7 @@ def _reduction(bodies: Bodies) -> csr_array:
     columns = (bodies.body_of[:, None] * d + np.arange(d)).ravel()
     moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, bodies.num_bodies * d)).tocsc()[:, d:]
     scaled = [csr_array(bodies.offsets.reshape(-1, 1))] if bodies.offsets.any() else []
-    return hstack([moving, *scaled]).tocsr()
+    return csr_array(hstack([moving, *scaled]))
 
 
 def _run(program: Any, tolerance: float, max_iterations: int) -> int:

@@ -10,7 +10,8 @@ orthogonal to v_e, since ||P z|| = max <y, z> over these) and lambda for the con
 
     <y, D A x> - lambda (<c, A x> - kappa),
 
-whose infimum over x is lambda kappa if  A^T D^T y = lambda A^T c  and minus infinity otherwise. So the dual is
+whose infimum over x is lambda kappa if  A^T D^T y = lambda A^T c  and minus infinity otherwise. So the dual
+is
 
     maximise    lambda
     subject to  sum over the pairs that leave body b of signed y_e = lambda * the same of w_e v_e,  each b
@@ -18,12 +19,12 @@ whose infimum over x is lambda kappa if  A^T D^T y = lambda A^T c  and minus inf
                 <y_e, v_e> = 0,    ||y_e|| <= w_e
 
 the balance at every camera summed over its body, and one equation more. For every x and every feasible pair
-R(A x) - lambda L(A x) = sum_e (w_e ||r_e|| - <y_e, r_e>) >= 0: lambda bounds the objective of all locations of
-these bodies. Fewer locations are admitted than without bodies, so the bound is at least as high.
+R(A x) - lambda L(A x) = sum_e (w_e ||r_e|| - <y_e, r_e>) >= 0: lambda bounds the objective of all locations
+of these bodies. Fewer locations are admitted than without bodies, so the bound is at least as high.
 
 An approximate y is repaired as in `certificate`: y' = y - S D A h with (A^T D^T S D A) h = A^T (D^T y -
-lambda c), and divided by max(1, max_e ||y'_e|| / w_e); both keep the equality, which is homogeneous. lambda is
-what makes <q, h> = 0 for the pinned pair's row q (see `reduced`): the matrix is nearly singular along x.
+lambda c), and divided by max(1, max_e ||y'_e|| / w_e); both keep the equality, which is homogeneous. lambda
+is what makes <q, h> = 0 for the pinned pair's row q (see `reduced`): the matrix is nearly singular along x.
 
 A pair inside a body says nothing of f and s; it would only shift the objective by a multiple of s. Such pairs
 take no part, and have dual 0.

@@ -1,7 +1,8 @@
 """Primal-dual Newton steps over bodies: the steps of `newton`, with the matrix and the balance reduced by A.
 
-A step of the bodies is a step of their nodes, dT = A dx, and everything per pair (residuals, the linearisation,
-the dual y+, the two step lengths) is that of `newton.steps`. Only the equations for the step differ:
+A step of the bodies is a step of their nodes, dT = A dx, and everything per pair (residuals, the
+linearisation, the dual y+, the two step lengths) is that of `newton.steps`. Only the equations for the step
+differ:
 
     (A^T M A) dx = lambda+ A^T c - A^T D^T g,    <A^T c, dx> = 0
 """

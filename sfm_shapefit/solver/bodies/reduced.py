@@ -10,7 +10,8 @@ K is factored in d x d blocks, sparse as the graph of bodies is; what remains fo
 eta - h^T K^-1 h. Translations are taken away by grounding one body.
 
 Along the solution itself the matrix tends to singular, whatever the data. `System` therefore works with the
-matrix of S_e + tau v v^T for one pinned pair and takes that term away again, exactly, as `newton.sparse` does.
+matrix of S_e + tau v v^T for one pinned pair and takes that term away again, exactly, as `newton.sparse`
+does.
 """
 
 from typing import NamedTuple

@@ -6,8 +6,8 @@ null vector moves both alike: an equivalence relation, whose classes are the set
 places relative to one another. If all bodies are in one class, s and f are determined up to translation and
 one common factor: a null vector that changes s is the solution itself, plus one that does not.
 
-Random null vectors tell the classes with probability 1: z <- (K + eps N)^-1 eps N z with N the plain Laplacian
-tends to the projection of z on the null space. That is a sparse solve or a few, at any size.
+Random null vectors tell the classes with probability 1: z <- (K + eps N)^-1 eps N z with N the plain
+Laplacian tends to the projection of z on the null space. That is a sparse solve or a few, at any size.
 
 Whether pairs tie bodies in general is asked at random positions with the given offsets, for a body's offsets
 are part of the problem and not general; whether they do at a solution, at its baselines.

@@ -1,0 +1,134 @@
+"""Rigs and fixed cameras in `locate`: which images form rigid bodies, and how these are placed.
+
+The frames of a model with rigs are bodies with metric offsets. Cameras that are fixed stand where the input
+has them: two or more are one body, whose offsets are their centres; of a single one only the origin can be
+taken.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray
+from sfm_shapefit.bodies import Bodies, separate
+from sfm_shapefit.body_placement import place_bodies
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.gauge import Gauge, choose_gauge, metric_gauge, moved_gauge
+from sfm_shapefit.options import FIX_SOLVED, LocateOptions
+from sfm_shapefit.placement import Placement, place
+from sfm_shapefit.robust.trust import Evidence
+from sfm_shapefit.tracks import JointGraph
+
+_COINCIDENT = 1e-9  # extent of the fixed centres, of their distance from the origin, that counts as none
+
+
+class Rigid(NamedTuple):
+    """What of a model is rigid."""
+
+    fixed: BoolArray
+    """(n,) images that stay exactly where the input has them."""
+    bodies: Bodies | None
+    """The images in bodies; None where each moves by itself."""
+    held: int | None
+    """The body of the fixed images."""
+
+
+def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
+    """Return what moves together and what not at all.
+
+    Raises:
+        InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
+            asked for than rigs or fixed images have.
+    """
+    fixed = _fixed_images(model, options.fix)
+    count = int(np.sum(fixed))
+    if options.scale == "rig" and not model.has_rigs:
+        raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
+    if not model.has_rigs and count < 2:
+        return Rigid(fixed, None, None)
+    if options.scale not in ("input", "rig"):
+        source = "rigs" if model.has_rigs else "fixed cameras"
+        raise InputError(
+            f"the scale is that of the {source}, so it cannot be {options.scale}; leave scale out"
+        )
+    bodies = model.bodies if model.has_rigs else separate(model.num_images, 3)
+    if count == 0:
+        return Rigid(fixed, bodies, None)
+    centers = model.centers[fixed]
+    extent = float(np.ptp(centers, axis=0).max())
+    if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not model.has_rigs:
+        raise InputError(
+            f"the {count} fixed cameras all stand at one place in the input; fix others, whose positions it has"
+        )
+    return Rigid(fixed, bodies.with_fixed(fixed, model.centers), 0)
+
+
+def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions) -> Placement:
+    """Place the view graph, over bodies where there are any."""
+    if rigid.bodies is None:
+        return place(joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras)
+    return place_bodies(
+        joint.graph,
+        rigid.bodies.with_separate(joint.num_points),
+        options.for_placement(),
+        joint.covariance,
+        evidence,
+        joint.num_cameras,
+        rigid.held,
+    )
+
+
+def chosen_gauge(
+    model: PosedModel, placement: Placement, rigid: Rigid, kept: BoolArray, options: LocateOptions
+) -> Gauge:
+    """Return scale and origin of the output: of what is fixed, of the rigs, or as asked.
+
+    Raises:
+        UnsolvableError: if the only fixed image is not placed.
+    """
+    cameras = placement.cameras[kept]
+    locations, centers = placement.locations[kept], model.centers[cameras]
+    still = rigid.fixed[cameras]
+    if placement.unit is not None:
+        return metric_gauge(locations, placement.unit, centers, still, has_rigs=model.has_rigs)
+    gauge = choose_gauge(locations, centers, options.scale)
+    if not rigid.fixed.any():
+        return gauge
+    name = model.names[int(np.argmax(rigid.fixed))]
+    if not still.any():
+        raise UnsolvableError(f"{name} is to stay where it is, but the matches do not tie it to the others")
+    return moved_gauge(gauge, locations[still][0], centers[still][0], name)
+
+
+def _fixed_images(model: PosedModel, fix: str) -> BoolArray:
+    """Return which images are to stay where they are."""
+    if not fix:
+        return np.zeros(model.num_images, dtype=np.bool_)
+    if fix == FIX_SOLVED:
+        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        solved = np.array([image.num_points3D > 0 for image in images], dtype=np.bool_)
+        if not solved.any():
+            raise InputError(
+                "no image of the model observes a 3D point, so none is solved; name those to fix"
+            )
+        return solved
+    path, index = Path(fix), {name: k for k, name in enumerate(model.names)}
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path} cannot be read; give a text file with the name of one image per line"
+        ) from error
+    fixed = np.zeros(model.num_images, dtype=np.bool_)
+    for number, line in enumerate(lines, start=1):
+        name = line.strip()
+        if not name or name.startswith("#"):
+            continue
+        if name not in index:
+            raise InputError(f"{path}, line {number}: the model has no posed image {name!r}")
+        fixed[index[name]] = True
+    if not fixed.any():
+        raise InputError(f"{path} names no image; give the name of one image per line")
+    return fixed
