@@ -284,7 +284,8 @@ def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction
     if rig.is_ref_sensor(sensor):
         return np.zeros(3)
     sensor_from_rig, rig_from_world = rig.sensor_from_rig(sensor), frame.rig_from_world
-    assert sensor_from_rig is not None and rig_from_world is not None
+    assert sensor_from_rig is not None
+    assert rig_from_world is not None
     in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
     return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.gauge import Gauge
+from sfm_shapefit.gauge import Gauge, choose_gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.measurement import (
@@ -19,7 +19,7 @@ from sfm_shapefit.pipeline.measurement import (
     shared_errors,
     with_points,
 )
-from sfm_shapefit.pipeline.rigid_bodies import chosen_gauge, placed, rigid_parts
+from sfm_shapefit.pipeline.rigid_bodies import placed, rigid_gauge, rigid_parts
 from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
 from sfm_shapefit.pipeline.sources import MatchSource, choose_inputs, open_source
@@ -70,10 +70,13 @@ def locate(
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
             placement = placed(joint, rigid, evidence, options)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            gauge = chosen_gauge(model, placement, rigid, kept, options)
+            locations, centers = placement.locations[kept], model.centers[placement.cameras[kept]]
+            gauge = rigid_gauge(
+                model, placement, rigid, kept, lambda: choose_gauge(locations, centers, options.scale)
+            )
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        located = kept, gauge.similarity.apply(placement.locations[kept])
+        located = kept, gauge.similarity.apply(locations)
         seeded, adjusted = seeded_model(source, placement, located, options, clock, rigid.fixed)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(

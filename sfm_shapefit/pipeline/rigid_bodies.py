@@ -5,6 +5,7 @@ has them: two or more are one body, whose offsets are their centres; of a single
 taken.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,7 +16,7 @@ from sfm_shapefit.bodies import Bodies, separate
 from sfm_shapefit.body_placement import place_bodies
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.gauge import Gauge, choose_gauge, metric_gauge, moved_gauge
+from sfm_shapefit.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.robust.trust import Evidence
@@ -60,7 +61,7 @@ def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
     extent = float(np.ptp(centers, axis=0).max())
     if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not model.has_rigs:
         raise InputError(
-            f"the {count} fixed cameras all stand at one place in the input; fix others, whose positions it has"
+            f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )
     return Rigid(fixed, bodies.with_fixed(fixed, model.centers), 0)
 
@@ -80,10 +81,17 @@ def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateO
     )
 
 
-def chosen_gauge(
-    model: PosedModel, placement: Placement, rigid: Rigid, kept: BoolArray, options: LocateOptions
+def rigid_gauge(
+    model: PosedModel, placement: Placement, rigid: Rigid, kept: BoolArray, otherwise: Callable[[], Gauge]
 ) -> Gauge:
-    """Return scale and origin of the output: of what is fixed, of the rigs, or as asked.
+    """Return scale and origin of the output where bodies or a fixed camera decide them.
+
+    Args:
+        model: the input.
+        placement: its solution.
+        rigid: what of it is rigid.
+        kept: which of the placement's cameras are in the output.
+        otherwise: chooses where no body knows the scale; a single fixed camera then moves only the origin.
 
     Raises:
         UnsolvableError: if the only fixed image is not placed.
@@ -93,7 +101,7 @@ def chosen_gauge(
     still = rigid.fixed[cameras]
     if placement.unit is not None:
         return metric_gauge(locations, placement.unit, centers, still, has_rigs=model.has_rigs)
-    gauge = choose_gauge(locations, centers, options.scale)
+    gauge = otherwise()
     if not rigid.fixed.any():
         return gauge
     name = model.names[int(np.argmax(rigid.fixed))]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
@@ -228,23 +228,28 @@ def _refined(
     if plan is None:
         return Start(name=name, locations=locations, refined=None)
     refined = refine_angles(graph, locations, metric, plan, rival)
-    num_strays = 0
-    if not isinstance(plan, ReducedFactor):  # of which no node can be put back by itself
-        refined, num_strays = _without_strays(graph, locations, refined, metric)
+    alone = np.ones(graph.num_cameras, dtype=np.bool_)
+    if isinstance(plan, ReducedFactor):
+        alone = np.bincount(plan.bodies.body_of)[plan.bodies.body_of] == 1
+    refined, num_strays = _without_strays(graph, locations, refined, metric, alone)
     if projected_length(graph, refined.locations) <= 0.0:
         return Start(name=name, locations=locations, refined=None)
     return Start(name=name, locations=locations, refined=refined, put_back=num_strays)
 
 
 def _without_strays(
-    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric
+    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric, alone: BoolArray
 ) -> tuple[AngularResult, int]:
-    """Return a refinement whose strays are put back, and their number; of the start, if that fits better."""
+    """Return a refinement whose strays are put back, and their number; of the start, if that fits better.
+
+    Only nodes that are a body of their own, `alone`, can be put back one by one.
+    """
     levels = refined.levels_rad
     far = left_scene(start, refined.locations)
     if not far.any():
         return refined, 0
     nodes = strays(graph, far, agreeing_pairs(graph, refined.locations, metric, levels))
+    nodes = nodes[alone[nodes]]
     if len(nodes) == 0:
         return refined, 0
     locations = _unit(put_back(start, refined.locations, nodes))

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         trajectory_graph_problem,
     )
     from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
+    from sfm_shapefit.synthetic.rigs import RigScene, make_rig_drive
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
@@ -39,6 +40,7 @@ _HOMES = {
         "trajectory_graph_problem",
     ),
     "options": ("SceneOptions", "WorkspaceOptions"),
+    "rigs": ("RigScene", "make_rig_drive"),
     "scenes": ("Scene", "make_scene", "project_points"),
     "streets": ("StreetProblem", "street_problem"),
 }
@@ -47,6 +49,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "Corruption",
     "GraphProblem",
+    "RigScene",
     "Scene",
     "SceneOptions",
     "StreetProblem",
@@ -56,6 +59,7 @@ __all__ = [
     "corridor_graph_problem",
     "expander_graph_problem",
     "lawn_graph_problem",
+    "make_rig_drive",
     "make_scene",
     "measured_problem",
     "project_points",
