@@ -96,11 +96,13 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
         np.testing.assert_array_equal(model.reconstruction.frame(frame).rig_from_world.matrix(), matrix)
 
 
-def assert_rigs_equal(a, b):
+def assert_rigs_equal(a, b, atol=0.0):
     assert set(a.rigs) == set(b.rigs)
     for rig_id, rig in a.rigs.items():
         for sensor, pose in rig.non_ref_sensors.items():
-            np.testing.assert_array_equal(pose.matrix(), b.rig(rig_id).sensor_from_rig(sensor).matrix())
+            other = b.rig(rig_id).sensor_from_rig(sensor)
+            # Bundle adjustment normalises quaternions anew; nothing else changes a bit.
+            np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
 
 
 # --- rigs in locate ------------------------------------------------------------------------------------
@@ -173,7 +175,7 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
     located = sfm_shapefit.locate(
         workspace / "sparse" / "0", options=LocateOptions(bundle_adjust=True, points="never")
     )
-    assert_rigs_equal(located.reconstruction, located.model.reconstruction)
+    assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
     fit = fit_similarity(centres(located.reconstruction)[1], rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
 
@@ -182,14 +184,14 @@ def test_what_rigs_rule_out_is_said(workspace):
     model = workspace / "sparse" / "0"
     with pytest.raises(InputError, match="the scale is that of the rigs, so it cannot be unit"):
         sfm_shapefit.locate(model, options=LocateOptions(scale="unit"))
-    with pytest.raises(InputError, match="not refined one by one"):
+    with pytest.raises(InputError, match="turn as one"):
         sfm_shapefit.locate(model, options=LocateOptions(refine_rotations=True))
     with pytest.raises(InputError, match="no rig of several cameras"):
         sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(scale="rig"))
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "truth")
+    model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))

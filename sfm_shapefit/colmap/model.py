@@ -117,9 +117,7 @@ def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
         InputError: if frames have several images, which cannot turn one by one.
     """
     if model.has_rigs:
-        raise InputError(
-            "the rotations of a rig's cameras are not refined one by one; leave refine_rotations out"
-        )
+        raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
     copy = pycolmap.Reconstruction(model.reconstruction)
     for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
         image = copy.image(int(model.image_ids[index]))

@@ -15,7 +15,7 @@ from sfm_shapefit.synthetic import RigScene
 def camera_id_of(rigs: RigScene, index: int) -> int:
     """Return the id of the camera of image `index`."""
     rig = int(rigs.rig_of_frame[rigs.frame_of_image[index]])
-    return rig * rigs.sensor_centers.shape[1] + int(rigs.sensor_of_image[index]) + 1
+    return rig * int(rigs.sensor_centers.shape[1]) + int(rigs.sensor_of_image[index]) + 1
 
 
 def new_rigs(rigs: RigScene, camera: pycolmap.Camera) -> tuple[list[pycolmap.Camera], list[pycolmap.Rig]]:

@@ -21,6 +21,7 @@ from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.tracks import JointGraph
+from sfm_shapefit.viewgraph import ViewGraph
 
 _COINCIDENT = 1e-9  # extent of the fixed centres, of their distance from the origin, that counts as none
 
@@ -47,6 +48,8 @@ def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
+    if options.refine_rotations and model.has_rigs:
+        raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
     if not model.has_rigs and count < 2:
         return Rigid(fixed, None, None)
     if options.scale not in ("input", "rig"):
@@ -67,9 +70,30 @@ def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
 
 
 def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions) -> Placement:
-    """Place the view graph, over bodies where there are any."""
+    """Place the view graph, over bodies where there are any.
+
+    Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
+    take part with bodies only if they are wanted always, or if cameras hang loose without them.
+    """
     if rigid.bodies is None:
         return place(joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras)
+    first = None
+    if options.points != "always":
+        try:
+            first = _placed_bodies(*_without_points(joint, evidence), rigid, options)
+        except UnsolvableError:
+            if joint.num_points == 0:
+                raise
+    if joint.num_points == 0 or (first is not None and not first.assessment.loose_groups):
+        assert first is not None or options.points == "always"
+        return first or _placed_bodies(joint, evidence, rigid, options)
+    second = _placed_bodies(joint, evidence, rigid, options)
+    return second if first is None or _num_held(second) > _num_held(first) else first
+
+
+def _placed_bodies(joint: JointGraph, evidence: Evidence, rigid: Rigid, options: LocateOptions) -> Placement:
+    """Place bodies, and points that each are one."""
+    assert rigid.bodies is not None
     return place_bodies(
         joint.graph,
         rigid.bodies.with_separate(joint.num_points),
@@ -79,6 +103,22 @@ def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateO
         joint.num_cameras,
         rigid.held,
     )
+
+
+def _without_points(joint: JointGraph, evidence: Evidence) -> tuple[JointGraph, Evidence]:
+    """Return the pairs of cameras alone; they stand before the rays."""
+    graph, k = joint.graph, joint.num_cameras
+    rows = np.flatnonzero((graph.edges < k).all(axis=1))
+    names = None if graph.names is None else graph.names[:k]
+    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
+    heard = evidence.restricted_to(rows, np.arange(k), graph.num_cameras)
+    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k), heard
+
+
+def _num_held(placement: Placement) -> int:
+    """Return how many cameras are placed and not loose."""
+    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+    return len(placement.cameras) - loose
 
 
 def rigid_gauge(

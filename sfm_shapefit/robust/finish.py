@@ -174,14 +174,18 @@ def _second_start(
     if bodies is None:
         lud = _lud_start(graph, classes, threads) if has_second_start(graph) else None
         return lud, None if lud is None else lud.locations
-    locations = lud_over_bodies(_weighted(graph, classes), bodies)
-    usable = locations is not None and projected_length(graph, locations) > 0.0
-    return None, locations if usable else None
+    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
+    found = []
+    for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
+        locations = lud_over_bodies(_weighted(graph, classes, point_weight), bodies)
+        if locations is not None and projected_length(graph, locations) > 0.0:
+            found.append((robust_cost(graph, locations, metric, opening), locations))
+    return None, min(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def _weighted(graph: ViewGraph, classes: IntArray) -> ViewGraph:
+def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
     """Return the graph with the weights that directions to points have in LUD."""
-    weights = np.where(classes > 0, _POINT_WEIGHT, 1.0) * graph.weights
+    weights = np.where(classes > 0, point_weight, 1.0) * graph.weights
     return ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
 
 

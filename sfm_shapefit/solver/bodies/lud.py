@@ -2,9 +2,9 @@
 
     minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1,  t = A x
 
-which is a sum of distances w_e dist(t_i - t_j, C_e) to the rays C_e = {s v_e, s >= 1}. Splitting with z_e for the
-baselines makes a step of two parts: z_e by the proximal map of a distance, which moves its point towards the ray
-by 1 / rho at most, and x by least squares with weights w_e, whose matrix is factored once:
+which is a sum of distances w_e dist(t_i - t_j, C_e) to the rays C_e = {s v_e, s >= 1}. Splitting with z_e
+for the baselines makes a step of two parts: z_e by the proximal map of a distance, which moves its point
+towards the ray by 1 / rho at most, and x by least squares with weights w_e, whose matrix is factored once:
 
     z = prox(D A x + u),    u <- u + D A x - z,    A^T D^T W D A x = A^T D^T W (z - u)
 
