@@ -182,7 +182,7 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
 
 def test_what_rigs_rule_out_is_said(workspace):
     model = workspace / "sparse" / "0"
-    with pytest.raises(InputError, match="the scale is that of the rigs, so it cannot be unit"):
+    with pytest.raises(InputError, match="the scale is that of the rigs; leave out"):
         sfm_shapefit.locate(model, options=LocateOptions(scale="unit"))
     with pytest.raises(InputError, match="turn as one"):
         sfm_shapefit.locate(model, options=LocateOptions(refine_rotations=True))

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.gauge import Gauge, choose_gauge
+from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.gauging import chosen_gauge, read_priors
 from sfm_shapefit.pipeline.measurement import (
     evidence_of,
     joint_graph,
@@ -35,6 +36,7 @@ def locate(
     database: Path | str | None = None,
     options: LocateOptions | None = None,
     progress: Progress | None = None,
+    priors: Path | str | None = None,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -45,6 +47,8 @@ def locate(
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings; defaults if None.
         progress: called as stages advance.
+        priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
+            serve if the scale is "prior" and there is no table.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
@@ -57,7 +61,8 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
-        rigid = rigid_parts(model, options)
+        known = read_priors(model, inputs, options, priors)
+        rigid = rigid_parts(model, options, has_priors=known is not None)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
@@ -70,14 +75,12 @@ def locate(
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
             placement = placed(joint, rigid, evidence, options)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            locations, centers = placement.locations[kept], model.centers[placement.cameras[kept]]
             gauge = rigid_gauge(
-                model, placement, rigid, kept, lambda: choose_gauge(locations, centers, options.scale)
+                model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)
             )
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        located = kept, gauge.similarity.apply(locations)
-        seeded, adjusted = seeded_model(source, placement, located, options, clock, rigid.fixed)
+        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,

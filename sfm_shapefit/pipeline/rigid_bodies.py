@@ -37,8 +37,13 @@ class Rigid(NamedTuple):
     """The body of the fixed images."""
 
 
-def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
+def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
     """Return what moves together and what not at all.
+
+    Args:
+        model: the input.
+        options: which images are fixed, and the scale asked for.
+        has_priors: whether position priors are to set scale and axes.
 
     Raises:
         InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
@@ -50,12 +55,18 @@ def rigid_parts(model: PosedModel, options: LocateOptions) -> Rigid:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
     if options.refine_rotations and model.has_rigs:
         raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
+    if options.refine_rotations and count:
+        raise InputError("fixed cameras keep their rotations; leave out refine_rotations")
+    if count and has_priors:
+        raise InputError(
+            "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"
+        )
     if not model.has_rigs and count < 2:
         return Rigid(fixed, None, None)
-    if options.scale not in ("input", "rig"):
+    if options.scale not in ("auto", "input", "rig") or options.known_distance or has_priors:
         source = "rigs" if model.has_rigs else "fixed cameras"
         raise InputError(
-            f"the scale is that of the {source}, so it cannot be {options.scale}; leave scale out"
+            f"the scale is that of the {source}; leave out other scales, known distances and priors"
         )
     bodies = model.bodies if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
