@@ -7,7 +7,18 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, graph_peers, real, real_peers, scale, solver, trust
+from benchmarks import (
+    coherent,
+    directions,
+    families,
+    graph_peers,
+    real,
+    real_peers,
+    rigs,
+    scale,
+    solver,
+    trust,
+)
 
 SUBCOMMANDS = {
     "real": real,
@@ -19,6 +30,7 @@ SUBCOMMANDS = {
     "directions": directions,
     "trust": trust,
     "coherent": coherent,
+    "rigs": rigs,
 }
 
 

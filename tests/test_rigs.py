@@ -14,7 +14,7 @@ from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.results import summary, write_result
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
-from tests.scenes import RING
+from tests.scenes import RING, copied
 
 
 def drive(num_images, seed=0, **options):
@@ -190,6 +190,12 @@ def test_what_rigs_rule_out_is_said(workspace):
         sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(scale="rig"))
 
 
+def test_inspecting_says_how_many_frames_hang_together(workspace):
+    seen = sfm_shapefit.inspect(workspace / "sparse" / "0", options=LocateOptions(points="never"))
+    assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
+    assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
+
+
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
     model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "sparse" / "0")
     for rig in model.rigs.values():
@@ -318,3 +324,23 @@ def test_fixed_cameras_without_positions_are_refused(tmp_path):
         frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
         sfm_shapefit.locate(model, RING / "database.db", LocateOptions(fix=str(names)))
+
+
+def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
+    from typer.testing import CliRunner
+
+    from sfm_shapefit.cli import app
+
+    scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
+    names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
+    arguments = ["locate", str(scene / "sparse" / "0"), str(tmp_path / "out"), "--fix", str(names)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
+        done.output.replace("│", " ").split()
+    )
+    given, after = (poses(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
+    for k in (1, 2, 3):
+        np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
+    refused = CliRunner().invoke(app, [*arguments[:-1], str(tmp_path / "none.txt"), "--overwrite"])
+    assert refused.exit_code == 3

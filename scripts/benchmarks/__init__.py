@@ -10,6 +10,7 @@
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
+    rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
     trust.py     subcommand `trust`: standard deviations and trust against errors
     graph_peers.py    subcommand `peers-graphs`: pytheia and gtsam on bare graphs
 

@@ -13,13 +13,14 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.bodies import Bodies, separate
-from sfm_shapefit.body_placement import place_bodies
+from sfm_shapefit.body_placement import is_scaled, place_bodies
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.robust.trust import Evidence
+from sfm_shapefit.solver.bodies import largest_tied
 from sfm_shapefit.tracks import JointGraph
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -78,6 +79,19 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
             f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )
     return Rigid(fixed, bodies.with_fixed(fixed, model.centers), 0)
+
+
+def rigs_statement(model: PosedModel, joint: JointGraph) -> str:
+    """Say how many frames a model has, and how many of them the pairs tie to one another."""
+    if not model.has_rigs:
+        return "none: every image is a frame of its own"
+    bodies = model.bodies.with_separate(joint.num_points)
+    frames = f"{model.bodies.num_bodies} frames of {model.num_images} images"
+    if not is_scaled(bodies, joint.graph.edges):
+        return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
+    sizes = np.bincount(bodies.body_of[: model.num_images], minlength=bodies.num_bodies)
+    tied = int(np.sum(sizes[largest_tied(joint.graph.edges, bodies, sizes)] > 0))
+    return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
 def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions) -> Placement:
