@@ -66,6 +66,7 @@ def place_bodies(
     return Placement(
         graph=graph,
         num_cameras=k,
+        dropped=np.zeros(0, dtype=np.int64),
         pieces=[RigidPiece(cameras=nodes, edges=edges, hinges=np.zeros(0, dtype=np.int64))],
         piece=0,
         solve=solved,

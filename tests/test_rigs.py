@@ -184,6 +184,10 @@ def test_what_rigs_rule_out_is_said(workspace):
     model = workspace / "sparse" / "0"
     with pytest.raises(InputError, match="the scale is that of the rigs; leave out"):
         sfm_shapefit.locate(model, options=LocateOptions(scale="unit"))
+    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
+        sfm_shapefit.locate(model, options=LocateOptions(objective="linf"))
+    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
+        sfm_shapefit.locate(model, options=LocateOptions(filter="1dsfm"))
     with pytest.raises(InputError, match="turn as one"):
         sfm_shapefit.locate(model, options=LocateOptions(refine_rotations=True))
     with pytest.raises(InputError, match="no rig of several cameras"):

@@ -69,6 +69,10 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
         raise InputError(
             f"the scale is that of the {source}; leave out other scales, known distances and priors"
         )
+    if not options.for_placement().solves_shapefit or options.filter != "none":
+        raise InputError(
+            "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
+        )
     bodies = model.bodies if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, bodies, None)

@@ -142,7 +142,9 @@ def assess(
     sigmas = scale * sigmas
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
     rigid = None if bodies is None else bodies.body_of
-    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, evidence, rigid)
+    judged = judge_cameras(
+        graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
+    )
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,

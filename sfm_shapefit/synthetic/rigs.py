@@ -14,8 +14,9 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.synthetic.layouts import LAYOUTS, Layout, looking_along, street
 from sfm_shapefit.synthetic.options import SceneOptions
-from sfm_shapefit.synthetic.scenes import Scene, _drive, _Layout, _looking_along, _road, scene_of
+from sfm_shapefit.synthetic.scenes import Scene, scene_of
 
 NUM_RIGS, NUM_SENSORS = 2, 3
 
@@ -71,8 +72,8 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     turns = _sensor_rotations()
     rig_of_image = rig_of_frame[frame_of_image]
     offsets = _OFFSETS_M[rig_of_image, sensor_of_image]
-    streets = _drive(num_frames // NUM_RIGS + 1, options.num_points, layout_rng)
-    layout = _Layout(
+    streets = LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng)
+    layout = Layout(
         centers=centers[frame_of_image] + np.einsum("nji,nj->ni", rotations[frame_of_image], offsets),
         rotations=turns[rig_of_image, sensor_of_image] @ rotations[frame_of_image],
         points=streets.points,
@@ -94,10 +95,10 @@ def _frames(
 ) -> tuple[FloatArray, FloatArray]:
     """Return rig_from_world rotations (f, 3, 3) and centres (f, 3) of the frames along the street."""
     at = _STEP_M / NUM_RIGS * np.arange(num_frames)
-    road, ahead, left = _road(at)
+    road, ahead, left = street(at)
     centers = road + (_LANES_M[rig_of_frame] + 0.1 * rng.standard_normal(num_frames))[:, None] * left
     centers[:, 2] = _HEIGHTS_M[rig_of_frame] + 0.05 * rng.standard_normal(num_frames)
-    return _looking_along(normalized(ahead + 0.02 * rng.standard_normal((num_frames, 3)))), centers
+    return looking_along(normalized(ahead + 0.02 * rng.standard_normal((num_frames, 3)))), centers
 
 
 def _sensor_rotations() -> FloatArray:
