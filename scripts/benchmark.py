@@ -7,7 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, peers, real, scale, solver, trust
+from benchmarks import coherent, directions, families, peers, real, rigs, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
@@ -18,6 +18,7 @@ SUBCOMMANDS = {
     "directions": directions,
     "trust": trust,
     "coherent": coherent,
+    "rigs": rigs,
 }
 
 

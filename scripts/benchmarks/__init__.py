@@ -10,6 +10,7 @@
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
+    rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
     trust.py     subcommand `trust`: standard deviations and trust against errors
     peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
     graph_peers.py    ... on bare graphs

@@ -46,6 +46,7 @@ if TYPE_CHECKING:
         project_distorted,
         surface_points,
     )
+    from sfm_shapefit.synthetic.rigs import RigScene, make_rig_drive
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
@@ -71,6 +72,7 @@ _HOMES = {
         "project_distorted",
         "surface_points",
     ),
+    "rigs": ("RigScene", "make_rig_drive"),
     "scenes": ("Scene", "make_scene", "project_points"),
     "streets": ("StreetProblem", "street_problem"),
 }
@@ -81,6 +83,7 @@ __all__ = [
     "GraphProblem",
     "RenderOptions",
     "RenderedScene",
+    "RigScene",
     "Scene",
     "SceneOptions",
     "StreetProblem",
@@ -92,6 +95,7 @@ __all__ = [
     "expander_graph_problem",
     "lawn_graph_problem",
     "make_rendered_scene",
+    "make_rig_drive",
     "make_scene",
     "measured_problem",
     "project_distorted",
