@@ -46,9 +46,13 @@ class LocateOptions:
     between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 cameras."""
     tol: float = 1e-8
     """Certified gap at which the solve counts as converged."""
-    scale: Scale = "input"
-    """Gauge of the output: scale and origin of the input's centres ("unit" where it has none), or
-    "unit": centroid 0 and median distance from it 1."""
+    scale: Scale = "auto"
+    """Scale and origin of the output: "input" takes those of the input's centres ("unit" where it has none);
+    "unit" puts the centroid at 0 and the median distance from it at 1; "prior" maps onto position priors,
+    axes too; "distance" makes a known distance true. "auto": a known distance if one is given, else
+    priors if a table is given, else "input"."""
+    known_distance: tuple[str, str, float] | None = None
+    """Two images by name, and how far apart they are in the output's units."""
     min_inliers: int = 15
     """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
     min_inlier_ratio: float = 0.5
@@ -84,6 +88,7 @@ class LocateOptions:
             choices = get_args(kind)
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        self._check_distance()
         if not 0.0 <= self.min_trust <= 1.0:
             raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
         if self.refine_rotations and self.directions == "relative-poses":
@@ -94,11 +99,30 @@ class LocateOptions:
         self.for_directions()
         self.for_structure()
 
+    def _check_distance(self) -> None:
+        """Refuse a known distance that is none, or that the scale asked for has no use for."""
+        known = self.known_distance
+        if self.scale == "distance" and known is None:
+            raise ValueError("the scale distance needs known_distance: two image names and their distance")
+        if known is None:
+            return
+        if self.scale not in ("auto", "distance"):
+            raise ValueError(f"known_distance has no effect with the scale {self.scale}; leave out one")
+        is_number = len(known) == 3 and isinstance(known[2], int | float)
+        if not (is_number and isinstance(known[0], str) and isinstance(known[1], str)):
+            raise ValueError(f"known_distance must be two image names and a number, got {known!r}")
+        if not 0.0 < known[2] < float("inf") or known[0] == known[1]:
+            raise ValueError(f"known_distance must be positive, of two different images, got {known!r}")
+
     def _check_types(self) -> None:
         """Refuse values of another type by name; an integer serves as a float."""
         hints = get_type_hints(type(self))
         for item in fields(self):
             value, wanted = getattr(self, item.name), hints[item.name]
+            if item.name == "known_distance":
+                if not isinstance(value, tuple | list | None):
+                    raise ValueError(f"known_distance must be two image names and a number, got {value!r}")
+                continue
             accepted = {float: (float, int), int: (int,), bool: (bool,)}.get(wanted, (str,))
             if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
                 raise ValueError(f"{item.name} must be of type {accepted[0].__name__}, got {value!r}")

@@ -1,7 +1,9 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
@@ -35,6 +37,14 @@ def locate_command(
     input_path: InputPath = None,
     output_path: OutputPath = None,
     database: Database = None,
+    priors: Annotated[
+        Path | None,
+        typer.Option(
+            "--priors",
+            metavar="FILE",
+            help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
     as_json: Json = False,
@@ -48,7 +58,7 @@ def locate_command(
         from sfm_shapefit.output import check_output
 
         options = options_from(LocateOptions, given, config)
-        protect = [path for path in (source, database, config) if path is not None]
+        protect = [path for path in (source, database, priors, config) if path is not None]
         check_output(target, overwrite=overwrite, protect=protect)
 
         from sfm_shapefit.pipeline import locate
@@ -57,7 +67,7 @@ def locate_command(
 
         catch_termination()
         with shown_progress(not quiet) as progress:
-            found = locate(source, database, options, progress)
+            found = locate(source, database, options, progress, priors)
             write_result(found, target, overwrite=overwrite, protect=protect)
         if as_json:
             print(dumps(summary(found)))  # noqa: T201

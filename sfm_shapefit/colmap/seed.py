@@ -68,6 +68,13 @@ def without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstr
     return copy
 
 
+def turned(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
+    """Return the model turned about the origin: cameras and points, x -> axes x."""
+    copy = pycolmap.Reconstruction(reconstruction)
+    copy.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(axes), np.zeros(3)))
+    return copy
+
+
 def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
     """Write a model in COLMAP's binary format into an existing folder, and walk the files once more.
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.gauge import Gauge, choose_gauge
+from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.gauging import chosen_gauge, read_priors
 from sfm_shapefit.pipeline.measurement import (
     evidence_of,
     joint_graph,
@@ -34,6 +35,7 @@ def locate(
     database: Path | str | None = None,
     options: LocateOptions | None = None,
     progress: Progress | None = None,
+    priors: Path | str | None = None,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -44,6 +46,8 @@ def locate(
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings; defaults if None.
         progress: called as stages advance.
+        priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
+            serve if the scale is "prior" and there is no table.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
@@ -56,6 +60,7 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        known = read_priors(model, inputs, options, priors)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
@@ -70,12 +75,10 @@ def locate(
                 joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras
             )
             kept = trusted(placement, options.min_trust)
-            locations = placement.locations[kept]
-            gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
+            gauge = chosen_gauge(model, placement, kept, options, known)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        located = kept, gauge.similarity.apply(locations)
-        seeded, adjusted = seeded_model(source, placement, located, options, clock)
+        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,

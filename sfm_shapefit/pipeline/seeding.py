@@ -8,9 +8,9 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted, bundle_adjust
 from sfm_shapefit.colmap.matches import MatchBatch
-from sfm_shapefit.colmap.seed import build_seed
+from sfm_shapefit.colmap.seed import build_seed, turned
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
-from sfm_shapefit.gauge import choose_gauge
+from sfm_shapefit.gauge import Gauge, unit_gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.sources import MatchSource
@@ -34,15 +34,17 @@ def trusted(placement: Placement, min_trust: float) -> BoolArray:
 def seeded_model(
     source: MatchSource,
     placement: Placement,
-    located: tuple[BoolArray, FloatArray],
+    kept: BoolArray,
+    gauge: Gauge,
     options: LocateOptions,
     clock: Clock,
 ) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
     """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
 
-    `located` says which of the placement's cameras are kept, and where those are in the output's units.
+    `kept` says which of the placement's cameras are in the model, `gauge` where those are in its units.
     """
     adjusted = None
+    located = kept, gauge.similarity.apply(placement.locations[kept])
     with clock("structure"):
         seed, tracks = _seed_and_tracks(source, placement, located, clock.advance)
         if not options.bundle_adjust:  # which triangulates at the seed's poses itself
@@ -54,7 +56,7 @@ def seeded_model(
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
             seeded = colored(seeded, source.model.reconstruction)
-    return seeded, adjusted
+    return seeded if gauge.axes is None else turned(seeded, gauge.axes), adjusted
 
 
 def further_pieces(
@@ -68,10 +70,8 @@ def further_pieces(
     found = []
     for placed in place_further(placement, options.for_placement(), joint.covariance, evidence):
         kept = trusted(placed, options.min_trust)
-        locations = placed.locations[kept]
-        gauge = choose_gauge(locations, np.zeros_like(locations), "unit")
-        located = kept, gauge.similarity.apply(locations)
-        seeded, _ = seeded_model(source, placed, located, options, Clock())
+        gauge = unit_gauge(placed.locations[kept])
+        seeded, _ = seeded_model(source, placed, kept, gauge, options, Clock())
         found.append(
             FurtherPiece(
                 placement=placed,
