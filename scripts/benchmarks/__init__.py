@@ -11,6 +11,7 @@
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
     trust.py     subcommand `trust`: standard deviations and trust against errors
+    onedsfm.py   subcommand `onedsfm`: the published scene Madrid Metropolis
     peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
     graph_peers.py    ... on bare graphs
     real_peers.py     ... on real scenes
