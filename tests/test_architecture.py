@@ -36,17 +36,22 @@ LAYERS = [
     "diagnosis",
     "options",
     "report",
+    "visual",
     "results",
     "pipeline",
+    "mapping",
     "cli",
 ]
 
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
-    "cv2": {"synthetic/scenes.py"},
+    "cv2": {"synthetic"},
+    "trimesh": {"synthetic/surfaces.py", "visual/mesh.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
+    "plotly": {"visual/report_page.py"},
+    "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

@@ -2,23 +2,34 @@
 
     minimise  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
 
-from a spanning tree, by an L1 phase and iteratively reweighted least squares (Geman-McClure). Pairs beyond
+from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs beyond
 `max_error_deg` of the result are left out and what stays connected is averaged once more, as pycolmap's
 global mapper does; cameras outside that component have no rotation.
 
 Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in GLOMAP.
 """
 
+import ctypes
+import os
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.adjustment import quiet_stderr
 from sfm_shapefit.errors import InputError, UnsolvableError
 
+Loss = Literal["geman-mcclure", "half-norm"]
+
+_LOSSES = {
+    "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,
+    "half-norm": pycolmap.RotationWeightType.HALF_NORM,
+}
 _MAX_ERROR_DEG = 10.0  # pycolmap's own default
 _CAMERA_ID = 1
 
@@ -29,6 +40,8 @@ def average_rotations(
     rotations: FloatArray,
     weights: npt.ArrayLike | None = None,
     *,
+    loss: Loss = "geman-mcclure",
+    count_matches: bool = True,
     max_error_deg: float = _MAX_ERROR_DEG,
     seed: int = 0,
 ) -> tuple[FloatArray, BoolArray]:
@@ -38,7 +51,11 @@ def average_rotations(
         num_images: n.
         pairs: (k, 2) images (i, j), i != j, each pair once.
         rotations: (k, 3, 3) cam_j_from_cam_i.
-        weights: (k,) numbers of matches, rounded; pairs count in proportion. All alike if None.
+        weights: (k,) numbers of matches, rounded; the spanning tree takes pairs of many, and they count in
+            proportion. All alike if None.
+        loss: of the residual angles; "half-norm" (their square root) is finer, but fails more often.
+        count_matches: False leaves the weights to the spanning tree alone: a few false pairs of many matches
+            then do less harm.
         max_error_deg: pairs that are farther off after the first averaging are left out of the second.
         seed: of pycolmap's random draws.
 
@@ -59,9 +76,10 @@ def average_rotations(
     options = pycolmap.RotationEstimatorOptions()
     options.random_seed = seed
     options.max_rotation_error_deg = max_error_deg
-    if weights is not None:
+    options.weight_type = _LOSSES[loss]
+    if weights is not None and count_matches:
         options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
-    with _quiet():
+    with quiet_stderr(), _quiet_stdout():
         for again in (False, True):
             options.filter_unregistered = again
             if not pycolmap.run_rotation_averaging(options, graph, model, []):
@@ -105,11 +123,26 @@ def _unposed_model(num_images: int) -> pycolmap.Reconstruction:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep pycolmap's messages off stderr while the block runs."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
+def _quiet_stdout() -> Iterator[None]:
+    """Send file descriptor 1 to nowhere: CHOLMOD prints its warnings there, into the C library's buffer."""
+    flush = getattr(ctypes.CDLL(None), "fflush", None) if os.name == "posix" else None
+    if flush is None:
+        yield
+        return
+    if sys.stdout is not None:
+        sys.stdout.flush()
+    flush(None)
     try:
+        saved = os.dup(1)
+    except OSError:  # there is no stdout
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
         yield
     finally:
-        pycolmap.logging.minloglevel = level
+        flush(None)
+        os.dup2(saved, 1)
+        os.close(saved)
+        os.close(nowhere)

@@ -2,6 +2,7 @@
 
 from sfm_shapefit.formats.g2o import g2o_text
 from sfm_shapefit.formats.graph_text import graph_text, read_graph
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.formats.onedsfm import (
     EpipolarGeometries,
     is_onedsfm,
@@ -19,4 +20,5 @@ __all__ = [
     "read_graph",
     "read_onedsfm",
     "read_rotations",
+    "refuse_irregular_file",
 ]
