@@ -7,7 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, peers, real, rigs, scale, solver, trust
+from benchmarks import coherent, directions, families, onedsfm, peers, real, rigs, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
@@ -15,6 +15,7 @@ SUBCOMMANDS = {
     "scale": scale,
     "graphs": families,
     "peers": peers,
+    "onedsfm": onedsfm,
     "directions": directions,
     "trust": trust,
     "coherent": coherent,

@@ -12,6 +12,7 @@
     scale.py     subcommand `scale`: large graphs as they grow
     rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
     trust.py     subcommand `trust`: standard deviations and trust against errors
+    onedsfm.py   subcommand `onedsfm`: the published scene Madrid Metropolis
     peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
     graph_peers.py    ... on bare graphs
     real_peers.py     ... on real scenes
