@@ -47,6 +47,7 @@ _AGREEING_SIGMAS = 5.0
 _MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
 _PRIOR = 30.0  # matches, half of them for the camera in a clean scene
+_LEAST_MEDIAN = 0.5
 _MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
 _UNKNOWN_SUPPORT = 50.0  # of a pair that does not say
 _USUAL_SHARE = 0.75  # of the median agreement of all cameras: a camera with that much loses nothing
@@ -205,6 +206,7 @@ def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
     good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
     spoken = heard > 0.0
     median = float(np.median(good[spoken] / heard[spoken])) if spoken.any() else 1.0
+    median = max(median, _LEAST_MEDIAN)  # a collapsed answer, with which hardly anything agrees
     return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
 
 
