@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from benchmarks import coherent, directions, families, peers, real, scale, solver, trust
+from benchmarks import map as mapping
 
 SUBCOMMANDS = {
     "real": real,
@@ -18,6 +19,7 @@ SUBCOMMANDS = {
     "directions": directions,
     "trust": trust,
     "coherent": coherent,
+    "map": mapping,
 }
 
 

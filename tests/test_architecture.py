@@ -39,6 +39,7 @@ LAYERS = [
     "results",
     "pipeline",
     "mapping",
+    "conversion",
     "cli",
 ]
 

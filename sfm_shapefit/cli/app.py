@@ -8,7 +8,7 @@ from typer.core import TyperGroup
 
 from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination
 
-_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "synth")
+_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "convert", "synth")
 """Of the commands in the help, by importance."""
 
 

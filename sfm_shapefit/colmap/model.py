@@ -21,8 +21,10 @@ import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.colmap.check import check_model_files, model_suffix
+from sfm_shapefit.colmap.foreign import reconstruction_of
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -65,7 +67,8 @@ def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified.
+            3.12 on, rigs and frames; or a reconstruction, which is not modified; or a model file of Bundler,
+            openMVG or OpenSfM.
         poses_only: the poses are read to be compared, and no camera will be moved: rigs with several
             sensors are accepted.
 
@@ -75,6 +78,9 @@ def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool
     """
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
+        is_checked = False
+    elif is_model_file(source):
+        label, reconstruction = str(source), reconstruction_of(read_scene(source), source)
         is_checked = False
     else:
         folder = Path(source)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import DirectionStatus
 from sfm_shapefit.errors import InputError
@@ -39,7 +40,7 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = options or LocateOptions()
-    if isinstance(source, Path | str) and Path(source).is_file():
+    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         return _inspect_graph(Path(source), options, theory=theory)

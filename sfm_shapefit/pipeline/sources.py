@@ -61,7 +61,8 @@ def choose_inputs(
         return Inputs(
             folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
         )
-    path = Path(database) if database is not None else folder and find_database(folder)
+    is_folder = folder is not None and not folder.is_file()  # pixels of other programs' models may differ
+    path = Path(database) if database is not None else folder and is_folder and find_database(folder) or None
     if path is None:
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one with --database")
