@@ -56,7 +56,7 @@ def convert(
         The format that was written.
 
     Raises:
-        InputError: if the source cannot be read, the format cannot hold it, or the target exists or is unknown.
+        InputError: if the source cannot be read, the format cannot hold it, or the target exists already.
     """
     path = Path(target)
     if target_format is None:

@@ -23,8 +23,8 @@ def convert_command(
         str | None,
         typer.Option(
             "--format",
-            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory) or csv; by default "
-            "that of OUT's suffix: none, .json, .tum or .txt, .csv.",
+            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory) or csv; by "
+            "default that of OUT's suffix: none, .json, .tum or .txt, .csv.",
         ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,

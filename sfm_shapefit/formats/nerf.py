@@ -76,8 +76,10 @@ def _intrinsics(camera: SceneCamera) -> dict[str, Any]:
     focal = camera.params[:1] * 2 if camera.model in _ONE_FOCAL else camera.params[:2]
     rest = camera.params[1:] if camera.model in _ONE_FOCAL else camera.params[2:]
     distortion = dict(zip(keys, rest[2:], strict=True))
-    if any([distortion.pop(key) for key in _DENOMINATOR if camera.model == "FULL_OPENCV"]):
-        raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
+    if camera.model == "FULL_OPENCV":
+        denominator = [distortion.pop(key) for key in _DENOMINATOR]
+        if any(denominator):
+            raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
     return {
         "camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV",
         "fl_x": focal[0],

@@ -73,6 +73,7 @@ def solve_graph_file(
             found = _rotations(geometries, rotations)
         graph, statement = _consistent(geometries, found, max_rotation_error_deg)
     else:
+        assert isinstance(path, Path | str)
         if rotations is not None:
             raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
         with clock("read"):

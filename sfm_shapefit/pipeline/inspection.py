@@ -4,11 +4,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import DirectionStatus
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
+from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.measurement import evidence_of, joint_graph, measure_directions, view_graph
