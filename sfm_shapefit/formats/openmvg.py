@@ -1,6 +1,7 @@
 """openMVG's sfm_data.json: read.
 
-    views        [{key, value: {ptr_wrapper: {data: {filename, width, height, id_view, id_intrinsic, id_pose}}}}]
+    views        [{key, value: {ptr_wrapper: {data: {filename, width, height,
+                   id_view, id_intrinsic, id_pose}}}}]
     intrinsics   [{key, value: {polymorphic_name, ptr_wrapper: {data: {width, height, focal_length,
                    principal_point, disto_k1 | disto_k3 | disto_t2 | fisheye}}}}]
     extrinsics   [{key, value: {rotation: 3 rows, center: [3]}}]
