@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from benchmarks import coherent, directions, families, onedsfm, peers, real, rigs, scale, solver, trust
+from benchmarks import map as mapping
 
 SUBCOMMANDS = {
     "real": real,
@@ -20,6 +21,7 @@ SUBCOMMANDS = {
     "trust": trust,
     "coherent": coherent,
     "rigs": rigs,
+    "map": mapping,
 }
 
 

@@ -43,6 +43,7 @@ LAYERS = [
     "pipeline",
     "synthetic/fixtures",
     "mapping",
+    "conversion",
     "cli",
 ]
 

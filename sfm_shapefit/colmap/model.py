@@ -24,8 +24,10 @@ import pycolmap
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.colmap.check import check_model_files, model_suffix
+from sfm_shapefit.colmap.foreign import reconstruction_of
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -83,7 +85,8 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified.
+            3.12 on, rigs and frames; or a reconstruction, which is not modified; or a model file of Bundler,
+            openMVG or OpenSfM.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
@@ -92,6 +95,9 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     """
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
+        is_checked = False
+    elif is_model_file(source):
+        label, reconstruction = str(source), reconstruction_of(read_scene(source), source)
         is_checked = False
     else:
         folder = Path(source)

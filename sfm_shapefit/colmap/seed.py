@@ -88,8 +88,8 @@ def turned(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolma
     return copy
 
 
-def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary format into an existing folder, and walk the files once more.
+def write_model(reconstruction: pycolmap.Reconstruction, folder: Path, *, text: bool = False) -> None:
+    """Write a model in COLMAP's binary or text format into an existing folder, and walk the files once more.
 
     pycolmap does not notice a disk that is full, hence the second look.
 
@@ -97,7 +97,10 @@ def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
         InputError: if the files cannot be written, or are not complete afterwards.
     """
     try:
-        reconstruction.write_binary(folder)
+        if text:
+            reconstruction.write_text(folder)
+        else:
+            reconstruction.write_binary(folder)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{folder} cannot be written; check its permissions and the free space") from error
     try:
