@@ -153,7 +153,8 @@ def _contradictions(scene: Scene) -> Iterator[Hint]:
         first, second = (shortened(scene.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
         matches = f" with {pairs.support[row]:,} matches" if pairs.support[row] else ""
         yield Hint(
-            text=f"{first} to {second}{matches} contradicts the solution by {pairs.residuals_deg[row]:.3g} degrees",
+            text=f"{first} to {second}{matches} contradicts the solution "
+            f"by {pairs.residuals_deg[row]:.3g} degrees",
             pair=row,
         )
 

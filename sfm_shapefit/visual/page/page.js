@@ -209,7 +209,7 @@
     const size = placedCameras.length > 2000 ? 2.5 : 4;
     addLayer("cameras", `Cameras (${count(placedCameras.length)})`, null, true, [
       trace({
-        x: frusta.x, y: frusta.y, z: frusta.z, customdata: frusta.camera, kind: "camera", hoverinfo: "skip",
+        x: frusta.x, y: frusta.y, z: frusta.z, customdata: frusta.camera, kind: "camera",
         line: { color: frusta.camera.map((k) => trustColors[k]), colorscale: RAMP, cmin: 0, cmax: 1, width: 2 },
       }),
       trace({
@@ -249,7 +249,7 @@
     }
     for (const mode of ["lines", "markers"]) {
       traces.push(trace({
-        ...nothing(), mode, kind: "selection", hoverinfo: "skip",
+        ...nothing(), mode, kind: "selection",
         line: { color: color("--chosen"), width: 6 },
         marker: { size: 9, symbol: "circle-open", color: color("--chosen"), line: { width: 2, color: color("--chosen") } },
       }));
@@ -307,7 +307,10 @@
   const customOf = (event) => {
     const point = event.points[0];
     const source = traces[point.curveNumber];
-    if (!source || !source.kind || !source.customdata) return null;
+    if (!source || !source.kind) return null;
+    if (source.kind === "selection") { // it lies over what it marks
+      return source.mode === "markers" ? ["camera", placedEnds(selected)[point.pointNumber]] : selected;
+    }
     return [source.kind, source.customdata[point.pointNumber]];
   };
   const listen = (target, find) => {
@@ -347,7 +350,8 @@
 
   // --- selection ------------------------------------------------------------------------------------
 
-  let selected = null;
+  let selected = null; // "camera" or "pair", and its row
+  const placedEnds = ([kind, k]) => (kind === "camera" ? [k] : [pairs.first[k], pairs.second[k]]).filter(isPlaced);
   const select = (kind, k, scroll = false, turn = false) => {
     selected = [kind, k];
     plot.dataset.selected = `${kind}:${k}`;
@@ -361,7 +365,7 @@
   const highlight = (centred) => {
     if (!plot.data) return;
     const [kind, k] = selected;
-    const ends = (kind === "camera" ? [k] : [pairs.first[k], pairs.second[k]]).filter(isPlaced);
+    const ends = placedEnds(selected);
     const lines = frustumLines(ends);
     if (kind === "pair" && ends.length === 2) {
       const baseline = pairLines([k]);
