@@ -61,7 +61,8 @@ def test_a_click_on_a_row_highlights_and_centres_its_camera(driver, report):
 def test_a_click_in_the_scene_leads_to_the_row(driver, report):
     # Plotly's own event, as a click on the marker of a camera that the table's first page does not show.
     driver.execute_script(
-        "const plot = document.getElementById('scene'); const at = plot.data.findIndex((t) => t.mode === 'markers');"
+        "const plot = document.getElementById('scene');"
+        "const at = plot.data.findIndex((trace) => trace.mode === 'markers');"
         "plot.emit('plotly_click', {points: [{curveNumber: at, pointNumber: 20}]});"
     )
     k = int(driver.execute_script(SELECTED).removeprefix("camera:"))
@@ -150,9 +151,8 @@ def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
     opened(driver, tmp_path / "report.html")
     for row in range(len(HOSTILE)):
         driver.execute_script(f"document.querySelectorAll('#cameras tbody tr')[{row}].click()")
-        driver.execute_script(
-            f"document.getElementById('trust').emit('plotly_hover', {{points: [{{pointNumber: {min(row, 6)}}}]}})"
-        )
+        point = f"{{points: [{{pointNumber: {min(row, 6)}}}]}}"
+        driver.execute_script(f"document.getElementById('trust').emit('plotly_hover', {point})")
     assert "owned" not in driver.title.replace(HOSTILE[0], "")
     made = "return document.querySelectorAll('main img, main b:not(.tile b), main a').length"
     assert driver.execute_script(made) == 0

@@ -39,7 +39,7 @@ def view_command(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port to listen on.")] = 8080,
 ) -> None:
-    """Explore OUT in the browser: move thresholds, pick cameras, see the input's poses beside the new ones."""
+    """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
     folder = one_path(out, None, "OUT")
     with reported():
         from sfm_shapefit.visual.sources import read_output
