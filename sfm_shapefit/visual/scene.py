@@ -343,9 +343,9 @@ def _frustum_depth(positions: FloatArray) -> float:
     """Return how deep frusta are drawn: well below the distance between neighbours."""
     if len(positions) < 2:
         return 1.0
-    low, high = np.asarray(np.quantile(positions, [0.05, 0.95], axis=0))
+    low, high = np.quantile(positions, [0.05, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
-    distances, _ = cKDTree(positions).query(positions, k=2)
+    distances = np.asarray(cKDTree(positions).query(positions, k=2)[0])
     smallest, largest = _FRUSTUM_OF_EXTENT
     wanted = _FRUSTUM_SHARE * float(np.median(distances[:, 1]))
     return float(np.clip(wanted, smallest * extent, largest * extent))
