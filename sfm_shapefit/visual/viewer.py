@@ -4,6 +4,8 @@ Everything is shown around the median of the cameras, because the viewer compute
 as plain labels of its controls, shortened; never as markup.
 """
 
+import io
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -81,7 +83,8 @@ def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.V
         import viser
     except ImportError as error:
         raise InputError("the viewer needs viser; pip install 'sfm_shapefit[viewer]'") from error
-    server = viser.ViserServer(host=host, port=port, verbose=False)
+    with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction(tuple(scene.axes[2].tolist()))
     _View(server, scene, facts)
     return server

@@ -328,6 +328,17 @@
     });
     target.addEventListener("mouseleave", hideTooltip);
   };
+  // Plotly sees a click in 3D only if the button is still down when it draws next, and misses quick ones.
+  const listenToPresses = () => {
+    let [under, pressed] = [null, null];
+    plot.on("plotly_hover", (event) => { under = customOf(event); });
+    plot.on("plotly_unhover", () => { under = null; });
+    plot.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
+    plot.addEventListener("pointerup", (event) => {
+      const still = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 4;
+      if (still && under && event.button === 0) select(under[0], under[1], false, true);
+    }, true);
+  };
   const CONFIG = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["tableRotation", "resetCameraLastSave3d", "hoverClosest3d", "select2d", "lasso2d", "autoScale2d"] };
   const hasWebgl = () => {
     try {
@@ -346,6 +357,7 @@
     drawLayerControls();
     await Plotly.newPlot(plot, traces, sceneLayout(), CONFIG);
     listen(plot, customOf);
+    listenToPresses();
   };
 
   // --- selection ------------------------------------------------------------------------------------
