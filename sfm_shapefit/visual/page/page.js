@@ -231,7 +231,7 @@
       const shown = code === 3 ? false : pairsOf[code].length <= MANY_PAIRS;
       addLayer(verdict, `Pairs: ${verdict} (${count(pairsOf[code].length)})`, VARIABLES[code], shown, [trace({
         x: lines.x, y: lines.y, z: lines.z, customdata: lines.pair, kind: "pair",
-        opacity: code === 0 ? Math.max(Math.min(60 / Math.sqrt(pairsOf[code].length + 1), 40) / 100, 0.12) : 0.75,
+        opacity: code === 0 ? Math.max(Math.min(6 / Math.sqrt(pairsOf[code].length + 1), 0.6), 0.15) : 0.75,
         line: { color: color(VARIABLES[code]), width: code === 0 ? 1.5 : 2 },
       })]);
     });
@@ -396,7 +396,7 @@
       const keep = kind === "camera" ? 0.7 : 0.85; // of the distance, down to a limit
       const offset = ["x", "y", "z"].map((c) => view.eye[c] - view.center[c]);
       const distance = Math.hypot(...offset);
-      const wanted = Math.min(distance, Math.max(distance * keep, 0.9 * Math.max(reach, 0.15)));
+      const wanted = Math.min(distance, Math.max(distance * keep, 1.3 * Math.max(reach, 0.15)));
       const [x, y, z] = offset.map((v, c) => middle[c] + (v * wanted) / distance);
       layout["scene.camera"] = { up: view.up, center: { x: middle[0], y: middle[1], z: middle[2] }, eye: { x, y, z } };
     }
@@ -669,7 +669,7 @@
     const { iterations, objectives, bounds } = data.convergence;
     const made = [{ type: "scatter", mode: "lines+markers", name: "objective", x: iterations, y: objectives, line: { color: color("--agrees"), width: 2 }, marker: { size: 5 }, hoverinfo: "none" }];
     if (bounds.some((b) => b !== null)) {
-      made.push({ type: "scatter", mode: "lines+markers", name: "lower bound", x: iterations, y: bounds, line: { color: color("--contradicts"), width: 2, dash: "dot" }, marker: { size: 5 }, hoverinfo: "none" });
+      made.push({ type: "scatter", mode: "lines+markers", name: "lower bound", x: iterations, y: bounds, line: { color: color("--undetermined"), width: 2, dash: "dot" }, marker: { size: 5 }, hoverinfo: "none" });
     }
     return [made, layout({ xaxis: { title: title("iteration") }, yaxis: { title: title("objective"), ...(data.convergence.range ? { range: data.convergence.range } : {}) } })];
   }, (event) => {
@@ -715,7 +715,7 @@
     const body = table.createTBody();
     data.pieces.forEach((piece) => {
       const row = body.insertRow();
-      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none", "name"), element("td", piece.scale, "name"), element("td", piece.folder === "." ? "this folder" : piece.folder || "not written"));
+      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none"), element("td", piece.scale), element("td", piece.folder === "." ? "this folder" : piece.folder || "not written"));
     });
     const scroll = element("div", "", "scroll");
     scroll.append(table);
