@@ -7,15 +7,14 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, graph_peers, real, real_peers, scale, solver, trust
+from benchmarks import coherent, directions, families, peers, real, scale, solver, trust
 
 SUBCOMMANDS = {
     "real": real,
     "solver": solver,
     "scale": scale,
     "graphs": families,
-    "peers-graphs": graph_peers,
-    "peers-real": real_peers,
+    "peers": peers,
     "directions": directions,
     "trust": trust,
     "coherent": coherent,

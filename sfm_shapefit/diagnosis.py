@@ -333,6 +333,13 @@ def _in_triangle(graph: ViewGraph) -> BoolArray:
 
 def _plan(piece: ViewGraph, options: PlacementOptions) -> Plan:
     """Return what a placement would do with the largest piece."""
+    if not options.solves_shapefit:
+        return Plan(
+            solver=options.objective,
+            solver_reason="as asked; ShapeFit is not solved, so nothing is certified",
+            second_start=False,
+            finish="the baseline's answer is kept as it is",
+        )
     choice = choose_method(piece, options)
     second = has_second_start(piece)
     if options.objective == "shapefit":

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
 from sfm_shapefit.gauge import Scale
-from sfm_shapefit.robust.options import Objective
+from sfm_shapefit.robust.options import Filter, Objective
 from sfm_shapefit.solver.options import Method
 
 if TYPE_CHECKING:
@@ -32,11 +32,15 @@ class LocateOptions:
     solver: Method = "auto"
     """The ShapeFit solver; "auto" picks one and says which."""
     objective: Objective = "auto"
-    """Which start the cameras come from. ShapeFit is solved and certified always. "auto" solves LUD
-    too, which does not collapse on long chains, refines both and keeps the one that fits the angles
-    better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit."""
+    """Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which does not
+    collapse on long chains, refines both and keeps the one that fits the angles better; "shapefit" is the
+    certified answer itself, unrefined; "lud" takes LUD whatever its fit. "least-squares" and "linf" are
+    those baselines' own answers, unrefined and without any certificate, for comparison."""
+    filter: Filter = "none"
+    """What drops pairs before anything is solved: "1dsfm", those that contradict the order of the cameras
+    along random axes; "triangles", those that contradict their triangles. Goes with every objective."""
     refine: bool = True
-    """Refine the start robustly in the angles of the directions; never for "shapefit"."""
+    """Refine the start robustly in the angles of the directions; only for "auto" and "lud"."""
     points: Points = "auto"
     """3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what directions
     between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 cameras."""
@@ -77,6 +81,7 @@ class LocateOptions:
             "scale": Scale,
             "solver": Method,
             "objective": Objective,
+            "filter": Filter,
             "points": Points,
         }
         for name, kind in kinds.items():
@@ -146,6 +151,7 @@ class LocateOptions:
             tol=self.tol,
             threads=self.num_threads(),
             objective=self.objective,
+            filter=self.filter,
             refine=self.refine,
         )
 

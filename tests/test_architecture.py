@@ -39,17 +39,18 @@ LAYERS = [
     "visual",
     "results",
     "pipeline",
+    "mapping",
     "cli",
 ]
 
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
-    "cv2": {"synthetic/scenes.py"},
+    "cv2": {"synthetic"},
+    "trimesh": {"synthetic/surfaces.py", "visual/mesh.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
     "plotly": {"visual/report_page.py"},
-    "trimesh": {"visual/mesh.py"},
     "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -84,8 +84,8 @@ def test_a_last_coordinate_of_zero_is_no_weight(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no pairs"),
-        ("# nothing\n\n", "no pairs"),
+        ("", "no lines of the form i j vx vy vz"),
+        ("# nothing\n\n", "no lines of the form"),
         ("0 1 1 0 0\n\n1 2 0 1\n", "line 3: has 4 columns"),
         ("0 1 1 0 0\n1 2 0 x 1\n", "line 2: 'x' is not a number"),
         ("0 1 1 0 0\n1 2 0 nan 1\n", "line 2: has a number that is not finite"),

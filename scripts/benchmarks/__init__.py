@@ -11,7 +11,9 @@
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
     trust.py     subcommand `trust`: standard deviations and trust against errors
-    graph_peers.py    subcommand `peers-graphs`: pytheia and gtsam on bare graphs
+    peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
+    graph_peers.py    ... on bare graphs
+    real_peers.py     ... on real scenes
 
 A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.
 """

@@ -59,20 +59,20 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(LocateOptions, given, config)
         protect = [path for path in (source, database, priors, config) if path is not None]
-        check_output(target, overwrite=overwrite, protect=protect)
+        with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.pipeline import locate
+            from sfm_shapefit.report import dumps
+            from sfm_shapefit.results import summary, write_result
 
-        from sfm_shapefit.pipeline import locate
-        from sfm_shapefit.report import dumps
-        from sfm_shapefit.results import summary, write_result
-
-        catch_termination()
-        with shown_progress(not quiet) as progress:
-            found = locate(source, database, options, progress, priors)
-            write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
+            catch_termination()
+            with shown_progress(not quiet) as progress:
+                found = locate(source, database, options, progress, priors)
+                write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:

@@ -55,14 +55,18 @@ class AdjustmentOptions:
     refine_intrinsics: bool = False
     """Refine focal lengths and distortion too; otherwise intrinsics come out bit-identical."""
     max_iterations: int = 100
-    """Limit of Levenberg-Marquardt steps in each of the three rounds."""
+    """Limit of Levenberg-Marquardt steps in each round."""
+    rounds: int = 3
+    """How many of the three rounds to run; the first alone makes a draft."""
     num_threads: int = 1
     """Threads of the solver. With 1 the result is bit-identical from run to run; with more only nearly."""
     quiet: bool = True
     """Keep the messages of pycolmap and Ceres off stderr; see `quiet_stderr`."""
 
     def __post_init__(self) -> None:
-        for name in ("max_iterations", "num_threads"):
+        if self.rounds > len(_ROUNDS):
+            raise ValueError(f"AdjustmentOptions.rounds must be at most {len(_ROUNDS)}, got {self.rounds}")
+        for name in ("max_iterations", "rounds", "num_threads"):
             if getattr(self, name) < 1:
                 raise ValueError(f"AdjustmentOptions.{name} must be > 0, got {getattr(self, name)}")
 
@@ -110,7 +114,7 @@ def bundle_adjust(
     options = options or AdjustmentOptions()
     start = triangulate(seed, tracks, structure_options)
     current, iterations, converged = start, 0, False
-    for stage in _ROUNDS:
+    for stage in _ROUNDS[: options.rounds]:
         loose = replace(
             structure_options,
             max_reprojection_error_px=stage.widening * structure_options.max_reprojection_error_px,

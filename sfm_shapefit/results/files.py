@@ -10,6 +10,7 @@ from typing import Any
 from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.output import MARKER, atomic_folder
 from sfm_shapefit.report import CameraRow, PairRow, write_json, write_rows
+from sfm_shapefit.results.exports import agreeing_onedsfm, positions_g2o
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
 from sfm_shapefit.results.summary import graph_summary, summary
 from sfm_shapefit.results.values import GraphResult, LocateResult
@@ -51,10 +52,34 @@ def write_result(
 
 
 def write_graph_result(
-    found: GraphResult, out: Path | str, *, overwrite: bool = False, report: bool = True, scene: bool = False
+    found: GraphResult,
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    g2o: bool = False,
+    onedsfm: bool = False,
+    protect: Sequence[Path | str] = (),
+    report: bool = True,
+    scene: bool = False,
 ) -> None:
-    """Write the tables and pictures of a bare graph like `write_result`; there is no model."""
-    with atomic_folder(out, overwrite=overwrite, protect=[found.path]) as folder:
+    """Write the tables and pictures of a bare graph like `write_result`; there is no model.
+
+    Args:
+        found: what `solve_graph_file` returned.
+        out, overwrite, protect, report, scene: see `write_result`.
+        g2o: also write `positions.g2o`, the placed nodes as vertices.
+        onedsfm: also write a folder `1dsfm`: the pairs that agree with the solution, and the placed cameras.
+
+    Raises:
+        InputError: as `write_result`, or if a format has no such dimension.
+    """
+    with atomic_folder(out, overwrite=overwrite, protect=[found.path, *protect]) as folder:
+        if g2o:
+            (folder / "positions.g2o").write_text(positions_g2o(found), encoding="utf-8")
+        if onedsfm:
+            (folder / "1dsfm").mkdir()
+            for name, text in agreeing_onedsfm(found).items():
+                (folder / "1dsfm" / name).write_text(text, encoding="utf-8")
         _write_tables(found, graph_summary(found), folder, report=report, scene=scene)
         for piece in found.further:
             subfolder = folder / folder_of(piece.piece)

@@ -17,6 +17,8 @@ from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.robust.finish import Finish
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
+_QUANTILES = (25, 50, 75, 90)
+_ANGLES_DEG = (1, 2, 5, 10, 30, 90)
 
 
 def summary(found: LocateResult) -> dict[str, Any]:
@@ -41,7 +43,9 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "num_points": found.reconstruction.num_points3D(),
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
+        "num_pairs_filtered": len(placement.dropped),
         "residual_level_deg": placement.assessment.level_deg,
+        "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
         "pieces": [asdict(row) for row in _pieces_of(found)],
@@ -60,14 +64,16 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
     placement = found.placement
     return {
         "schema_version": SCHEMA_VERSION,
-        "inputs": {"graph": str(found.path)},
+        "inputs": {"graph": str(found.path), "directions": found.statement},
         "options": asdict(found.options),
         "dimension": placement.graph.dimension,
         "num_images": placement.graph.num_cameras,
         "num_placed": len(placement.cameras),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
+        "num_pairs_filtered": len(placement.dropped),
         "residual_level_deg": placement.assessment.level_deg,
+        "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "pieces": [
             asdict(row)
@@ -82,6 +88,13 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "warnings": list(quality_warnings(placement)),
         "versions": _versions(),
     }
+
+
+def residuals_deg(placement: Placement) -> dict[str, float]:
+    """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
+    residuals = placement.assessment.residuals_deg[placement.pairs]
+    facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}
+    return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
 
 
 def _pieces_of(found: LocateResult) -> list[PieceRow]:

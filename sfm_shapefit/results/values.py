@@ -10,6 +10,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions import DirectionStatus, PairDirections
+from sfm_shapefit.formats import EpipolarGeometries
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement
@@ -136,13 +137,19 @@ class GraphResult:
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
     path: Path
-    """The graph's file."""
+    """The graph's file or folder."""
+    statement: str
+    """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
     placement: Placement
     further: tuple[Placement, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
+    geometries: EpipolarGeometries | None = None
+    """The relative poses that the directions came from, if it has any."""
+    rotations: FloatArray | None = None
+    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
     @property
     def cameras(self) -> list[CameraRow]:

@@ -26,13 +26,14 @@ from sfm_shapefit.solver.angular import (
     residual_levels,
     robust_cost,
 )
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
 COLLAPSED = 0.3
 """Disagreement of the starts beyond which one of them has collapsed."""
 
+_UNEQUAL = 0.1  # disagreement from which LUD is likely to be the better start
 _LUD_STEPS = 50  # more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # its bound costs about 100 more iterations
 _LUD_PAIRS = 1_000_000  # beyond, the second start takes as long as the first
@@ -67,7 +68,7 @@ class Finish:
     locations: FloatArray
     """(n, d) centred, scaled like the solver's."""
     start: str
-    """The convex program they come from, "ShapeFit" or "LUD"."""
+    """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
     refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -116,7 +117,7 @@ def finish(
 
     Args:
         graph: connected and parallel rigid.
-        solved: its certified ShapeFit solution.
+        solved: its certified ShapeFit solution, or a baseline's answer, which is kept as it is.
         options: which starts, and whether to refine.
         covariance: (m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
             unknown, None where all are.
@@ -124,12 +125,14 @@ def finish(
     """
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     metric = Metric(covariance, classes)
+    if solved.status is Status.NOT_SOLVED:
+        return _as_located(graph, solved, metric)
     lud = _lud_start(graph, classes, options.threads) if has_second_start(graph) else None
-    plan = plan_refinement(graph) if options.refine and options.objective != "shapefit" else None
+    plan = plan_refinement(graph) if options.refines else None
 
     apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
     candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
-    if apart is not None and apart > COLLAPSED:
+    if apart is not None and apart > _UNEQUAL:
         candidates.reverse()  # the likely better one first: the other ends early where it loses
     starts: list[Start] = []
     for name, locations in candidates:
@@ -138,7 +141,7 @@ def finish(
     levels = _common_levels(graph, starts, metric)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     kept, reason = _choose(starts, costs, apart, options)
-    if plan is None and options.refine and options.objective != "shapefit":
+    if plan is None and options.refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _moves(kept)
     certified = kept.name == "ShapeFit" and moved[1] == 0.0  # to the bit
@@ -154,6 +157,25 @@ def finish(
         num_turned_pairs=_turned_pairs(graph, kept, metric, levels),
         num_put_back=kept.put_back,
         lud=lud,
+    )
+
+
+def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:
+    """Return a baseline's answer as it is."""
+    start = Start(name=solved.method, locations=solved.locations, refined=None)
+    levels = _common_levels(graph, [start], metric)
+    return Finish(
+        locations=solved.locations,
+        start=start.name,
+        refined=False,
+        reason="the baseline's own answer, as asked",
+        disagreement=None,
+        costs={start.name: robust_cost(graph, start.locations, metric, levels)},
+        levels_deg=tuple(np.degrees(levels).tolist()),
+        moved=(0.0, 0.0),
+        num_turned_pairs=0,
+        num_put_back=0,
+        lud=None,
     )
 
 
