@@ -416,7 +416,10 @@
     const item = (verdict, text, note, action) => {
       const line = element("li");
       const dot = element("span", "", "dot");
-      if (verdict !== null) dot.style.background = `var(${VARIABLES[verdict]})`;
+      if (verdict !== null) {
+        dot.style.background = `var(${VARIABLES[verdict]})`;
+        dot.title = VERDICTS[verdict];
+      }
       const button = element("button", text, "link");
       button.type = "button";
       button.onclick = action;
@@ -552,7 +555,7 @@
     title, value, cell: (k) => element("td", value(k), className),
   });
   const verdictCell = (p) => {
-    const cell = element("td");
+    const cell = element("td", "", "verdict");
     const dot = element("span", "", "dot");
     dot.style.background = `var(${VARIABLES[pairs.verdict[p]]})`;
     cell.append(dot, ` ${VERDICTS[pairs.verdict[p]]}`);
