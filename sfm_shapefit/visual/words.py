@@ -171,4 +171,4 @@ def _unchecked(scene: Scene) -> Iterator[Hint]:
     count = int(np.sum(scene.pairs.classes == PairClass.UNDETERMINED))
     if count:
         what = "1 pair" if count == 1 else f"{count:,} pairs"
-        yield Hint(text=f"{what} cannot be judged: nothing checks it, or its piece is not solved")
+        yield Hint(text=f"{what} cannot be judged: unchecked by others, or in a piece that is not solved")
