@@ -32,6 +32,7 @@ def scene_of_model(found: "LocateResult", cameras: Sequence[CameraRow], pairs: S
         pairs,
         model=found.model,
         original=found.model,
+        turn=found.gauge.axes,
         points=found.reconstruction,
         certified=_certified(found.placement, len(cameras)),
         input_is_aligned=found.gauge.scale == "input",
