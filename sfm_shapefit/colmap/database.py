@@ -240,9 +240,9 @@ class MatchDatabase:
         return np.frombuffer(qvec + tvec, dtype="<f8")
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
-        """Return the matches of the chosen pairs, without repetitions and matches that have no ray."""
+        """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
         keypoints, pair_of = self._read_match_rows(chosen)
-        keypoints, pair_of = _without_repetitions(keypoints, pair_of)
+        keypoints, pair_of = _in_order(keypoints, pair_of)
         bounds = np.searchsorted(pair_of, np.arange(len(chosen) + 1))
         rays = np.empty((2, len(keypoints), 3))
         for k, pair in enumerate(chosen.tolist()):
@@ -563,14 +563,13 @@ def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     return whole and isinstance(data, bytes) and len(data) == rows * cols * itemsize
 
 
-def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Drop all but the first occurrence of each match (M, 2) within its pair; pairs stay in order."""
-    columns = (pair_of, keypoints[:, 0], keypoints[:, 1])
-    order = np.lexsort(columns[::-1])
-    in_order = [column[order] for column in columns]
-    repeated = np.logical_and.reduce([column[1:] == column[:-1] for column in in_order])
-    if not repeated.any():
-        return keypoints, pair_of
-    keep = np.ones(len(keypoints), dtype=np.bool_)
-    keep[order[1:][repeated]] = False  # lexsort is stable: the first of equals comes first
+def _in_order(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Sort the matches (M, 2) within each pair and drop repetitions; pairs stay in order.
+
+    Sums over matches then do not depend on the order in which the database lists them.
+    """
+    order = np.lexsort((keypoints[:, 1], keypoints[:, 0], pair_of))
+    keypoints, pair_of = keypoints[order], pair_of[order]
+    repeated = (pair_of[1:] == pair_of[:-1]) & (keypoints[1:] == keypoints[:-1]).all(axis=1)
+    keep = np.append(True, ~repeated)[: len(pair_of)]
     return keypoints[keep], pair_of[keep]

@@ -39,12 +39,16 @@ _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedModel:
-    """The posed images of a COLMAP model, in ascending order of their ids. Arrays are read-only."""
+    """The posed images of a COLMAP model, in the order of their names. Arrays are read-only.
+
+    Ids are what a program happened to count; names are the user's. So the answer, whose sums depend on the
+    order of images, does not depend on the order in which they were once added.
+    """
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
     image_ids: IntArray
-    """(n,) ascending ids of the images that have a pose."""
+    """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
     """The names of those images, all different."""
     rotations: FloatArray
@@ -213,7 +217,8 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
 
 def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_rigs: bool) -> PosedModel:
     """Collect the posed images of a reconstruction."""
-    image_ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    posed = {i: image.name for i, image in reconstruction.images.items() if image.has_pose}
+    image_ids = sorted(posed, key=lambda i: (posed[i], i))
     if len(image_ids) < 2:
         few = "only one image" if image_ids else "no image"
         raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
