@@ -1,4 +1,4 @@
-"""The same answer, byte by byte: for any number of threads, hash seed and repetition; and for any order of input.
+"""The same answer, byte by byte, for any number of threads, hash seed and repetition, and any order of input.
 
 Reordered input has the same images, matches and points under other ids and in another order: positions must
 agree to 1e-12 of the extent.

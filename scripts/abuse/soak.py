@@ -57,10 +57,11 @@ def soak(base: Path, calls: int, *, show: bool = False) -> list[str]:
     if max(descriptors) != min(descriptors):
         problems.append(f"open files went from {descriptors[0]} to {descriptors[-1]}")
     if show:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
         print(
             f"{calls} calls: resident {sizes[0] / 1e6:.1f} MB at first, {sizes[-1] / 1e6:.1f} MB at last "
             f"(median of quarters grew by {growth / 1e6:.2f} MB), peak "
-            f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3:.0f} MB, {descriptors[-1]} open files, "
+            f"{peak:.0f} MB, {descriptors[-1]} open files, "
             f"{len(answers)} different inputs, each with one answer"
         )
     return problems

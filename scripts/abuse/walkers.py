@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
             (corpus / f"sound-{name}").write_bytes(
                 bytes([k]) + (base / "sparse" / "0" / f"{name}.bin").read_bytes()
             )
-        command = [sys.executable, sys.argv[0], "walkers", "--inside", "--base", str(base)]
+        command = [sys.executable, os.path.abspath(sys.argv[0]), "walkers", "--inside", "--base", str(base)]
         command += ["--seconds", str(args.seconds), "--seed", str(args.seed), "--corpus", str(corpus)]
         return subprocess.run(command, check=False, cwd=temporary).returncode
 
