@@ -65,11 +65,12 @@ def read_graph(path: Path | str) -> ViewGraph:
     if not rows:
         raise InputError(f"{file} has no pairs; give lines of the form: i j vx vy vz [weight]")
     values = _values(file, numbers, rows)
-    directions, weights = _directions_and_weights(values)
+    with np.errstate(over="ignore"):  # a length that overflows is no unit length
+        directions, weights = _directions_and_weights(values)
+        lengths = np.linalg.norm(directions, axis=1)
     ids, nodes = _nodes([word for row in rows for word in row[:2]])
     edges = nodes.reshape(-1, 2)
 
-    lengths = np.linalg.norm(directions, axis=1)
     _refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
     _refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
     _refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")

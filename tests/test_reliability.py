@@ -110,17 +110,16 @@ def test_the_verdict_sees_a_changed_input_and_another_answer(tmp_path):
 
 def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_path):
     out = tmp_path / "out"
-    with claimed_output(out):
-        with atomic_folder(out) as partial:
-            (partial / "locate.json").write_text("first")
-            script = (
-                "import sys\nfrom sfm_shapefit.output import claimed_output\n"
-                f"with claimed_output({str(out)!r}): pass"
-            )
-            second = subprocess.run(
-                [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=ROOT
-            )
-            assert "another run is writing" in second.stderr
+    with claimed_output(out), atomic_folder(out) as partial:
+        (partial / "locate.json").write_text("first")
+        script = (
+            "import sys\nfrom sfm_shapefit.output import claimed_output\n"
+            f"with claimed_output({str(out)!r}): pass"
+        )
+        second = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=ROOT
+        )
+        assert "another run is writing" in second.stderr
     assert (out / "locate.json").read_text() == "first"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -184,7 +183,10 @@ def test_an_empty_folder_that_appears_meanwhile_is_not_replaced(tmp_path, monkey
         return found
 
     monkeypatch.setattr(os.path, "lexists", appearing)
-    with pytest.raises(InputError, match="made by another program meanwhile"), atomic_folder(tmp_path / "out"):
+    with (
+        pytest.raises(InputError, match="made by another program meanwhile"),
+        atomic_folder(tmp_path / "out"),
+    ):
         (tmp_path / ".hit").touch()
     assert list((tmp_path / "out").iterdir()) == []
 
@@ -222,7 +224,9 @@ def test_lack_of_memory_is_one_sentence(capsys, error):
 
 
 def test_an_address_space_too_small_for_the_libraries_is_refused_at_once(tmp_path):
-    command = f"ulimit -v 500000; exec {sys.executable} -m sfm_shapefit.cli locate {RING}/sparse/0 {tmp_path}/out"
+    command = (
+        f"ulimit -v 500000; exec {sys.executable} -m sfm_shapefit.cli locate {RING}/sparse/0 {tmp_path}/out"
+    )
     done = subprocess.run(
         ["bash", "-c", command], capture_output=True, text=True, check=False, cwd=ROOT, timeout=60
     )

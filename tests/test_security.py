@@ -150,9 +150,9 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, 
     for path in (graph, model / "points3D.bin", scene / "database.db"):
         path.unlink(missing_ok=True)
         os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
-    with pytest.raises(InputError, match="graph.txt cannot be read: it is a pipe or a device"):
+    with pytest.raises(InputError, match=r"graph\.txt cannot be read: it is a pipe or a device"):
         read_graph(graph)
-    with pytest.raises(InputError, match=r"points3D.bin cannot be read: it is a pipe or a device"):
+    with pytest.raises(InputError, match=r"points3D\.bin cannot be read: it is a pipe or a device"):
         check_model_files(model)
     with (
         pytest.raises(InputError, match="it is a pipe or a device"),
@@ -178,5 +178,7 @@ def test_the_lock_file_of_ci_pins_every_package_and_names_no_place():
     pinned = {line.split("==")[0].strip().lower().replace("_", "-") for line in pins}
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
-    names = {line.split(">")[0].split("=")[0].split("[")[0].strip().lower().replace("_", "-") for line in wanted}
+    names = {
+        line.split(">")[0].split("=")[0].split("[")[0].strip().lower().replace("_", "-") for line in wanted
+    }
     assert names <= pinned

@@ -15,6 +15,7 @@ to 4.2 (columns that came later, identity or zero poses that mean "none") measur
 """
 
 import os
+import secrets
 import shutil
 import sqlite3
 import struct
@@ -34,6 +35,7 @@ from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.output import locked_folder, remove_abandoned
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
@@ -390,10 +392,13 @@ def _size(path: Path) -> int:
 def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
     files = [path, *(_sidecar(path, suffix) for suffix in _SIDECARS)]
+    parent = Path(tempfile.gettempdir())
+    remove_abandoned(parent, ".shapefit-*.copy")
     for _ in range(_COPY_ATTEMPTS):
         before = _fingerprints(files)
         try:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sfm_shapefit_")))
+            name = f".shapefit-{secrets.token_hex(8)}.copy"
+            folder = stack.enter_context(locked_folder(parent / name))
             for file in filter(Path.exists, files):
                 shutil.copyfile(file, folder / file.name)
         except OSError as error:
@@ -559,8 +564,9 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
 
 def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     """Return whether `data` is a blob of rows x cols items."""
-    whole = isinstance(rows, int) and isinstance(cols, int)
-    return whole and isinstance(data, bytes) and len(data) == rows * cols * itemsize
+    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
+        return False
+    return len(data) == rows * cols * itemsize
 
 
 def _in_order(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:

@@ -31,6 +31,7 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
+_LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
 _QUIET = 3  # glog's FATAL
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalised coordinates are the same numbers.
@@ -234,7 +235,8 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_
     poses = [image.cam_from_world() for image in images]
     rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
-    _refuse_not_finite(label, "the position of image", image_ids, translations)
+    absurd = np.abs(translations) > _LARGEST_COORDINATE
+    _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
     return PosedModel(
         reconstruction=reconstruction,
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
