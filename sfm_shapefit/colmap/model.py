@@ -36,6 +36,7 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
+_LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
 _QUIET = 3  # glog's FATAL
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalised coordinates are the same numbers.
@@ -44,12 +45,16 @@ _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedModel:
-    """The posed images of a COLMAP model, in ascending order of their ids. Arrays are read-only."""
+    """The posed images of a COLMAP model, in the order of their names. Arrays are read-only.
+
+    Ids are what a program happened to count; names are the user's. So the answer, whose sums depend on the
+    order of images, does not depend on the order in which they were once added.
+    """
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
     image_ids: IntArray
-    """(n,) ascending ids of the images that have a pose."""
+    """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
     """The names of those images, all different."""
     rotations: FloatArray
@@ -241,7 +246,8 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
 
 def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedModel:
     """Collect the posed images of a reconstruction."""
-    image_ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    posed = {i: image.name for i, image in reconstruction.images.items() if image.has_pose}
+    image_ids = sorted(posed, key=lambda i: (posed[i], i))
     if len(image_ids) < 2:
         few = "only one image" if image_ids else "no image"
         raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
@@ -257,7 +263,8 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
     poses = [image.cam_from_world() for image in images]
     rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
-    _refuse_not_finite(label, "the position of image", image_ids, translations)
+    absurd = np.abs(translations) > _LARGEST_COORDINATE
+    _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
     return PosedModel(
         reconstruction=reconstruction,
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
