@@ -62,7 +62,10 @@ def place_bodies(
     solved = solve_bodies(piece, part, options)
     finished = finish(piece, solved, options, known, classes, part)
     unit = _checked_unit(piece, part, finished.locations)
-    assessment = assess(piece, finished.locations, known, heard, int(np.sum(nodes < k)), part, still)
+    placed = int(np.sum(nodes < k))
+    assessment = assess(
+        piece, finished.locations, known, heard, placed, part, still, unheld=finished.put_back
+    )
     return Placement(
         graph=graph,
         num_cameras=k,

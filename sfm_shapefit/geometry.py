@@ -96,11 +96,12 @@ def fit_similarity(
 def median_spread(points: FloatArray) -> float:
     """Return the median distance of points (n, d) from their coordinate-wise median.
 
-    Where more than half of the points coincide it is the largest distance instead; 0 only if all coincide.
+    Where more than half of the points coincide, to rounding, it is the largest distance instead; 0 only if all
+    coincide. Distances of a few points that are 1e14 times as large do not matter.
     """
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     median, largest = float(np.median(distances)), float(distances.max())
-    return median if median > 1e-12 * largest else largest
+    return median if median > _ROUNDING * largest else largest
 
 
 def fit_similarity_l1(

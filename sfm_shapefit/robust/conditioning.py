@@ -9,6 +9,7 @@ all of these. Here its loose cameras are put into groups that move together, wit
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
     on a line   the group lies on a line, along which nothing fixes their spacing
     together    each camera is held well by its neighbours, the group is not held by the rest
+    distance    nothing holds it at any distance: the refinement had thrown it out of the scene
 """
 
 import enum
@@ -37,6 +38,7 @@ class Looseness(enum.Enum):
     FEW_PAIRS = "two agreeing pairs or fewer hold it"
     PARALLEL = "the directions of its agreeing pairs are nearly parallel"
     ON_A_LINE = "it stands on a straight stretch, along which nothing fixes the spacing"
+    DISTANCE = "its directions leave its distance open"
     TOGETHER = "it moves with its neighbours, which the rest does not hold"
 
 
@@ -68,7 +70,12 @@ class Conditioning:
 
 
 def condition(
-    locations: FloatArray, edges: IntArray, inliers: BoolArray, sigmas: FloatArray, num_cameras: int
+    locations: FloatArray,
+    edges: IntArray,
+    inliers: BoolArray,
+    sigmas: FloatArray,
+    num_cameras: int,
+    unheld: IntArray | None = None,
 ) -> Conditioning:
     """Find the cameras that the pairs leave loose at the solution, and why.
 
@@ -78,8 +85,10 @@ def condition(
         inliers: (m,) pairs that agree with the solution.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
         num_cameras: k; nodes beyond are points.
+        unheld: nodes whose distance is known to be open, with infinite standard deviations; none if None.
     """
     n = len(locations)
+    is_unheld = np.isin(np.arange(n), [] if unheld is None else unheld)
     used = edges[inliers]
     num_pairs = np.bincount(used.ravel(), minlength=n)
     narrowness = _narrowness(locations, used)
@@ -96,6 +105,8 @@ def condition(
         if _is_straight(locations[members]):
             for camera in members.tolist():
                 causes[camera] = Looseness.ON_A_LINE
+        for camera in members[is_unheld[members]].tolist():
+            causes[camera] = Looseness.DISTANCE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
         groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
     return Conditioning(

@@ -16,7 +16,7 @@ from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.robust.strays import left_scene, put_back, strays
+from sfm_shapefit.robust.strays import put_back, strays
 from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
 from sfm_shapefit.solver.angular import (
     AngularResult,
@@ -54,8 +54,8 @@ class Start:
     """(n, d) as solved."""
     refined: AngularResult | None
     """None where it was not refined."""
-    put_back: int = 0
-    """Nodes that the refinement threw out of the scene, and that are where the start had them instead."""
+    put_back: IntArray
+    """Nodes that the refinement threw out of the scene, and that are where the home had them instead."""
 
     @property
     def best(self) -> FloatArray:
@@ -86,10 +86,16 @@ class Finish:
     centre."""
     num_turned_pairs: int
     """Pairs that fit the start and not the refined locations, or the other way round, at `levels_deg`."""
-    num_put_back: int
-    """Nodes that the refinement threw out of the scene; they are where the start had them instead."""
+    put_back: IntArray
+    """Nodes that the refinement threw out of the scene, ascending; they are where LUD, or else the start, had
+    them instead, and nothing says that they belong there."""
     lud: LudResult | None
     """The second start, with its own dual bound (0 where that was not computed)."""
+
+    @property
+    def num_put_back(self) -> int:
+        """How many nodes the refinement threw out of the scene."""
+        return len(self.put_back)
 
     @property
     def collapsed(self) -> bool:
@@ -142,7 +148,8 @@ def finish(
     starts: list[Start] = []
     for name, locations in candidates:
         rival = starts[0].best if starts else None
-        starts.append(_refined(name, locations, graph, metric, plan, rival))
+        home = locations if second is None else second
+        starts.append(_refined(name, locations, home, graph, metric, plan, rival))
     levels = _common_levels(graph, starts, metric)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
     kept, reason = _choose(starts, costs, apart, options)
@@ -160,7 +167,7 @@ def finish(
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=moved,
         num_turned_pairs=_turned_pairs(graph, kept, metric, levels),
-        num_put_back=kept.put_back,
+        put_back=kept.put_back,
         lud=lud,
     )
 
@@ -194,7 +201,7 @@ def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_
 
 def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:
     """Return a baseline's answer as it is."""
-    start = Start(name=solved.method, locations=solved.locations, refined=None)
+    start = _unrefined(solved.method, solved.locations)
     levels = _common_levels(graph, [start], metric)
     return Finish(
         locations=solved.locations,
@@ -206,7 +213,7 @@ def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finis
         levels_deg=tuple(np.degrees(levels).tolist()),
         moved=(0.0, 0.0),
         num_turned_pairs=0,
-        num_put_back=0,
+        put_back=start.put_back,
         lud=None,
     )
 
@@ -242,47 +249,63 @@ def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult |
     return found if usable else None
 
 
+def _unrefined(name: str, locations: FloatArray) -> Start:
+    """Return a start as it was solved."""
+    return Start(name=name, locations=locations, refined=None, put_back=np.empty(0, dtype=np.int64))
+
+
 def _refined(
     name: str,
     locations: FloatArray,
+    home: FloatArray,
     graph: ViewGraph,
     metric: Metric,
     plan: SymbolicFactor | ReducedFactor | None,
     rival: FloatArray | None,
 ) -> Start:
-    """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
+    """Return a start with what the refinement makes of it; nothing, if that turns all directions round.
+
+    `home` are the locations among which nodes are put back that the refinement throws out.
+    """
     if plan is None:
-        return Start(name=name, locations=locations, refined=None)
+        return _unrefined(name, locations)
     refined = refine_angles(graph, locations, metric, plan, rival)
     alone = np.ones(graph.num_cameras, dtype=np.bool_)
     if isinstance(plan, ReducedFactor):
         alone = np.bincount(plan.bodies.body_of)[plan.bodies.body_of] == 1
-    refined, num_strays = _without_strays(graph, locations, refined, metric, alone)
+    refined, nodes = _without_strays(graph, home, refined, metric, alone)
     if projected_length(graph, refined.locations) <= 0.0:
-        return Start(name=name, locations=locations, refined=None)
-    return Start(name=name, locations=locations, refined=refined, put_back=num_strays)
+        return _unrefined(name, locations)
+    return Start(name=name, locations=locations, refined=refined, put_back=nodes)
 
 
 def _without_strays(
-    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric, alone: BoolArray
-) -> tuple[AngularResult, int]:
-    """Return a refinement whose strays are put back, and their number; of the start, if that fits better.
+    graph: ViewGraph, home: FloatArray, refined: AngularResult, metric: Metric, alone: BoolArray
+) -> tuple[AngularResult, IntArray]:
+    """Return a refinement whose strays are put back, and these nodes; all of the home, if that fits better.
 
     Only nodes that are a body of their own, `alone`, can be put back one by one.
     """
     levels = refined.levels_rad
-    far = left_scene(start, refined.locations)
-    if not far.any():
-        return refined, 0
-    nodes = strays(graph, far, agreeing_pairs(graph, refined.locations, metric, levels))
+    agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
+    nodes = strays(graph, home, refined.locations, agreeing, _noise(metric, levels))
     nodes = nodes[alone[nodes]]
     if len(nodes) == 0:
-        return refined, 0
-    locations = _unit(put_back(start, refined.locations, nodes))
-    cost, first_cost = (robust_cost(graph, t, metric, levels) for t in (locations, start))
-    if first_cost < cost:
-        return replace(refined, locations=_unit(start), cost=first_cost), 0
-    return replace(refined, locations=locations, cost=cost), len(nodes)
+        return refined, nodes
+    locations = _unit(put_back(home, refined.locations, nodes))
+    cost, home_cost = (robust_cost(graph, t, metric, levels) for t in (locations, home))
+    if home_cost < cost:
+        return replace(refined, locations=_unit(home), cost=home_cost), nodes
+    return replace(refined, locations=locations, cost=cost), nodes
+
+
+def _noise(metric: Metric, levels: FloatArray) -> FloatArray:
+    """Return the standard deviation of each direction (m,), per axis, radians."""
+    variances = levels[metric.classes] ** 2
+    if metric.covariance is not None:
+        own = np.nan_to_num(metric.covariance, nan=0.0, posinf=0.0)
+        variances = variances + np.trace(own, axis1=1, axis2=2) / own.shape[1]
+    return np.asarray(np.sqrt(variances))
 
 
 def _turned_pairs(graph: ViewGraph, kept: Start, metric: Metric, levels: FloatArray) -> int:

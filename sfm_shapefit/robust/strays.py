@@ -2,9 +2,18 @@
 
 A direction says nothing of distance, so that nothing holds a camera which fits two wrong directions by chance
 and whose others are rejected: it may slide to any distance, and does where that improves a residual a little.
-The convex starts have no such freedom. So groups of nodes that end far beyond the start's own radius, and
-whose pairs with others mostly contradict that, go back where the start had them. A far group that the rest
-agrees with stays: it is far.
+LUD, which bounds each length, has no such freedom. So groups of nodes that end far beyond its radius go back
+where it had them, unless the rest holds them there: at least two pairs with the rest agree, more than half do,
+and they leave the distance of the group open by less than a third.
+
+How far a group's distance is open: baseline d_e from a node at offset x_e from the group's middle changes its
+direction by P_e (a + s x_e) / |d_e| if the group moves by a and grows by s, P_e = I - u_e u_e^T. The information
+
+    sum_e J_e^T J_e / sigma_e^2,    J_e = P_e [I, x_e] / |d_e|,
+
+without s (its Schur complement) bounds what is known of a. Nearly parallel baselines leave a open along them,
+and a group that was blown up around the rest leaves its size open, in whatever directions it is seen. A group
+far outside may have others that hang on it farther out: each tenfold radius is looked at by itself.
 """
 
 import numpy as np
@@ -13,32 +22,51 @@ from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _REACH = 3.0  # times the largest distance of the start, both in median distances; a sound fit moves by shares
+_FARTHER = 10.0  # from one radius to the next
 _LEAST_AGREEMENT = 0.5  # of the pairs that leave a group
 _FEWEST_AGREEING = 2  # of them with the rest: along a single direction a group may slide
 _FEWEST_OTHERS = 3  # nodes that say where the start lies
+_OPEN_SHARE = 1.0 / 3.0  # standard deviation of a distance, of itself: three of them reach to the rest
 
 
-def left_scene(start: FloatArray, refined: FloatArray) -> BoolArray:
+def strays(
+    graph: ViewGraph, start: FloatArray, refined: FloatArray, agreeing: BoolArray, noise_rad: FloatArray
+) -> IntArray:
+    """Return the nodes that left the scene and that the rest does not hold where they are, ascending.
+
+    Args:
+        graph: the view graph.
+        start, refined: (n, d) locations before and after; each has its own scale and origin.
+        agreeing: (m,) pairs that fit the refined locations.
+        noise_rad: (m,) standard deviation of each direction, per axis.
+    """
+    found: BoolArray = np.zeros(graph.num_cameras, dtype=np.bool_)
+    reach = _REACH
+    while (far := left_scene(start, refined, reach)).any():
+        found |= _unheld(graph, refined, far, agreeing, noise_rad)
+        reach *= _FARTHER
+    return np.flatnonzero(found).astype(np.int64)
+
+
+def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) -> BoolArray:
     """Return the nodes that ended far outside the start's radius, (n,); scale and origin do not matter.
 
     Args:
         start, refined: (n, d) locations before and after the refinement.
+        reach: how far, in radii of the start.
     """
-    far: BoolArray = _distances(refined) > _REACH * _distances(start).max()
+    far: BoolArray = _distances(refined) > reach * _distances(start).max()
     return far if np.sum(~far) >= _FEWEST_OTHERS else np.zeros_like(far)
 
 
-def strays(graph: ViewGraph, far: BoolArray, agreeing: BoolArray) -> IntArray:
-    """Return the nodes that left the scene without the agreement of the rest, ascending.
-
-    Args:
-        graph: the view graph.
-        far: (n,) those that left it, see `left_scene`.
-        agreeing: (m,) pairs that fit the refined locations.
-    """
+def _unheld(
+    graph: ViewGraph, refined: FloatArray, far: BoolArray, agreeing: BoolArray, noise_rad: FloatArray
+) -> BoolArray:
+    """Return those of the far nodes, (n,), whose group the others do not hold where it is."""
     is_far = far[graph.edges]
     i, j = graph.edges[is_far.all(axis=1) & agreeing].T
     adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_cameras, graph.num_cameras))
@@ -47,9 +75,42 @@ def strays(graph: ViewGraph, far: BoolArray, agreeing: BoolArray) -> IntArray:
     leaving = (ends[:, 0] != ends[:, 1])[:, None] & is_far
     pairs = np.bincount(ends[leaving], minlength=count)
     agreed = np.bincount(ends[leaving & agreeing[:, None]], minlength=count)  # with the rest: else one group
-    enough = (agreed >= _FEWEST_AGREEING) & (agreed > _LEAST_AGREEMENT * pairs)
-    lost = far & ~enough[group]
-    return np.flatnonzero(lost).astype(np.int64)
+    held = (agreed >= _FEWEST_AGREEING) & (agreed > _LEAST_AGREEMENT * pairs)
+    for label in np.unique(group[far & held[group]]).tolist():
+        members = np.flatnonzero(group == label)
+        joining = np.flatnonzero((leaving & (ends == label)).any(axis=1) & agreeing)
+        held[label] = openness(refined, graph.edges[joining], members, noise_rad[joining]) <= _OPEN_SHARE
+    lost: BoolArray = far & ~held[group]
+    return lost
+
+
+def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatArray) -> float:
+    """Return the standard deviation of where a group stands, along its loosest axis, over its distance.
+
+    Args:
+        t: (n, d) locations.
+        edges: (m, 2) at least one pair, each of a node of the group and another.
+        group: the nodes of the group, which moves as a whole and may grow.
+        noise_rad: (m,) standard deviation of each direction, per axis.
+    """
+    d = t.shape[1]
+    baselines = differences(t, edges)
+    lengths = np.maximum(np.linalg.norm(baselines, axis=1), np.finfo(np.float64).tiny)
+    u = baselines / lengths[:, None]
+    distance = float(np.median(lengths))
+    own = np.where(np.isin(edges[:, 0], group), edges[:, 0], edges[:, 1])
+    offsets = (t[own] - t[group].mean(axis=0)) / distance
+    motions = np.concatenate([np.broadcast_to(np.eye(d), (len(u), d, d)), offsets[:, :, None]], axis=2)
+    across = motions - u[:, :, None] * (u[:, None, :] @ motions)
+    scaled = across * (distance / (lengths * noise_rad))[:, None, None]
+    information = np.einsum("eax,eay->xy", scaled, scaled)
+    growth = information[d, d]
+    shift = information[:d, :d]
+    if growth > 0.0:
+        shift = shift - np.outer(information[:d, d], information[d, :d]) / growth
+    least = float(np.linalg.eigvalsh(shift)[0])
+    rounding = 1e-14 * float(np.trace(information))
+    return float("inf") if least <= rounding else least**-0.5
 
 
 def put_back(start: FloatArray, refined: FloatArray, nodes: IntArray) -> FloatArray:

@@ -23,10 +23,10 @@ from functools import partial
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
+from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.robust.body_uncertainty import propagate_bodies
 from sfm_shapefit.robust.conditioning import LooseGroup, condition
@@ -47,6 +47,9 @@ _BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
 _LOOSENING_RAD = 1e-4
 """Noise for which it is asked at least which nodes are loose: with none, none would be."""
+_REACHES = (np.inf, 1e3, 30.0)
+"""Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
+stands beyond the last does not say how large the scene is."""
 _UNCHECKED_LEVERAGE = 0.99
 """Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size."""
 
@@ -102,6 +105,7 @@ def assess(
     num_cameras: int | None = None,
     bodies: Bodies | None = None,
     held: int | None = None,
+    unheld: IntArray | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -115,6 +119,8 @@ def assess(
         num_cameras: k, the first so many nodes are cameras and the others points; all if None.
         bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
         held: the body that stays where it is; the mean of the cameras does if None.
+        unheld: nodes that stand where they do for want of anything better, such as those that the finish put
+            back: their standard deviations are infinite, and they hold no others; none if None.
     """
     freedom = graph.dimension - 1
     k = graph.num_cameras if num_cameras is None else num_cameras
@@ -138,9 +144,11 @@ def assess(
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if errors is None else errors / scale
     propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
-    sigmas, leverages = propagated(graph, locations, inliers, information, k, errors)
+    holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
+    sigmas, leverages = propagated(graph, locations, holding, information, k, errors)
+    leverages[inliers & ~holding] = np.nan
     sigmas = scale * sigmas
-    conditioning = condition(locations, graph.edges, inliers, sigmas, k)
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k, unheld)
     rigid = None if bodies is None else bodies.body_of
     judged = judge_cameras(
         graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
@@ -246,29 +254,45 @@ def _propagated(
 ) -> tuple[FloatArray, FloatArray]:
     """Return the standard deviations (n, d) and the leverages (m,).
 
-    Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
+    Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid. Where
+    baselines of very different lengths make that singular, only its nodes within some radii have any.
     """
-    sigmas = np.full(locations.shape, np.inf)
-    leverages = np.where(inliers, np.nan, 0.0)
-    pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], graph.dimension)
-    rows = np.flatnonzero(inliers)[pieces == 0]
-    held, edges = np.unique(graph.edges[rows], return_inverse=True)
-    cameras = int(np.sum(held < num_cameras))
-    if cameras < _SMALLEST_RIGID:
-        return sigmas, leverages
     unknown = np.full(locations.shape, np.nan), np.where(inliers, np.nan, 0.0)
-    try:
-        samples = None if errors is None else errors[rows]
-        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
-    except UnsolvableError:  # singular in spite of the ridge
-        return unknown
-    if found is None:
-        return unknown
-    extent = np.ptp(locations[held], axis=0).max()
-    is_loose = (found.sigmas > extent).any(axis=1)
-    sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
-    leverages[rows] = found.leverages
-    return sigmas, leverages
+    distances = _distances(locations, num_cameras)
+    for reach in _REACHES:
+        sigmas = np.full(locations.shape, np.inf)
+        leverages = np.where(inliers, np.nan, 0.0)
+        used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
+        rows = used[parallel_rigid_pieces(graph.num_cameras, graph.edges[used], graph.dimension) == 0]
+        held, edges = np.unique(graph.edges[rows], return_inverse=True)
+        cameras = int(np.sum(held < num_cameras))
+        if cameras < _SMALLEST_RIGID:
+            return sigmas, leverages
+        try:
+            samples = None if errors is None else errors[rows]
+            found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
+        except UnsolvableError:  # singular in spite of the ridge
+            continue
+        if found is None:
+            return unknown
+        inside = locations[held[distances[held] <= _REACHES[-1]]]
+        is_loose = (found.sigmas > _extent(inside)).any(axis=1)
+        sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
+        leverages[rows] = found.leverages
+        return sigmas, leverages
+    return unknown
+
+
+def _distances(locations: FloatArray, num_cameras: int) -> FloatArray:
+    """Return the distance of each node (n,) from the cameras' median, in their median distances."""
+    cameras = locations[:num_cameras]
+    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
+    return np.asarray(distances / max(median_spread(cameras), np.finfo(np.float64).tiny))
+
+
+def _extent(locations: FloatArray) -> float:
+    """Return the longest side of the box around locations (n, d); 0 of none."""
+    return float(np.ptp(locations, axis=0).max()) if len(locations) else 0.0
 
 
 def _propagated_over(
