@@ -5,7 +5,7 @@ its own. The largest is the answer; the others are kept apart.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,14 +15,17 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
 from sfm_shapefit.robust.options import Filter, PlacementOptions
+from sfm_shapefit.robust.rival import Rival, find_rival
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import IterationInfo, SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
+_MOST_WATCHED = 100_000
+"""Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,6 +52,10 @@ class Placement:
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    rival: Rival | None = None
+    """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
+    history: tuple[IterationInfo, ...] = ()
+    """The iterations of the solve; empty for graphs so large that watching them would take long."""
 
     @property
     def nodes(self) -> IntArray:
@@ -212,9 +219,15 @@ def _place_piece(
     known = None if covariance is None else covariance[edges]
     classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
     heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
-    solved = solve(piece, options) if options.solves_shapefit else solve_baseline(piece, options.objective)
+    history: list[IterationInfo] = []
+    watch = history.append if piece.num_edges <= _MOST_WATCHED else None
+    solved = (
+        solve(piece, options, watch) if options.solves_shapefit else solve_baseline(piece, options.objective)
+    )
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
+    assessment = assess(piece, finished.locations, known, heard, placed)
+    rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,
         num_cameras=num_cameras,
@@ -223,5 +236,7 @@ def _place_piece(
         piece=k,
         solve=solved,
         finish=finished,
-        assessment=assess(piece, finished.locations, known, heard, placed),
+        assessment=assessment,
+        rival=None if rival is None else replace(rival, cameras=nodes[rival.cameras]),
+        history=tuple(history),
     )

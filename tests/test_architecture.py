@@ -36,6 +36,7 @@ LAYERS = [
     "diagnosis",
     "options",
     "report",
+    "visual",
     "results",
     "pipeline",
     "mapping",
@@ -46,9 +47,12 @@ LAYERS = [
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
-    "cv2": {"synthetic/scenes.py"},
+    "cv2": {"synthetic"},
+    "trimesh": {"synthetic/surfaces.py", "visual/mesh.py"},
     "pycolmap": {"colmap"},
     "sqlite3": {"colmap"},
+    "plotly": {"visual/report_page.py"},
+    "viser": {"visual/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},
 }

@@ -121,7 +121,8 @@ def test_solve_places_a_bare_graph(tmp_path, d):
     assert (facts["num_images"], facts["num_placed"], facts["dimension"]) == (13, 12, d)
     assert facts["solve"]["gap"] <= 1e-8
     assert (tmp_path / "g.txt").read_bytes() == before
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"locate.json", "cameras.csv", "pairs.csv"}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
 
     header, *lines = (tmp_path / "out" / "cameras.csv").read_text().splitlines()
     rows = {line.split(",")[0]: dict(zip(header.split(","), line.split(","), strict=True)) for line in lines}

@@ -6,9 +6,9 @@ from typing import Any
 import typer
 from typer.core import TyperGroup
 
-from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination
+from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination, refuse_little_memory
 
-_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "convert", "synth")
+_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
 """Of the commands in the help, by importance."""
 
 
@@ -34,6 +34,7 @@ def main() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
     catch_termination()
     try:
+        refuse_little_memory()
         app()
     except KeyboardInterrupt:  # outside a command: while modules are loaded
         sys.exit(EXIT_INTERRUPTED)

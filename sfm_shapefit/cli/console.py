@@ -25,32 +25,74 @@ EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_INTERRUPTED = 3, 4, 130
 NAMES_SHOWN = 8
 SEE_JSON = "see --json"
 
+_LIBRARIES_BYTES = 850_000_000  # measured: with less, loading them or their first call fails
+_THREAD_BYTES = 50_000_000  # stack and work space of one thread of the linear algebra library
+
+
+_NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
+"""How Python, C++ and the dynamic linker say that there is no memory."""
+
+_received: list[int] = []
+"""Numbers of the signals that asked this process to end."""
+
 
 @contextmanager
-def reported() -> Iterator[None]:
+def reported(interrupted: str = "interrupted; nothing was written") -> Iterator[None]:
     """Turn every known error into one sentence on stderr and its exit code."""
     try:
         yield
-    except KeyboardInterrupt:
-        _fail("interrupted; nothing was written", EXIT_INTERRUPTED)
-    except UnsolvableError as error:
-        _fail(str(error), EXIT_UNSOLVABLE)
-    except ShapeFitError as error:
-        _fail(str(error), EXIT_INPUT)
+    except (KeyboardInterrupt, Exception) as error:
+        # Native code that a signal interrupts may turn the interrupt into an error of its own.
+        if isinstance(error, KeyboardInterrupt) or _received:
+            _fail(interrupted, EXIT_INTERRUPTED)
+        if isinstance(error, UnsolvableError):
+            _fail(str(error), EXIT_UNSOLVABLE)
+        if isinstance(error, ShapeFitError):
+            _fail(str(error), EXIT_INPUT)
+        if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
+            _fail(
+                "the memory that this process may use is not enough; allow more, or give a smaller model",
+                EXIT_INPUT,
+            )
+        raise
 
 
 def catch_termination() -> None:
-    """Turn SIGTERM into an interrupt; again once pycolmap is loaded, which brings a handler of its own."""
-    signal.signal(signal.SIGTERM, _interrupt)
+    """Turn SIGTERM into an interrupt; again once pycolmap is loaded, which brings a handler of its own.
+
+    A signal that whoever started this process wants ignored, as nohup does, stays ignored.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
 
 
-def _interrupt(_signal: int, _frame: object) -> None:
+def _interrupt(number: int, _frame: object) -> None:
+    _received.append(number)
     raise KeyboardInterrupt
 
 
+def refuse_little_memory() -> None:
+    """Refuse an address space in which the libraries cannot even be loaded: they would crash or hang."""
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = _LIBRARIES_BYTES + _THREAD_BYTES * (os.cpu_count() or 1)
+    if limit != resource.RLIM_INFINITY and limit < needed:
+        _say(
+            f"this process may use {limit / 1e6:.0f} MB of address space, but its libraries need "
+            f"{needed / 1e6:.0f} MB; raise the limit (ulimit -v)"
+        )
+        sys.exit(EXIT_INPUT)
+
+
 def _fail(message: str, code: int) -> None:
-    print(f"sfm-shapefit: {printable(message)}", file=sys.stderr)  # noqa: T201
+    _say(message)
     raise typer.Exit(code)
+
+
+def _say(message: str) -> None:
+    print(f"sfm-shapefit: {printable(message)}", file=sys.stderr)  # noqa: T201
 
 
 def printable(text: str) -> str:

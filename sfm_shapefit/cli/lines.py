@@ -26,3 +26,8 @@ def objective_line(solve: "SolverResult") -> str:
     if solve.status is Status.NOT_SOLVED:
         return f"{solve.objective:.6g}, not certified ({chosen})"
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
+
+
+def pictures_line(report: bool, scene: bool) -> str:
+    """Name the pictures that were written, to follow the names of other files."""
+    return ", report.html" * report + ", scene.glb, scene.ply" * scene

@@ -17,11 +17,13 @@ from sfm_shapefit.cli.flags import (
     OutputPath,
     Overwrite,
     Quiet,
+    Report,
+    Scene,
     one_path,
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import objective_line, pieces_line
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
 from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
@@ -47,6 +49,8 @@ def locate_command(
     ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
+    report: Report = True,
+    scene: Scene = False,
     as_json: Json = False,
     quiet: Quiet = False,
     **given: Any,
@@ -55,27 +59,28 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(LocateOptions, given, config)
         protect = [path for path in (source, database, priors, config) if path is not None]
-        check_output(target, overwrite=overwrite, protect=protect)
+        with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.pipeline import locate
+            from sfm_shapefit.report import dumps
+            from sfm_shapefit.results import summary, write_result
 
-        from sfm_shapefit.pipeline import locate
-        from sfm_shapefit.report import dumps
-        from sfm_shapefit.results import summary, write_result
-
-        catch_termination()
-        with shown_progress(not quiet) as progress:
-            found = locate(source, database, options, progress, priors)
-            write_result(found, target, overwrite=overwrite, protect=protect)
+            catch_termination()
+            with shown_progress(not quiet) as progress:
+                found = locate(source, database, options, progress, priors)
+                write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{len(found.model.names)} images of {source}", _locate_table(found, target))
+            table = _locate_table(found, target, pictures_line(report, scene))
+            print_table(f"{len(found.model.names)} images of {source}", table)
 
 
-def _locate_table(found: "LocateResult", out: Path) -> Rows:
+def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
     from sfm_shapefit.results import summary
 
@@ -95,7 +100,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
-        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
+        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
 
 

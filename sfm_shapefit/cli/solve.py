@@ -7,8 +7,18 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened
-from sfm_shapefit.cli.flags import Json, OutArgument, Overwrite, Quiet, one_path, options_from, takes
-from sfm_shapefit.cli.lines import objective_line, pieces_line
+from sfm_shapefit.cli.flags import (
+    Json,
+    OutArgument,
+    Overwrite,
+    Quiet,
+    Report,
+    Scene,
+    one_path,
+    options_from,
+    takes,
+)
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
 from sfm_shapefit.robust.options import PlacementOptions
 
 if TYPE_CHECKING:
@@ -53,6 +63,8 @@ def solve_command(
         typer.Option("--1dsfm", help="Also write 1dsfm/: the pairs that agree, rotations and locations."),
     ] = False,
     overwrite: Overwrite = False,
+    report: Report = True,
+    scene: Scene = False,
     as_json: Json = False,
     quiet: Quiet = False,
     **given: Any,
@@ -61,32 +73,44 @@ def solve_command(
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(PlacementOptions, given)
         inputs = [path for path in (source, rotations) if path is not None]
-        check_output(target, overwrite=overwrite, protect=inputs)
+        with claimed_output(target, overwrite=overwrite, protect=inputs):
+            from sfm_shapefit.pipeline import solve_graph_file
+            from sfm_shapefit.report import dumps
+            from sfm_shapefit.results import graph_summary, write_graph_result
 
-        from sfm_shapefit.pipeline import solve_graph_file
-        from sfm_shapefit.report import dumps
-        from sfm_shapefit.results import graph_summary, write_graph_result
-
-        catch_termination()
-        found = solve_graph_file(
-            source,
-            options,
-            rotations=rotations,
-            max_rotation_error_deg=max_rotation_error,
-            reverse=reverse,
-        )
-        write_graph_result(found, target, overwrite=overwrite, g2o=g2o, onedsfm=onedsfm, protect=inputs)
+            catch_termination()
+            found = solve_graph_file(
+                source,
+                options,
+                rotations=rotations,
+                max_rotation_error_deg=max_rotation_error,
+                reverse=reverse,
+            )
+            write_graph_result(
+                found,
+                target,
+                overwrite=overwrite,
+                g2o=g2o,
+                onedsfm=onedsfm,
+                protect=inputs,
+                report=report,
+                scene=scene,
+            )
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(graph_summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{found.placement.graph.num_cameras} nodes of {source}", _solve_table(found, target))
+            print_table(
+                f"{found.placement.graph.num_cameras} nodes of {source}",
+                _solve_table(found, target, pictures_line(report, scene)),
+            )
 
 
-def _solve_table(found: "GraphResult", out: Path) -> Rows:
+def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
     from sfm_shapefit.results import graph_summary, quality_warnings
 
@@ -110,7 +134,7 @@ def _solve_table(found: "GraphResult", out: Path) -> Rows:
         ("locations", placement.finish.statement()),
         *[("warning", warning) for warning in quality_warnings(placement)],
         ("time", _time_line(found.timings_s)),
-        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv"),
+        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
 
 

@@ -33,6 +33,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.matches import MatchBatch, RelativePoses
 from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
 
 MAX_NUM_IMAGES = 2147483647
@@ -48,6 +49,21 @@ _WAL_VERSION = 2  # bytes 18 and 19 of the header
 _LOCK_TIMEOUT_S = 2.0
 _COPY_ATTEMPTS = 3
 _MIN_TRANSLATION = 1e-12  # stored translations are 1, or of the scene's size; shorter ones mean "none"
+
+# A database may come from anywhere: what no query of this module needs is not allowed.
+_LIMITS = {
+    sqlite3.SQLITE_LIMIT_LENGTH: 2**29,  # bytes of a value or a row; 20 million keypoints, 67 million matches
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,  # of the schema's statements too
+    sqlite3.SQLITE_LIMIT_COLUMN: 100,
+    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 20,
+    sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 3,
+    sqlite3.SQLITE_LIMIT_VDBE_OP: 10_000,
+    sqlite3.SQLITE_LIMIT_FUNCTION_ARG: 10,
+    sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    sqlite3.SQLITE_LIMIT_LIKE_PATTERN_LENGTH: 100,
+    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
+    sqlite3.SQLITE_LIMIT_WORKER_THREADS: 0,
+}
 
 _REQUIRED_COLUMNS = {
     "images": ("image_id", "name"),
@@ -336,20 +352,24 @@ def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
             closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None))
         )
         connection.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
+        for limit, value in _LIMITS.items():
+            connection.setlimit(limit, value)
         connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA cell_size_check = ON")
         connection.execute("PRAGMA query_only = ON")
         yield connection
 
 
 def _read_header(path: Path) -> bytes:
     """Return the first 100 bytes of a database, or refuse a file that is none."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the database file itself")
+    refuse_irregular_file(path)
     try:
         with path.open("rb") as stream:
             header = stream.read(100)
     except FileNotFoundError:
         raise InputError(f"the database {path} does not exist") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder; give the database file itself") from None
     except OSError as error:
         raise InputError(f"the database {path} cannot be read: {error.strerror}") from None
     if not header:
@@ -448,12 +468,33 @@ def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
 
 
 def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a database without the tables and columns that are read."""
+    """Refuse a database without the tables and columns that are read, or that computes what they hold.
+
+    A view, a virtual table and a generated column run code of whoever made the database when they are read.
+    """
     for table, required in _REQUIRED_COLUMNS.items():
+        _refuse_computed(path, connection, table)
         columns = _columns(connection, table)
         if missing := [name for name in required if name not in columns]:
             what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
             raise InputError(f"{path} is not a COLMAP database: it has {what}")
+
+
+def _refuse_computed(path: Path, connection: sqlite3.Connection, table: str) -> None:
+    """Refuse a table that is none, or whose rows are computed."""
+    kinds = connection.execute(
+        "SELECT type, rootpage FROM sqlite_master WHERE type IN ('table', 'view') AND lower(name) = ?",
+        (table,),
+    )
+    if any(kind != "table" or not page for kind, page in kinds):  # a virtual table has no page of its own
+        raise InputError(
+            f"{path} is not a COLMAP database: its {table} is a view or a virtual table, not a table"
+        )
+    hidden = connection.execute(
+        "SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", (table,)
+    ).fetchone()
+    if hidden is not None:
+        raise InputError(f"{path} is not a COLMAP database: its {table} has a computed column {hidden[0]!r}")
 
 
 def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -> dict[int, int]:
@@ -538,7 +579,9 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
 
 def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     """Return whether `data` is a blob of rows x cols items."""
-    return isinstance(data, bytes) and isinstance(rows, int) and len(data) == rows * cols * itemsize
+    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
+        return False
+    return len(data) == rows * cols * itemsize
 
 
 def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:

@@ -18,6 +18,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -66,6 +67,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
             is one of the model's.
     """
+    refuse_irregular_file(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -49,15 +49,15 @@ def _write_contents(scene: Scene, workspace: Path, options: WorkspaceOptions) ->
         model = _rotations_only_model(scene)
     else:
         model = _full_model(scene, scene.stated_rotations) if perturbed else truth
-    _write_model(model, workspace / "sparse" / "0")
+    write_model(model, workspace / "sparse" / "0")
     if model is not truth:
-        _write_model(truth, workspace / "truth")
+        write_model(truth, workspace / "truth")
 
 
 # --- models ----------------------------------------------------------------------------------------------
 
 
-def _write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
+def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     """Write a model in COLMAP's binary format."""
     folder.mkdir(parents=True)
     model.write_binary(folder)
@@ -68,7 +68,7 @@ def _rotations_only_model(scene: Scene) -> pycolmap.Reconstruction:
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(_camera(scene))
     for index, rotation in enumerate(scene.stated_rotations):
-        model.add_image_with_trivial_frame(_image(index), _rigid(rotation, np.zeros(3)))
+        model.add_image_with_trivial_frame(_image(index), rigid(rotation, np.zeros(3)))
     return model
 
 
@@ -80,7 +80,7 @@ def _full_model(scene: Scene, rotations: FloatArray) -> pycolmap.Reconstruction:
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(_camera(scene))
     for index, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):
-        pose = _rigid(rotation, -rotation @ center)
+        pose = rigid(rotation, -rotation @ center)
         model.add_image_with_trivial_frame(_image(index, scene.keypoints[index]), pose)
 
     point_ids, first, image_ids, keypoint_ids = _tracks(scene)
@@ -124,17 +124,22 @@ def _camera(scene: Scene) -> pycolmap.Camera:
     )
 
 
+def image_name(index: int) -> str:
+    """Return the name of image `index` of a scene."""
+    return f"{index + 1:04d}.jpg"
+
+
 def _image(index: int, keypoints: FloatArray | None = None) -> pycolmap.Image:
     """Return image `index` without pose."""
     return pycolmap.Image(
-        name=f"{index + 1:04d}.jpg",
+        name=image_name(index),
         keypoints=np.empty((0, 2)) if keypoints is None else keypoints,
         camera_id=_CAMERA_ID,
         image_id=index + 1,
     )
 
 
-def _rigid(rotation: FloatArray, translation: FloatArray) -> pycolmap.Rigid3d:
+def rigid(rotation: FloatArray, translation: FloatArray) -> pycolmap.Rigid3d:
     """Return the transform x -> rotation @ x + translation."""
     return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
 
@@ -151,6 +156,11 @@ def _write_database(scene: Scene, path: Path, *, relative_poses: bool) -> None:
             _write_pairs(scene, database, relative_poses=relative_poses)
     finally:
         database.close()
+    compact_database(path)
+
+
+def compact_database(path: Path) -> None:
+    """Make one small file of a database of our own: no write-ahead log, no free pages."""
     with contextlib.closing(sqlite3.connect(path, isolation_level=None)) as connection:
         connection.execute("PRAGMA journal_mode = DELETE")
         connection.execute("VACUUM")
@@ -184,7 +194,7 @@ def _write_pairs(scene: Scene, database: pycolmap.Database, *, relative_poses: b
         geometry.E, geometry.F = essential[e], fundamental[e]
         geometry.inlier_matches = matches
         if relative_poses:
-            geometry.cam2_from_cam1 = _rigid(scene.relative_rotations[e], scene.relative_translations[e])
+            geometry.cam2_from_cam1 = rigid(scene.relative_rotations[e], scene.relative_translations[e])
         database.write_matches(i, j, matches)
         database.write_two_view_geometry(i, j, geometry)
 

@@ -3,6 +3,7 @@
 from sfm_shapefit.formats.g2o import g2o_text
 from sfm_shapefit.formats.glomap_text import is_relative_poses, read_relative_poses, relative_poses_text
 from sfm_shapefit.formats.graph_text import graph_text, read_graph
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.formats.onedsfm import (
     EpipolarGeometries,
     is_onedsfm,
@@ -22,5 +23,6 @@ __all__ = [
     "read_onedsfm",
     "read_relative_poses",
     "read_rotations",
+    "refuse_irregular_file",
     "relative_poses_text",
 ]

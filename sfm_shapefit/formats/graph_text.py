@@ -20,6 +20,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
 _ROUNDED = 1e-7
+_LARGEST_WEIGHT = 1e30  # sums of squares of products of weights must not overflow
 _FORM = "i j vx vy vz [weight]"
 _MIN_COLUMNS = 4  # two ids and a direction in the plane
 
@@ -46,6 +47,8 @@ def read_graph(path: Path | str) -> ViewGraph:
     refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
     refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
     refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
+    extreme = (weights < 1.0 / _LARGEST_WEIGHT) | (weights > _LARGEST_WEIGHT)
+    refuse(file, numbers, extreme, f"has a weight beyond 1 / {_LARGEST_WEIGHT:g} to {_LARGEST_WEIGHT:g}")
     rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
     directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
     try:

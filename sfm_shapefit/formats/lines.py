@@ -1,11 +1,31 @@
 """What the readers of text formats share: lines of words and numbers, refused by their number."""
 
+import re
+import stat
 from pathlib import Path
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words: Python refuses to convert very long ones
+
+
+def refuse_irregular_file(path: Path) -> None:
+    """Refuse what is neither a file nor missing: reading a pipe waits for ever, and a device may have no end.
+
+    Raises:
+        InputError: if `path` is, or links to, a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (OSError, ValueError):
+        return  # whoever opens it says why it cannot be read
+    if stat.S_ISDIR(mode):
+        raise InputError(f"{path} cannot be read: Is a directory")
+    if not stat.S_ISREG(mode):
+        raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
 
 
 def read_lines(file: Path, form: str) -> tuple[list[int], list[list[str]]]:
@@ -18,6 +38,7 @@ def read_lines(file: Path, form: str) -> tuple[list[int], list[list[str]]]:
     Raises:
         InputError: if the file cannot be read or holds nothing.
     """
+    refuse_irregular_file(file)
     try:
         text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -58,7 +79,7 @@ def number_table(
 def node_indices(words: list[str]) -> tuple[list[str], IntArray]:
     """Return the distinct ids in order, numbers by value, and the index of every word among them."""
     distinct = set(words)
-    if all(word.lstrip("-").isascii() and word.lstrip("-").isdigit() for word in distinct):
+    if all(_IS_INTEGER.fullmatch(word) for word in distinct):
         ids = sorted(distinct, key=lambda word: (int(word), word))
     else:
         ids = sorted(distinct)

@@ -31,6 +31,8 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if placement.rival is not None:
+        yield placement.rival.statement()
 
 
 def _collapse(finish: Finish) -> Iterator[str]:

@@ -33,6 +33,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 COLLAPSED = 0.3
 """Disagreement of the starts beyond which one of them has collapsed."""
 
+_UNEQUAL = 0.1  # disagreement from which LUD is likely to be the better start
 _LUD_STEPS = 50  # more change nothing after the refinement
 _LUD_CERTIFIED_PAIRS = 50_000  # its bound costs about 100 more iterations
 _LUD_PAIRS = 1_000_000  # beyond, the second start takes as long as the first
@@ -131,7 +132,7 @@ def finish(
 
     apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
     candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
-    if apart is not None and apart > COLLAPSED:
+    if apart is not None and apart > _UNEQUAL:
         candidates.reverse()  # the likely better one first: the other ends early where it loses
     starts: list[Start] = []
     for name, locations in candidates:

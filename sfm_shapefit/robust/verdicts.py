@@ -131,7 +131,7 @@ def assess(
     sigmas, leverages = _propagated(graph, locations, inliers, information, k, errors)
     sigmas = scale * sigmas
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
-    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, evidence)
+    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence)
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,

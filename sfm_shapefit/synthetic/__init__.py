@@ -20,7 +20,14 @@ if TYPE_CHECKING:
         ring_graph_problem,
         trajectory_graph_problem,
     )
-    from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
+    from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
+    from sfm_shapefit.synthetic.rendering import (
+        RenderedScene,
+        draw_image,
+        make_rendered_scene,
+        project_distorted,
+        surface_points,
+    )
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
@@ -38,7 +45,14 @@ _HOMES = {
         "ring_graph_problem",
         "trajectory_graph_problem",
     ),
-    "options": ("SceneOptions", "WorkspaceOptions"),
+    "options": ("RenderOptions", "SceneOptions", "WorkspaceOptions"),
+    "rendering": (
+        "RenderedScene",
+        "draw_image",
+        "make_rendered_scene",
+        "project_distorted",
+        "surface_points",
+    ),
     "scenes": ("Scene", "make_scene", "project_points"),
     "streets": ("StreetProblem", "street_problem"),
 }
@@ -47,6 +61,8 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "Corruption",
     "GraphProblem",
+    "RenderOptions",
+    "RenderedScene",
     "Scene",
     "SceneOptions",
     "StreetProblem",
@@ -54,14 +70,18 @@ __all__ = [
     "box_graph_problem",
     "community_graph_problem",
     "corridor_graph_problem",
+    "draw_image",
     "expander_graph_problem",
     "lawn_graph_problem",
+    "make_rendered_scene",
     "make_scene",
     "measured_problem",
+    "project_distorted",
     "project_points",
     "random_graph_problem",
     "ring_graph_problem",
     "street_problem",
+    "surface_points",
     "trajectory_graph_problem",
 ]
 
