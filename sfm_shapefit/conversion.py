@@ -63,7 +63,7 @@ def convert(
         if path.suffix.lower() not in _BY_SUFFIX:
             raise InputError(f"{path} has no known suffix; give the format: {', '.join(get_args(Format))}")
         target_format = _BY_SUFFIX[path.suffix.lower()]
-    model = read_model(source, poses_only=True).reconstruction
+    model = read_model(source).reconstruction
     if target_format in _TEXTS:
         _write_text(_TEXTS[target_format](scene_of(model)), path, overwrite=overwrite)
         return target_format

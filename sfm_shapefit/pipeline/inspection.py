@@ -12,6 +12,7 @@ from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.measurement import evidence_of, joint_graph, measure_directions, view_graph
+from sfm_shapefit.pipeline.rigid_bodies import rigs_statement
 from sfm_shapefit.pipeline.sources import choose_inputs, open_source
 
 if TYPE_CHECKING:
@@ -66,6 +67,7 @@ def inspect(
                     evidence_of(directions).contradicting,
                 ),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+                rigs=rigs_statement(model, joint),
             )
 
 
