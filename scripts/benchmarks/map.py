@@ -3,9 +3,9 @@
 All start from the same verified matches and intrinsics. The mappers of pycolmap run on a copy of the
 database, with 15 and with 30 as the least number of matches of a pair, and the better one counts; `map`
 chooses by itself. They refine focal lengths; `map` keeps those of the database. Errors are those of the
-largest model against the truth after robust alignment; since `map` leaves out cameras it does not trust, the peers' errors
-are also given on the cameras that `map` placed. One thread each, one run each in a fresh process; `map` has
-its numba kernels loaded by a run on the bundled ring before.
+largest model against the truth after robust alignment; since `map` leaves out cameras it does not trust,
+the peers' errors are also given on the cameras that `map` placed. One thread each, one run each in a fresh
+process; `map` has its numba kernels loaded by a run on the bundled ring before.
 """
 
 import argparse
