@@ -14,6 +14,8 @@ from sfm_shapefit.cli.flags import (
     OutputPath,
     Overwrite,
     Quiet,
+    Report,
+    Scene,
     one_path,
     options_from,
     takes,
@@ -35,6 +37,8 @@ def map_command(
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
     overwrite: Overwrite = False,
+    report: Report = True,
+    scene: Scene = False,
     config: Config = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -57,7 +61,7 @@ def map_command(
         catch_termination()
         with shown_progress(not quiet) as progress:
             found = map_database(source, options, progress)
-            write_map_result(found, target, overwrite=overwrite, protect=protect)
+            write_map_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
         if as_json:
             print(dumps(map_summary(found)))  # noqa: T201
         elif not quiet:
