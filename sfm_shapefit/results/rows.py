@@ -18,6 +18,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _FILTERED = "left out by the filter"
 _OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
 
 
@@ -101,7 +102,11 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             weight=float(graph.weights[edge]),
         )
         if edge not in judged:
-            rows.append(replace(row, reason=_FILTERED if edge in dropped else _OUTSIDE))
+            inner = placement.bodies is not None and bool(
+                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            )
+            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
+            rows.append(replace(row, reason=_INNER if inner else elsewhere))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

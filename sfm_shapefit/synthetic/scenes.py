@@ -108,8 +108,19 @@ def make_scene(options: SceneOptions) -> Scene:
             than asked for.
     """
     rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
-    layout_rng, pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
-    layout = LAYOUTS[options.shape](options.num_images, options.num_points, layout_rng)
+    layout = LAYOUTS[options.shape](options.num_images, options.num_points, rngs[0])
+    return scene_of(layout, options, rngs[1:])
+
+
+def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
+    """Photograph, pair and corrupt a layout; `make_scene` says what it raises.
+
+    Args:
+        layout: cameras and surfaces.
+        options: `shape` is not read.
+        rngs: five streams, one for each kind of draw.
+    """
+    pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     images = [_photograph(layout, image, options, pixel_rng) for image in range(options.num_images)]
     keypoint_points = [ids for ids, _ in images]
     keypoints = [xy for _, xy in images]

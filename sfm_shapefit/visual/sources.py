@@ -101,7 +101,7 @@ def _input_of(facts: dict[str, Any]) -> PosedModel | None:
     """Return the input, if it can still be read."""
     path = Path(facts["inputs"]["model"])
     try:
-        return read_model(path, poses_only=True) if path.is_dir() else None
+        return read_model(path) if path.is_dir() else None
     except InputError:
         return None
 
