@@ -8,7 +8,8 @@ The private folder `.shapefit-<hash of the name>.partial` is also the claim on a
 holds a lock on it (flock) as long as it lives. So a second run into the same place is told so, and what a
 killed run left behind is known by its free lock, and removed by the next run that writes to the same parent.
 
-The folder of a `locate` run is known by its `locate.json`; nothing else that holds files is ever replaced.
+The folder of a `locate` run is known by its `locate.json`, that of `map` by its `map.json`; nothing else
+that holds files is ever replaced.
 """
 
 import ctypes
@@ -26,7 +27,9 @@ from pathlib import Path
 from sfm_shapefit.errors import InputError
 
 MARKER = "locate.json"
-"""The file by which an output folder of this package is recognised."""
+"""The file by which an output folder of `locate` and `solve` is recognised."""
+MAP_MARKER = "map.json"
+"""The file by which an output folder of `map` is recognised."""
 
 
 def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:
@@ -34,7 +37,7 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
 
     Args:
         out: the folder to be made. Missing parents are fine.
-        overwrite: accept an existing folder if it is empty or an earlier output (it has `MARKER`).
+        overwrite: accept an existing folder if it is empty or an earlier output (it has a marker).
         protect: files and folders that must survive, such as the input model and its database: `out` may
             neither be one of them nor contain one.
 
@@ -238,9 +241,10 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
         is_empty = not any(folder.iterdir())
     except OSError as error:
         raise InputError(f"{folder} cannot be read ({error.strerror}); choose another folder") from error
-    if not is_empty and not (folder / MARKER).is_file():
+    if not is_empty and not any((folder / marker).is_file() for marker in (MARKER, MAP_MARKER)):
         raise InputError(
-            f"{folder} holds files but no {MARKER}, so it is not overwritten; choose another folder"
+            f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; "
+            "choose another folder"
         )
 
 

@@ -46,7 +46,7 @@ def ring_out(tmp_path_factory):
 def test_locate_writes_the_model_and_its_tables(ring_out):
     written = {path.name for path in ring_out.iterdir()}
     model = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    assert written == model | {"locate.json", "cameras.csv", "pairs.csv"}
+    assert written == model | {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert pycolmap.Reconstruction(ring_out).num_reg_images() == 8
 
 

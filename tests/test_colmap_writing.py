@@ -711,7 +711,7 @@ def test_overwriting_refuses_what_is_no_earlier_output_but_takes_an_empty_folder
     with atomic_folder(photos, overwrite=True) as partial:
         (partial / "dear.jpg").write_bytes(b"x")
     with (
-        pytest.raises(InputError, match=r"holds files but no locate\.json"),
+        pytest.raises(InputError, match=r"holds files but no locate\.json or map\.json"),
         atomic_folder(photos, overwrite=True),
     ):
         pytest.fail("the block must not run")

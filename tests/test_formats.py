@@ -84,8 +84,8 @@ def test_a_last_coordinate_of_zero_is_no_weight(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no pairs"),
-        ("# nothing\n\n", "no pairs"),
+        ("", "no lines of the form i j vx vy vz"),
+        ("# nothing\n\n", "no lines of the form"),
         ("0 1 1 0 0\n\n1 2 0 1\n", "line 3: has 4 columns"),
         ("0 1 1 0 0\n1 2 0 x 1\n", "line 2: 'x' is not a number"),
         ("0 1 1 0 0\n1 2 0 nan 1\n", "line 2: has a number that is not finite"),
@@ -121,7 +121,8 @@ def test_solve_places_a_bare_graph(tmp_path, d):
     assert (facts["num_images"], facts["num_placed"], facts["dimension"]) == (13, 12, d)
     assert facts["solve"]["gap"] <= 1e-8
     assert (tmp_path / "g.txt").read_bytes() == before
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"locate.json", "cameras.csv", "pairs.csv"}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
 
     header, *lines = (tmp_path / "out" / "cameras.csv").read_text().splitlines()
     rows = {line.split(",")[0]: dict(zip(header.split(","), line.split(","), strict=True)) for line in lines}

@@ -32,6 +32,12 @@ Database = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Report = Annotated[
+    bool, typer.Option("--report/--no-report", help="Write report.html: one page that works offline.")
+]
+Scene = Annotated[
+    bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
+]
 Config = Annotated[
     Path | None,
     typer.Option("--config", metavar="FILE.toml", help="Options from a TOML file; flags win over it."),

@@ -1,7 +1,9 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
@@ -15,11 +17,13 @@ from sfm_shapefit.cli.flags import (
     OutputPath,
     Overwrite,
     Quiet,
+    Report,
+    Scene,
     one_path,
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import objective_line, pieces_line
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
 from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
@@ -35,8 +39,18 @@ def locate_command(
     input_path: InputPath = None,
     output_path: OutputPath = None,
     database: Database = None,
+    priors: Annotated[
+        Path | None,
+        typer.Option(
+            "--priors",
+            metavar="FILE",
+            help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
+    report: Report = True,
+    scene: Scene = False,
     as_json: Json = False,
     quiet: Quiet = False,
     **given: Any,
@@ -48,7 +62,8 @@ def locate_command(
         from sfm_shapefit.output import claimed_output
 
         options = options_from(LocateOptions, given, config)
-        protect = [path for path in (source, database, config) if path is not None]
+        names = Path(options.fix) if options.fix else None
+        protect = [path for path in (source, database, priors, names, config) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=protect):
             from sfm_shapefit.pipeline import locate
             from sfm_shapefit.report import dumps
@@ -56,16 +71,17 @@ def locate_command(
 
             catch_termination()
             with shown_progress(not quiet) as progress:
-                found = locate(source, database, options, progress)
-                write_result(found, target, overwrite=overwrite, protect=protect)
+                found = locate(source, database, options, progress, priors)
+                write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
     with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{len(found.model.names)} images of {source}", _locate_table(found, target))
+            table = _locate_table(found, target, pictures_line(report, scene))
+            print_table(f"{len(found.model.names)} images of {source}", table)
 
 
-def _locate_table(found: "LocateResult", out: Path) -> Rows:
+def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
     from sfm_shapefit.results import summary
 
@@ -75,6 +91,7 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", shortened(left_out))] if left_out else []),
+        *_bodies_line(facts),
         *pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", objective_line(found.solve)),
@@ -85,8 +102,17 @@ def _locate_table(found: "LocateResult", out: Path) -> Rows:
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
-        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv"),
+        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
+
+
+def _bodies_line(facts: dict[str, Any]) -> Rows:
+    bodies = facts["bodies"]
+    if bodies is None:
+        return []
+    fixed = f", {bodies['num_fixed']} cameras fixed" if bodies["num_fixed"] else ""
+    inner = f"; {bodies['num_inner_pairs']} pairs inside them give no constraint"
+    return [("rigid bodies", f"{bodies['num_placed']} of {bodies['num_bodies']} placed{fixed}{inner}")]
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:

@@ -25,6 +25,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -105,6 +106,25 @@ def open_database(
             _check_schema(file, connection)
             database = MatchDatabase(file, connection, model, cache_bytes)
         yield database
+
+
+def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
+    """Return the rows of the first query whose columns `table` has; none if it fits none of them.
+
+    Args:
+        path: the database; it is not changed.
+        table: whose columns decide, for schemas differ from version to version.
+        queries: what to select, by the columns of `table` that it needs.
+
+    Raises:
+        InputError: if the file is missing, is no sqlite database, is locked or damaged.
+    """
+    with _sqlite_errors(path), _readonly_connection(path) as connection:
+        columns = _columns(connection, table)
+        for needed, query in queries.items():
+            if columns.issuperset(needed):
+                return connection.execute(query).fetchall()
+    return []
 
 
 class MatchDatabase:

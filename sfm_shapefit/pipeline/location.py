@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.gauge import Gauge, choose_gauge
+from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.gauging import chosen_gauge, read_priors
 from sfm_shapefit.pipeline.measurement import (
     evidence_of,
     joint_graph,
@@ -19,10 +20,11 @@ from sfm_shapefit.pipeline.measurement import (
     shared_errors,
     with_points,
 )
+from sfm_shapefit.pipeline.rigid_bodies import placed, rigid_gauge, rigid_parts
 from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
 from sfm_shapefit.pipeline.sources import MatchSource, choose_inputs, open_source
-from sfm_shapefit.placement import Placement, place
+from sfm_shapefit.placement import Placement
 from sfm_shapefit.results import LocateResult, quality_warnings, trust_warnings
 
 if TYPE_CHECKING:
@@ -34,6 +36,7 @@ def locate(
     database: Path | str | None = None,
     options: LocateOptions | None = None,
     progress: Progress | None = None,
+    priors: Path | str | None = None,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -44,6 +47,8 @@ def locate(
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings; defaults if None.
         progress: called as stages advance.
+        priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
+            serve if the scale is "prior" and there is no table.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
@@ -56,6 +61,8 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        known = read_priors(model, inputs, options, priors)
+        rigid = rigid_parts(model, options, has_priors=known is not None)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
@@ -66,16 +73,14 @@ def locate(
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = place(
-                joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras
+            placement = placed(joint, rigid, evidence, options)
+            kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+            gauge = rigid_gauge(
+                model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)
             )
-            kept = trusted(placement, options.min_trust)
-            locations = placement.locations[kept]
-            gauge = choose_gauge(locations, model.centers[placement.cameras[kept]], options.scale)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        located = kept, gauge.similarity.apply(locations)
-        seeded, adjusted = seeded_model(source, placement, located, options, clock)
+        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
@@ -91,6 +96,7 @@ def locate(
         warnings=warnings,
         turned_deg=turned_deg,
         further=further,
+        fixed=rigid.fixed,
     )
 
 

@@ -8,9 +8,9 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted, bundle_adjust
 from sfm_shapefit.colmap.matches import MatchBatch
-from sfm_shapefit.colmap.seed import build_seed
+from sfm_shapefit.colmap.seed import build_seed, turned
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
-from sfm_shapefit.gauge import choose_gauge
+from sfm_shapefit.gauge import Gauge, unit_gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.pipeline.sources import MatchSource
@@ -34,27 +34,32 @@ def trusted(placement: Placement, min_trust: float) -> BoolArray:
 def seeded_model(
     source: MatchSource,
     placement: Placement,
-    located: tuple[BoolArray, FloatArray],
+    kept: BoolArray,
+    gauge: Gauge,
     options: LocateOptions,
     clock: Clock,
+    fixed: BoolArray | None = None,
 ) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
     """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
 
-    `located` says which of the placement's cameras are kept, and where those are in the output's units.
+    `kept` says which of the placement's cameras are in the model, `gauge` where those are in its units.
+    Images that are `fixed` keep their poses to the last bit.
     """
     adjusted = None
+    located = kept, gauge.similarity.apply(placement.locations[kept])
     with clock("structure"):
-        seed, tracks = _seed_and_tracks(source, placement, located, clock.advance)
+        seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
         if not options.bundle_adjust:  # which triangulates at the seed's poses itself
             seeded = triangulate(seed, tracks, options.for_structure())
     if options.bundle_adjust:
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options.for_structure())
+            still = () if fixed is None else source.model.frame_ids[fixed].tolist()
+            adjusted = bundle_adjust(seed, tracks, options.for_structure(), fixed_frames=still)
             seeded = adjusted.reconstruction
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
             seeded = colored(seeded, source.model.reconstruction)
-    return seeded, adjusted
+    return seeded if gauge.axes is None else turned(seeded, gauge.axes), adjusted
 
 
 def further_pieces(
@@ -68,10 +73,8 @@ def further_pieces(
     found = []
     for placed in place_further(placement, options.for_placement(), joint.covariance, evidence):
         kept = trusted(placed, options.min_trust)
-        locations = placed.locations[kept]
-        gauge = choose_gauge(locations, np.zeros_like(locations), "unit")
-        located = kept, gauge.similarity.apply(locations)
-        seeded, _ = seeded_model(source, placed, located, options, Clock())
+        gauge = unit_gauge(placed.locations[kept])
+        seeded, _ = seeded_model(source, placed, kept, gauge, options, Clock())
         found.append(
             FurtherPiece(
                 placement=placed,
@@ -89,19 +92,17 @@ def _seed_and_tracks(
     placement: Placement,
     located: tuple[BoolArray, FloatArray],
     advance: Callable[[int, int], None],
+    fixed: BoolArray | None,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
-    """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
-
-    `located` says which of the placement's cameras are kept, and where those are in the output's units.
-    """
+    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
     model, (kept, centers) = source.model, located
     placed = np.zeros(model.num_images, dtype=np.bool_)
     placed[placement.cameras[kept]] = True
     all_centers = np.full((model.num_images, 3), np.nan)
     all_centers[placement.cameras[kept]] = centers
     if source.database is None:
-        return build_seed(model, placed, all_centers), model.reconstruction
-    seed = build_seed(model, placed, all_centers, source.database.keypoints)
+        return build_seed(model, placed, all_centers, fixed=fixed), model.reconstruction
+    seed = build_seed(model, placed, all_centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     batches = _counted(_without_pairs(source.batches(among), placement.rejected_pairs), source.total, advance)

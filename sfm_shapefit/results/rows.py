@@ -12,9 +12,13 @@ from sfm_shapefit.placement import Placement, count_large
 from sfm_shapefit.report import CameraRow, PairRow, PieceRow
 from sfm_shapefit.rigidity import left_out_reasons
 from sfm_shapefit.robust.verdicts import Verdict
+from sfm_shapefit.solver.options import Status
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_FILTERED = "left out by the filter"
+_OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
 
 
@@ -32,7 +36,7 @@ def camera_rows(
     """
     graph = placement.graph
     homes = _home_pieces(placement)
-    reasons = _with_folders(left_out_reasons(graph, placement.pieces), further)
+    reasons = _with_folders(left_out_reasons(placement.considered, placement.pieces), further)
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
     rows = [
         CameraRow(
@@ -84,7 +88,10 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     judged: dict[int, tuple[Placement, int, float]] = {}
     for piece in (placement, *further):
         dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
+        if piece.solve.status is Status.NOT_SOLVED:
+            dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
+    dropped = set(placement.dropped.tolist())
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
@@ -95,7 +102,11 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             weight=float(graph.weights[edge]),
         )
         if edge not in judged:
-            rows.append(replace(row, reason="outside the pieces that are solved"))
+            inner = placement.bodies is not None and bool(
+                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            )
+            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
+            rows.append(replace(row, reason=_INNER if inner else elsewhere))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

@@ -17,6 +17,8 @@ from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.robust.finish import Finish
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
+_QUANTILES = (25, 50, 75, 90)
+_ANGLES_DEG = (1, 2, 5, 10, 30, 90)
 
 
 def summary(found: LocateResult) -> dict[str, Any]:
@@ -32,7 +34,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         },
         "options": asdict(found.options),
         "num_images": len(all_names(found)),
-        "num_placed": int(np.sum(found.kept)),
+        "num_placed": found.reconstruction.num_reg_images(),
         "not_trusted": _not_trusted(found),
         "num_pairs": len(found.directions.pairs),
         "num_pairs_rejected": num_unusable + len(placement.rejected_pairs),
@@ -41,9 +43,12 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "num_points": found.reconstruction.num_points3D(),
         "mean_reprojection_error_px": found.reconstruction.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
+        "num_pairs_filtered": len(placement.dropped),
         "residual_level_deg": placement.assessment.level_deg,
+        "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
+        "bodies": _bodies_summary(found),
         "pieces": [asdict(row) for row in _pieces_of(found)],
         "solve": solve_summary(found.solve),
         "finish": _finish_summary(placement.finish),
@@ -60,14 +65,16 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
     placement = found.placement
     return {
         "schema_version": SCHEMA_VERSION,
-        "inputs": {"graph": str(found.path)},
+        "inputs": {"graph": str(found.path), "directions": found.statement},
         "options": asdict(found.options),
         "dimension": placement.graph.dimension,
         "num_images": placement.graph.num_cameras,
         "num_placed": len(placement.cameras),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
+        "num_pairs_filtered": len(placement.dropped),
         "residual_level_deg": placement.assessment.level_deg,
+        "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "pieces": [
             asdict(row)
@@ -82,6 +89,29 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "warnings": list(quality_warnings(placement)),
         "versions": _versions(),
     }
+
+
+def _bodies_summary(found: LocateResult) -> dict[str, int] | None:
+    """Return what moved together: frames of rigs, and fixed cameras; None where each camera moves by
+    itself."""
+    placement = found.placement
+    if placement.bodies is None:
+        return None
+    cameras = placement.bodies.body_of[: placement.num_cameras]
+    pairs = placement.graph.edges[: placement.num_pairs]
+    return {
+        "num_bodies": len(np.unique(cameras)),
+        "num_placed": len(np.unique(cameras[placement.cameras[found.kept]])),
+        "num_fixed": 0 if found.fixed is None else int(np.sum(found.fixed)),
+        "num_inner_pairs": int(np.sum(~placement.bodies.joins(pairs))),
+    }
+
+
+def residuals_deg(placement: Placement) -> dict[str, float]:
+    """Return quantiles of the placed pairs' residuals in degrees, and the shares that lie beyond angles."""
+    residuals = placement.assessment.residuals_deg[placement.pairs]
+    facts = {f"quantile_{q}": float(np.quantile(residuals, q / 100.0)) for q in _QUANTILES}
+    return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
 
 
 def _pieces_of(found: LocateResult) -> list[PieceRow]:

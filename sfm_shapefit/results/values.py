@@ -10,6 +10,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions import DirectionStatus, PairDirections
+from sfm_shapefit.formats import EpipolarGeometries
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement import Placement
@@ -21,6 +22,10 @@ from sfm_shapefit.solver.options import SolverResult
 
 if TYPE_CHECKING:
     import pycolmap
+
+
+CARRIED_FIXED = "fixed; no pair of it takes part"
+CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,6 +72,8 @@ class LocateResult:
     rotations were not to be refined."""
     further: "tuple[FurtherPiece, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
+    fixed: BoolArray | None = None
+    """(n,) images that stay exactly where the input has them; None if that was not asked for."""
 
     @property
     def solve(self) -> SolverResult:
@@ -87,8 +94,22 @@ class LocateResult:
         rows = camera_rows(self.placement, centers, self.gauge.similarity.scale, solved_pieces)
         for camera, reason in without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
+        for camera, center in self._carried().items():
+            is_fixed = self.fixed is not None and self.fixed[camera]
+            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
+            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         unposed = sorted(set(all_names(self)) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    def _carried(self) -> dict[int, tuple[float, ...]]:
+        """Return the centres of images in the output that no pair placed: fixed ones, and rest of a frame."""
+        ids = self.model.image_ids
+        judged = set(self.placement.cameras[self.kept].tolist())
+        return {
+            camera: tuple(self.reconstruction.image(image_id).projection_center().tolist())
+            for camera, image_id in enumerate(ids.tolist())
+            if camera not in judged and self.reconstruction.image(image_id).has_pose
+        }
 
     @property
     def pairs(self) -> list[PairRow]:
@@ -136,13 +157,19 @@ class GraphResult:
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
     path: Path
-    """The graph's file."""
+    """The graph's file or folder."""
+    statement: str
+    """What it is, and where rotations came from, for the user."""
     options: PlacementOptions
     placement: Placement
     further: tuple[Placement, ...]
     """The further rigid pieces of three nodes or more, each with a scale of its own."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
+    geometries: EpipolarGeometries | None = None
+    """The relative poses that the directions came from, if it has any."""
+    rotations: FloatArray | None = None
+    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
     @property
     def cameras(self) -> list[CameraRow]:

@@ -17,7 +17,9 @@ _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
 
 def quality_warnings(placement: Placement) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if placement.solve.status is not Status.CONVERGED:
+    if placement.solve.status is Status.NOT_SOLVED:
+        yield placement.solve.status.value
+    elif placement.solve.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
     if placement.solve.unique is False:
         yield "other placements may fit as well: the certificate does not prove the optimum unique"
@@ -29,6 +31,8 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if placement.rival is not None:
+        yield placement.rival.statement()
 
 
 def _collapse(finish: Finish) -> Iterator[str]:

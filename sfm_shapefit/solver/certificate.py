@@ -62,6 +62,7 @@ _REPAIRS = 4  # each repair shrinks the equality residual to the rounding of the
 _CG_STEPS = 500  # 10 to 60 on all but long chains
 _SEED = 1
 _EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
+_UNREPAIRED = 1e-9  # an equality residual, relative to the largest degree, that no bound may rest on
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
 _REGULAR_SINGLE = 1e-3  # the same for a factor in single precision: far above its rounding, n d eps
@@ -135,7 +136,8 @@ def certify(
     y *= scale
     total *= scale
     bound = float(np.sum(total * c) / np.sum(c * c))
-    if bound <= 0.0:  # y = 0 is feasible and proves at least this
+    # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
+    if not (bound > 0.0 and _largest(total - bound * c) <= _UNREPAIRED * degree):
         y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
     return Certificate(
         objective=value,
