@@ -59,7 +59,7 @@ def test_a_click_on_a_row_highlights_and_centres_its_camera(driver, report):
 
 
 def test_a_click_in_the_scene_leads_to_the_row(driver, report):
-    # Plotly's own event, as over the marker of a camera that the table's first page lacks, then a press.
+    # Plotly's own event, as over a camera that the table's first page does not show, then a press.
     driver.execute_script(
         "const plot = document.getElementById('scene');"
         "const at = plot.data.findIndex((trace) => trace.mode === 'markers');"

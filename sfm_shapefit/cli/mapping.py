@@ -48,20 +48,22 @@ def map_command(
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(MapOptions, given, config)
         protect = [path for path in (source, config) if path is not None]
-        check_output(target, overwrite=overwrite, protect=protect)
+        with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.mapping.results import map_summary, write_map_result
+            from sfm_shapefit.mapping.run import map_database
+            from sfm_shapefit.report import dumps
 
-        from sfm_shapefit.mapping.results import map_summary, write_map_result
-        from sfm_shapefit.mapping.run import map_database
-        from sfm_shapefit.report import dumps
-
-        catch_termination()
-        with shown_progress(not quiet) as progress:
-            found = map_database(source, options, progress)
-            write_map_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
+            catch_termination()
+            with shown_progress(not quiet) as progress:
+                found = map_database(source, options, progress)
+                write_map_result(
+                    found, target, overwrite=overwrite, protect=protect, report=report, scene=scene
+                )
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(map_summary(found)))  # noqa: T201
         elif not quiet:
