@@ -395,3 +395,16 @@ def test_refinement_with_priors_needs_priors(tmp_path):
     assert "needs priors" in result.stderr
     with pytest.raises(ValueError, match="no effect with the scale unit"):
         LocateOptions(scale="unit", refine_with_priors=True)
+
+
+def test_standard_deviations_and_directions_follow_the_axes(ring, tmp_path):
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()  # x becomes y, y becomes -x
+    table = write_table(tmp_path / "priors.txt", ring, ring.centers @ quarter.T)
+    plain, found = locate(RING_MODEL), locate(RING_MODEL, priors=table)
+    ratio = found.gauge.similarity.scale / plain.gauge.similarity.scale
+    for before, after in zip(plain.cameras, found.cameras, strict=True):
+        x, y, z = before.sigma
+        # The ring is exact, so that the turn is a quarter to 1e-6 or so, and so are the variances' shares.
+        np.testing.assert_allclose(after.sigma, ratio * np.array([y, x, z]), rtol=1e-4)
+    for before, after in zip(plain.pairs, found.pairs, strict=True):
+        np.testing.assert_allclose(after.direction, quarter @ before.direction, atol=1e-5)
