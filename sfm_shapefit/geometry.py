@@ -11,6 +11,7 @@ from sfm_shapefit.arrays import FloatArray
 
 _NUM_SAMPLES = 256  # where half of the points are good, 1 draw of 3 in 8 is: none in 256 has odds 1e-15
 _NUM_REFINED_SAMPLES = 4
+_ROUNDING = 1e-14  # of distances, as a share of the largest
 
 
 def normalized(vectors: FloatArray) -> FloatArray:
@@ -96,8 +97,8 @@ def fit_similarity(
 def median_spread(points: FloatArray) -> float:
     """Return the median distance of points (n, d) from their coordinate-wise median.
 
-    Where more than half of the points coincide, to rounding, it is the largest distance instead; 0 only if all
-    coincide. Distances of a few points that are 1e14 times as large do not matter.
+    Where more than half of the points coincide to rounding it is the largest distance instead; 0 only if all
+    coincide. Points that lie 1e13 times as far away do not matter, as long as they are fewer than half.
     """
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     median, largest = float(np.median(distances)), float(distances.max())

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import median_spread, normalized
+from sfm_shapefit.placement import place
 from sfm_shapefit.robust.finish import finish
 from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.robust.strays import left_scene, put_back, strays
+from sfm_shapefit.robust.strays import left_scene, openness, put_back, strays
 from sfm_shapefit.solver.angular import KERNEL_WIDTH
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
@@ -32,8 +33,9 @@ def joining(graph: ViewGraph, *nodes: int):
     return count > 0, count > 1
 
 
-def found_strays(graph: ViewGraph, start, refined, agreeing) -> list[int]:
-    return strays(graph, left_scene(start, refined), agreeing).tolist()
+def found_strays(graph: ViewGraph, start, refined, agreeing, noise_rad=1e-4) -> list[int]:
+    noise = np.full(graph.num_edges, noise_rad)
+    return strays(graph, start, refined, agreeing, noise).tolist()
 
 
 def test_a_node_far_away_that_contradicts_the_rest_is_a_stray():
@@ -104,6 +106,7 @@ def test_those_that_stay_say_where_the_others_go_and_nothing_turns():
     t = np.random.default_rng(1).standard_normal((N, 3))
     moved = 2.0 * t
     moved[:12] += 1000.0  # most of them, together
+    assert not left_scene(moved, t).any()
     np.testing.assert_allclose(put_back(t, moved, np.arange(12)), 2.0 * t, atol=1e-6)
     turned = t @ np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert np.abs(put_back(t, turned, np.array([3]))[3] - turned[3]).max() > 0.1  # directions know the axes
@@ -145,3 +148,114 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     assert f"{found.num_turned_pairs} pairs changed sides)" in found.statement()
     unrefined = finish(graph, solve(graph), PlacementOptions(refine=False))
     assert (unrefined.num_turned_pairs, unrefined.num_put_back) == (0, 0)
+
+
+# --- what nothing holds at its distance ------------------------------------------------------------
+
+
+def test_openness_is_the_error_that_triangulation_makes():
+    """Two rays a either side of their middle and s of noise: s / (sqrt 2 sin a) of their length."""
+    for half_angle in (np.pi / 4, 0.1, 1e-3):
+        side = np.tan(half_angle)
+        t = np.array([[-side, 0.0, 0.0], [side, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        found = openness(t, np.array([[0, 2], [1, 2]]), np.array([2]), np.full(2, 0.01))
+        length = np.hypot(side, 1.0)
+        assert found == pytest.approx([0.01 * length / (np.sqrt(2.0) * np.sin(half_angle))], rel=1e-6)
+
+
+def test_openness_does_not_depend_on_scale_nor_on_which_end_is_in_the_group():
+    t = np.random.default_rng(3).standard_normal((6, 3)) + np.array([[0, 0, 0]] * 3 + [[9, 0, 0]] * 3)
+    edges = np.array([(i, j) for i in range(3) for j in range(3, 6)])
+    noise = np.linspace(0.01, 0.02, 9)
+    found = openness(t, edges, np.array([3, 4, 5]), noise)
+    turned = np.where(np.arange(9)[:, None] % 2, edges, edges[:, ::-1])
+    other = openness(1e6 * t - 5.0, turned, np.array([3, 4, 5]), 2.0 * noise)
+    np.testing.assert_allclose(other, 2.0 * found, rtol=1e-6)
+
+
+def test_parallel_baselines_and_a_group_around_a_single_node_leave_distances_open():
+    t = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 5], [3, 0, 5], [-3, 4, -10]])
+    noise = np.full(4, 1e-3)
+    assert openness(t, np.array([[0, 2], [1, 2]]), np.array([2]), noise[:2])[0] > 1e3
+    group = np.array([2, 3, 4])  # blown up around node 0, in different directions
+    assert openness(t, np.array([[0, 2], [0, 3], [0, 4]]), group, noise[:3]).min() > 1e3
+    assert openness(t, np.array([[0, 2], [1, 3], [0, 4], [1, 4]]), group, noise).max() < 0.05
+
+
+def test_a_group_that_hangs_on_one_of_its_nodes_may_be_of_any_size():
+    t = np.array([[0.0, 0, 0], [3, 0, 0], [0, 0, 5], [0, 3, 7], [2, 0, 9]])
+    found = openness(t, np.array([[0, 2], [1, 2]]), np.array([2, 3, 4]), np.full(2, 1e-3))
+    assert found[0] < 0.01
+    assert found[1:].min() > 1e3
+
+
+@pytest.mark.parametrize(("noise_rad", "found"), [(1e-3, []), (0.2, [4])])
+def test_a_node_seen_in_nearly_one_direction_is_held_only_by_directions_that_are_exact(noise_rad, found):
+    graph, t, moved = scene(4)  # 19 pairs in a cone of about 0.6 degrees
+    assert found_strays(graph, t, moved, np.ones(graph.num_edges, dtype=bool), noise_rad) == found
+
+
+def test_a_group_blown_up_around_the_rest_is_lost_though_all_its_pairs_agree():
+    graph, t, moved = scene(*range(12, N))
+    moved[12:] *= 1e4
+    everything = np.ones(graph.num_edges, dtype=bool)
+    assert found_strays(graph, t, moved, everything, 0.01) == list(range(12, N))
+    assert found_strays(graph, t, moved, everything, 1e-9) == []
+
+
+def test_what_hangs_on_a_far_group_far_beyond_it_is_looked_at_by_itself():
+    """Two far nodes that all hold, and one a thousand times as far that only these two see."""
+    graph, t, moved = scene(4, 5)
+    moved[6] = 1e5 * t[6]
+    of_node, _ = joining(graph, 6)
+    with_two, _ = joining(graph, 4, 5)
+    kept = np.flatnonzero(~of_node | with_two)
+    hanging = ViewGraph(N, graph.edges[kept], graph.directions[kept])
+    agreeing = np.ones(len(kept), dtype=bool)
+    assert found_strays(hanging, t, moved, agreeing, 1e-3) == [6]
+
+
+def hung(t, edges, added, directions, sigma, seed):
+    """A graph with noisy directions among known places and given ones to further nodes."""
+    rng = np.random.default_rng(seed)
+    v = normalized(differences(t, edges) / np.linalg.norm(differences(t, edges), axis=1)[:, None])
+    v = np.concatenate([v, directions])
+    v = normalized(v + sigma * rng.standard_normal(v.shape))
+    return ViewGraph(int(added.max()) + 1, np.concatenate([edges, added]), v)
+
+
+def flown(placement):
+    """Distances from the median, in median distances."""
+    t = placement.locations
+    return np.linalg.norm(t - np.median(t, axis=0), axis=1) / median_spread(t)
+
+
+def test_a_group_whose_directions_to_the_rest_are_parallel_within_noise_stays_and_is_not_trusted():
+    """As a group of Madrid_Metropolis did, five cameras see the others in one direction, a degree off."""
+    problem = random_graph_problem(40, 0.5, sigma=0.01, seed=3)
+    rng = np.random.default_rng(3)
+    group = rng.standard_normal((5, 3))
+    inner = np.array([(i, j) for i in range(5) for j in range(i + 1, 5)])
+    outer = np.array([(k, 40 + a) for a in range(5) for k in rng.choice(40, 2, replace=False)])
+    directions = np.concatenate(
+        [normalized(differences(group, inner)), np.tile([[0.0, 0.0, -1.0]], (len(outer), 1))]
+    )
+    added = np.concatenate([inner + 40, outer])
+    found = place(hung(problem.locations, problem.edges, added, directions, 0.015, seed=3))
+    assert len(found.cameras) == 45
+    assert flown(found).max() < 30.0
+    trust = found.assessment.trust
+    assert trust[40:].max() < 0.1
+    assert trust[:40].min() > 0.7
+
+
+def test_a_camera_of_two_nearly_parallel_pairs_stays_and_is_named():
+    problem = random_graph_problem(40, 0.5, sigma=0.01, seed=4)
+    directions = normalized(np.array([[0.02, 0.0, -1.0], [-0.02, 0.0, -1.0]]))  # each seen from a wrong side
+    order = np.argsort(problem.locations[:, 0])
+    added = np.array([[order[5], 40], [order[-5], 40]])
+    found = place(hung(problem.locations, problem.edges, added, directions, 0.003, seed=4))
+    assert flown(found).max() < 30.0
+    assert found.assessment.trust[40] < 0.05
+    assert found.assessment.reasons[40]
+    assert found.assessment.trust[:40].min() > 0.7

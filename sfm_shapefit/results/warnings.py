@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.placement import SMALLEST_PIECE, Placement
 from sfm_shapefit.results.rows import name_of
 from sfm_shapefit.robust.finish import Finish
@@ -12,6 +13,7 @@ from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
 _ALARMING_LEVEL_DEG = 5.0
+_INSIDE = 30.0  # median distances from the median within which cameras say how large the scene is
 _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
 
 
@@ -49,7 +51,7 @@ def _collapse(finish: Finish) -> Iterator[str]:
 
 def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
-    extent = float(np.linalg.norm(np.ptp(placement.locations, axis=0)))
+    extent = _extent(placement.locations)
     largest = placement.assessment.sigmas[: len(placement.cameras)].max(axis=1)
     uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
     if np.isnan(largest).any():
@@ -60,6 +62,13 @@ def _uncertain_cameras(placement: Placement) -> Iterator[str]:
             f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
             f"above all {worst}; see sigma and trust in cameras.csv"
         )
+
+
+def _extent(locations: FloatArray) -> float:
+    """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
+    distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
+    inside = locations[distances <= _INSIDE * median_spread(locations)]
+    return float(np.linalg.norm(np.ptp(inside, axis=0)))
 
 
 def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:

@@ -1,18 +1,19 @@
 """Nodes that the refinement threw out of the scene, put back.
 
-A direction says nothing of distance, so that nothing holds a camera which fits two wrong directions by chance
-and whose others are rejected: it may slide to any distance, and does where that improves a residual a little.
-LUD, which bounds each length, has no such freedom. So groups of nodes that end far beyond its radius go back
-where it had them, unless the rest holds them there: at least two pairs with the rest agree, more than half do,
-and they leave the distance of the group open by less than a third.
+A direction says nothing of distance, so that nothing holds a camera which fits two wrong directions by
+chance and whose others are rejected, or a group of cameras that see the rest in nearly one direction: it may
+slide to any distance, and does where that improves a residual a little. LUD, which bounds each length, has no
+such freedom. So groups of nodes that end far beyond its radius go back where it had them, unless the rest
+holds them where they are: at least two pairs with the rest agree, more than half do, and they leave the
+distance of the group open by less than a third.
 
-How far a group's distance is open: baseline d_e from a node at offset x_e from the group's middle changes its
-direction by P_e (a + s x_e) / |d_e| if the group moves by a and grows by s, P_e = I - u_e u_e^T. The information
+How far a distance is open: the baseline d_e of a node at offset x_e from its group's middle changes direction
+by P_e (a + s x_e) / |d_e| if the group moves by a and grows by s, P_e = I - u_e u_e^T. The information
 
     sum_e J_e^T J_e / sigma_e^2,    J_e = P_e [I, x_e] / |d_e|,
 
-without s (its Schur complement) bounds what is known of a. Nearly parallel baselines leave a open along them,
-and a group that was blown up around the rest leaves its size open, in whatever directions it is seen. A group
+bounds what is known of a and s, and so of each node's a + s x. Nearly parallel baselines leave a open along
+them, and a group that was blown up around the rest leaves s open, in whatever directions it is seen. A group
 far outside may have others that hang on it farther out: each tenfold radius is looked at by itself.
 """
 
@@ -30,6 +31,8 @@ _FARTHER = 10.0  # from one radius to the next
 _LEAST_AGREEMENT = 0.5  # of the pairs that leave a group
 _FEWEST_AGREEING = 2  # of them with the rest: along a single direction a group may slide
 _FEWEST_OTHERS = 3  # nodes that say where the start lies
+_ROUNDING = 1e-14  # of the largest eigenvalue
+_UNKNOWN = 1e-12  # information instead: a standard deviation of a million distances
 _OPEN_SHARE = 1.0 / 3.0  # standard deviation of a distance, of itself: three of them reach to the rest
 
 
@@ -75,42 +78,43 @@ def _unheld(
     leaving = (ends[:, 0] != ends[:, 1])[:, None] & is_far
     pairs = np.bincount(ends[leaving], minlength=count)
     agreed = np.bincount(ends[leaving & agreeing[:, None]], minlength=count)  # with the rest: else one group
-    held = (agreed >= _FEWEST_AGREEING) & (agreed > _LEAST_AGREEMENT * pairs)
-    for label in np.unique(group[far & held[group]]).tolist():
+    enough = (agreed >= _FEWEST_AGREEING) & (agreed > _LEAST_AGREEMENT * pairs)
+    lost: BoolArray = far & ~enough[group]
+    for label in np.unique(group[far & enough[group]]).tolist():
         members = np.flatnonzero(group == label)
         joining = np.flatnonzero((leaving & (ends == label)).any(axis=1) & agreeing)
-        held[label] = openness(refined, graph.edges[joining], members, noise_rad[joining]) <= _OPEN_SHARE
-    lost: BoolArray = far & ~held[group]
+        lost[members] = openness(refined, graph.edges[joining], members, noise_rad[joining]) > _OPEN_SHARE
     return lost
 
 
-def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatArray) -> float:
-    """Return the standard deviation of where a group stands, along its loosest axis, over its distance.
+def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatArray) -> FloatArray:
+    """Return the standard deviation of each node of a group along its loosest axis, over its distance, (k,).
 
     Args:
         t: (n, d) locations.
         edges: (m, 2) at least one pair, each of a node of the group and another.
-        group: the nodes of the group, which moves as a whole and may grow.
+        group: (k,) the nodes of the group, which moves as a whole and may grow.
         noise_rad: (m,) standard deviation of each direction, per axis.
     """
     d = t.shape[1]
     baselines = differences(t, edges)
     lengths = np.maximum(np.linalg.norm(baselines, axis=1), np.finfo(np.float64).tiny)
     u = baselines / lengths[:, None]
-    distance = float(np.median(lengths))
-    own = np.where(np.isin(edges[:, 0], group), edges[:, 0], edges[:, 1])
-    offsets = (t[own] - t[group].mean(axis=0)) / distance
-    motions = np.concatenate([np.broadcast_to(np.eye(d), (len(u), d, d)), offsets[:, :, None]], axis=2)
-    across = motions - u[:, :, None] * (u[:, None, :] @ motions)
-    scaled = across * (distance / (lengths * noise_rad))[:, None, None]
-    information = np.einsum("eax,eay->xy", scaled, scaled)
-    growth = information[d, d]
-    shift = information[:d, :d]
-    if growth > 0.0:
-        shift = shift - np.outer(information[:d, d], information[d, :d]) / growth
-    least = float(np.linalg.eigvalsh(shift)[0])
-    rounding = 1e-14 * float(np.trace(information))
-    return float("inf") if least <= rounding else least**-0.5
+    first = np.isin(edges[:, 0], group)
+    own, other = np.where(first, edges.T, edges.T[::-1])
+    middle, unit = t[own].mean(axis=0), float(np.median(lengths))
+    motions = np.tile(np.eye(d, d + 1), (len(edges), 1, 1))
+    motions[:, :, d] = (t[own] - middle) / unit
+    seen = (motions - u[:, :, None] * (u[:, None, :] @ motions)) * (unit / (lengths * noise_rad))[
+        :, None, None
+    ]
+    values, vectors = np.linalg.eigh(np.einsum("eax,eay->xy", seen, seen))
+    values = np.where(values > _ROUNDING * values[-1], values, _UNKNOWN)
+    moves = np.tile(np.eye(d, d + 1), (len(group), 1, 1))
+    moves[:, :, d] = (t[group] - middle) / unit
+    roots = moves @ vectors / np.sqrt(values)
+    sigmas = unit * np.linalg.norm(roots, ord=2, axis=(1, 2))
+    return np.asarray(sigmas / np.linalg.norm(t[group] - t[other].mean(axis=0), axis=1))
 
 
 def put_back(start: FloatArray, refined: FloatArray, nodes: IntArray) -> FloatArray:
