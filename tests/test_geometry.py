@@ -297,10 +297,12 @@ def test_the_l1_fit_is_the_same_on_every_call():
         ([[-1.0, 0], [0, 0], [1, 0], [100, 0], [-1, 0]], 1.0),
         ([[0.0, 0], [0, 0], [0, 0], [3, 4]], 5.0),
         ([[2.0, 2], [2, 2]], 0.0),
+        ([[-1.0, 0], [0, 0], [1, 0], [1e13, 0], [-1, 0]], 1.0),
+        ([[0.0, 0], [1e-9, 0], [0, 1e-9], [1e6, 0]], 1e6),
     ],
 )
 def test_the_median_spread_ignores_far_points_unless_the_rest_coincides(points, expected):
-    assert median_spread(np.array(points)) == expected
+    assert median_spread(np.array(points)) == pytest.approx(expected, rel=1e-12)
 
 
 # --- rotations ---------------------------------------------------------------------------------------

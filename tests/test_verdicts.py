@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
+from sfm_shapefit.robust.conditioning import Looseness
 from sfm_shapefit.robust.verdicts import Verdict, assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -135,3 +136,39 @@ def test_coincident_cameras_do_not_produce_nan():
     assert np.isfinite(found.residuals_deg).all()
     assert not np.isnan(found.sigmas).any()
     assert not found.inliers[0]
+
+
+@pytest.mark.parametrize("reach", [1e4, 1e7, 1e12])
+def test_cameras_that_fly_far_outside_are_not_trusted_and_cost_the_others_nothing(reach):
+    """Three of them fly together: their pairs agree with them as well as with the rest."""
+    t, edges, _ = measured(8, n=20)
+    t[17:] = reach * normalized(t[17:])
+    v = normalized(differences(t, edges))
+    noise = SIGMA * np.random.default_rng(8).standard_normal((len(edges), 2))
+    v = normalized(v + np.einsum("edk,ek->ed", tangent_bases(v), noise))
+    found = assess(ViewGraph(20, edges, v), t)
+    assert found.trust[17:].max() < 1e-6
+    assert (found.sigmas[17:].max(axis=1) > 1.0).all()
+    without = edges.max(axis=1) < 17
+    alone = assess(ViewGraph(17, edges[without], v[without]), t[:17])
+    assert found.trust[:17].min() > 0.9
+    np.testing.assert_allclose(found.sigmas[:17], alone.sigmas, rtol=0.5)
+
+
+def test_nodes_that_nothing_is_said_to_hold_hold_no_others():
+    t, edges, v = measured(9)
+    graph, own = ViewGraph(12, edges, v), (edges == 5).any(axis=1)
+    found = assess(graph, t, unheld=np.array([5]))
+    assert np.isinf(found.sigmas[5]).all()
+    assert found.trust[5] == 0.0
+    assert found.reasons[5] == Looseness.DISTANCE.value
+    assert [(g.cameras.tolist(), g.cause) for g in found.loose_groups] == [([5], Looseness.DISTANCE)]
+    assert found.inliers[own].all()  # they fit all the same
+    assert np.isnan(found.leverages[own]).all()
+    first = int(np.flatnonzero(own)[0])
+    assert found.verdict(first) is Verdict.UNDETERMINED
+    others, _ = graph.restricted_to(np.flatnonzero(~own))
+    alone = assess(others, np.delete(t, 5, axis=0))
+    np.testing.assert_allclose(np.delete(found.sigmas, 5, axis=0), alone.sigmas, rtol=0.1)
+    assert np.delete(found.trust, 5).min() > 0.9
+    assert assess(graph, t, unheld=np.empty(0, dtype=np.int64)).trust[5] > 0.9
