@@ -45,7 +45,7 @@ def assert_feasible(graph, certificate):
     assert np.abs(np.sum(y * v, axis=1)).max() <= 1e-14 * w.max()
     violation = adjoint(y, graph.edges, graph.num_cameras) - certificate.dual_bound * scale_functional(graph)
     degree = np.bincount(graph.edges.ravel(), weights=np.repeat(w, 2)).max()
-    # A 1e5th of the gap, from 1e-12 to 5e-10. The repair aims at half of it: room for a gap that ends lower.
+    # What needs no repair: a 1e5th of the gap, from 1e-12 to 5e-10.
     allowed = min(max(1e-5 * certificate.gap, 1e-12), 5e-10)
     assert np.linalg.norm(violation, axis=1).max() <= 1.1 * allowed * degree
 

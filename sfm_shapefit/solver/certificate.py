@@ -137,7 +137,8 @@ def certify(
     if _largest(total - multiplier * c) > degree * _exact(value - multiplier / max(1.0, worst)):
         repair = _repair(graph, t, y, factor, threads)
         gap = _clip_in_rounds(repair, c, t, value, _ENOUGH * tol)
-        worst = _restore_exactly(repair, c, t, 0.5 * degree * _exact(gap))
+        allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
+        worst = _restore_exactly(repair, c, t, degree * allowed)
         total = apply_incidence_transposed(graph.edges, y, n)
     scale = 1.0 / max(1.0, worst)
     if scale < 1.0:
