@@ -79,6 +79,29 @@ def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(family
         assert 0.0 <= certificate.gap <= gap_by_unit
 
 
+def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(monkeypatch):
+    graph = drawn("comm", 400, 40)
+    split = solve_admm(graph, 1e-12, 100)
+    steps = []
+
+    def counted(*args, **kwargs):
+        found = conjugate_gradients(*args, **kwargs)
+        steps.append(found.iterations)
+        return found
+
+    monkeypatch.setattr(certificate, "conjugate_gradients", counted)
+    monkeypatch.setattr(certificate, "_LARGE", 0)  # blocks of pairs, as for a large graph
+    best = certify(graph, split.locations, split.dual)
+    most, enough = len(steps), 10.0 * best.gap
+    steps.clear()
+    found = certify(graph, split.locations, split.dual, tol=enough)
+    assert len(steps) < most
+    assert_feasible(graph, found)
+    assert best.gap < found.gap <= enough
+    again = certify(graph, split.locations, split.dual, tol=enough, threads=2)
+    assert np.array_equal(again.dual, found.dual)
+
+
 def test_on_a_collapsing_chain_the_repaired_dual_is_feasible_though_it_proves_little():
     graph = drawn("seq", 400, 24)
     split = solve_admm(graph, 1e-12, 50)
