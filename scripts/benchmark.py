@@ -7,18 +7,21 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, graph_peers, real, real_peers, scale, solver, trust
+from benchmarks import coherent, directions, families, onedsfm, peers, real, rigs, scale, solver, trust
+from benchmarks import map as mapping
 
 SUBCOMMANDS = {
     "real": real,
     "solver": solver,
     "scale": scale,
     "graphs": families,
-    "peers-graphs": graph_peers,
-    "peers-real": real_peers,
+    "peers": peers,
+    "onedsfm": onedsfm,
     "directions": directions,
     "trust": trust,
     "coherent": coherent,
+    "rigs": rigs,
+    "map": mapping,
 }
 
 

@@ -4,6 +4,7 @@
     result = solve(graph)                                   # ShapeFit with a certificate of optimality
     found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
     write_result(found, "out")
+    mapped = map_database("database.db")                    # the same from the matches alone
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     errors = evaluate(found.reconstruction, "truth")
 
@@ -15,7 +16,11 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sfm_shapefit.conversion import convert
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
+    from sfm_shapefit.mapping.options import MapOptions
+    from sfm_shapefit.mapping.results import MapResult, write_map_result
+    from sfm_shapefit.mapping.run import map_database
     from sfm_shapefit.options import LocateOptions
     from sfm_shapefit.pipeline import evaluate, inspect, locate
     from sfm_shapefit.results import LocateResult, write_result
@@ -25,7 +30,11 @@ if TYPE_CHECKING:
     from sfm_shapefit.viewgraph import ViewGraph
 
 _HOMES = {
+    "conversion": ("convert",),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
+    "mapping.options": ("MapOptions",),
+    "mapping.results": ("MapResult", "write_map_result"),
+    "mapping.run": ("map_database",),
     "options": ("LocateOptions",),
     "pipeline": ("evaluate", "inspect", "locate"),
     "results": ("LocateResult", "write_result"),
@@ -42,6 +51,8 @@ __all__ = [
     "InputError",
     "LocateOptions",
     "LocateResult",
+    "MapOptions",
+    "MapResult",
     "ShapeFitError",
     "SolverOptions",
     "SolverResult",
@@ -49,10 +60,13 @@ __all__ = [
     "UnsolvableError",
     "ViewGraph",
     "certify",
+    "convert",
     "evaluate",
     "inspect",
     "locate",
+    "map_database",
     "solve",
+    "write_map_result",
     "write_result",
 ]
 

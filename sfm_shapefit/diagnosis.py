@@ -140,6 +140,8 @@ class Inspection:
     diagnosis: Diagnosis
     theory: Theory | None
     """None if not asked for."""
+    rigs: str = "none: every image is a frame of its own"
+    """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
@@ -333,6 +335,13 @@ def _in_triangle(graph: ViewGraph) -> BoolArray:
 
 def _plan(piece: ViewGraph, options: PlacementOptions) -> Plan:
     """Return what a placement would do with the largest piece."""
+    if not options.solves_shapefit:
+        return Plan(
+            solver=options.objective,
+            solver_reason="as asked; ShapeFit is not solved, so nothing is certified",
+            second_start=False,
+            finish="the baseline's answer is kept as it is",
+        )
     choice = choose_method(piece, options)
     second = has_second_start(piece)
     if options.objective == "shapefit":

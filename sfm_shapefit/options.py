@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
 from sfm_shapefit.gauge import Scale
-from sfm_shapefit.robust.options import Objective
+from sfm_shapefit.robust.options import Filter, Objective
 from sfm_shapefit.solver.options import Method
 
 if TYPE_CHECKING:
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
+
+FIX_SOLVED = "solved"
+"""In place of a file of names: fix every image that observes a 3D point of the input."""
 
 _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time of the solve
 
@@ -32,19 +35,35 @@ class LocateOptions:
     solver: Method = "auto"
     """The ShapeFit solver; "auto" picks one and says which."""
     objective: Objective = "auto"
-    """Which start the cameras come from. ShapeFit is solved and certified always. "auto" solves LUD
-    too, which does not collapse on long chains, refines both and keeps the one that fits the angles
-    better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit."""
+    """Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which does not
+    collapse on long chains, refines both and keeps the one that fits the angles better; "shapefit" is the
+    certified answer itself, unrefined; "lud" takes LUD whatever its fit. "least-squares" and "linf" are
+    those baselines' own answers, unrefined and without any certificate, for comparison."""
+    filter: Filter = "none"
+    """What drops pairs before anything is solved: "1dsfm", those that contradict the order of the cameras
+    along random axes; "triangles", those that contradict their triangles. Goes with every objective."""
     refine: bool = True
-    """Refine the start robustly in the angles of the directions; never for "shapefit"."""
+    """Refine the start robustly in the angles of the directions; only for "auto" and "lud"."""
     points: Points = "auto"
     """3D points as extra nodes of the view graph: a few tracks per camera, whose rays fix what directions
     between cameras cannot, above all on straight roads. "auto" uses them up to 5,000 cameras."""
     tol: float = 1e-8
     """Certified gap at which the solve counts as converged."""
-    scale: Scale = "input"
-    """Gauge of the output: scale and origin of the input's centres ("unit" where it has none), or
-    "unit": centroid 0 and median distance from it 1."""
+    scale: Scale = "auto"
+    """Scale and origin of the output: "input" takes those of the input's centres ("unit" where it has none);
+    "unit" puts the centroid at 0 and the median distance from it at 1; "prior" maps onto position priors,
+    axes too; "distance" makes a known distance true; "rig" is the unit of the sensors' offsets in their rigs.
+    "auto": a known distance if one is given, else priors if a table is given, else "input". A model with
+    rigs of several cameras always has their scale, and one with two or more fixed cameras theirs."""
+    known_distance: tuple[str, str, float] | None = None
+    """Two images by name, and how far apart they are in the output's units."""
+    fix: str = ""
+    """Cameras that stay exactly where the input has them, while the others are placed around them: a text
+    file with one image name per line, or "solved": every image that observes a 3D point of the input, for new
+    images in a solved model. With two or more the scale is theirs, with one only the origin."""
+    refine_with_priors: bool = False
+    """Let the position priors that set the scale also pull the cameras, each by its standard deviation;
+    priors that are far off have no part."""
     min_inliers: int = 15
     """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
     min_inlier_ratio: float = 0.5
@@ -73,27 +92,50 @@ class LocateOptions:
             "scale": Scale,
             "solver": Method,
             "objective": Objective,
+            "filter": Filter,
             "points": Points,
         }
         for name, kind in kinds.items():
             choices = get_args(kind)
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        self._check_distance()
         if not 0.0 <= self.min_trust <= 1.0:
             raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
         if self.refine_rotations and self.directions == "relative-poses":
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
+        if self.refine_with_priors and self.scale not in ("auto", "prior"):
+            raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
         self.for_placement()
         self.for_directions()
         self.for_structure()
 
+    def _check_distance(self) -> None:
+        """Refuse a known distance that is none, or that the scale asked for has no use for."""
+        known = self.known_distance
+        if self.scale == "distance" and known is None:
+            raise ValueError("the scale distance needs known_distance: two image names and their distance")
+        if known is None:
+            return
+        if self.scale not in ("auto", "distance"):
+            raise ValueError(f"known_distance has no effect with the scale {self.scale}; leave out one")
+        is_number = len(known) == 3 and isinstance(known[2], int | float)
+        if not (is_number and isinstance(known[0], str) and isinstance(known[1], str)):
+            raise ValueError(f"known_distance must be two image names and a number, got {known!r}")
+        if not 0.0 < known[2] < float("inf") or known[0] == known[1]:
+            raise ValueError(f"known_distance must be positive, of two different images, got {known!r}")
+
     def _check_types(self) -> None:
         """Refuse values of another type by name; an integer serves as a float."""
         hints = get_type_hints(type(self))
         for item in fields(self):
             value, wanted = getattr(self, item.name), hints[item.name]
+            if item.name == "known_distance":
+                if not isinstance(value, tuple | list | None):
+                    raise ValueError(f"known_distance must be two image names and a number, got {value!r}")
+                continue
             accepted = {float: (float, int), int: (int,), bool: (bool,)}.get(wanted, (str,))
             if not isinstance(value, accepted) or (isinstance(value, bool) and wanted is not bool):
                 raise ValueError(f"{item.name} must be of type {accepted[0].__name__}, got {value!r}")
@@ -122,6 +164,7 @@ class LocateOptions:
             tol=self.tol,
             threads=self.num_threads(),
             objective=self.objective,
+            filter=self.filter,
             refine=self.refine,
         )
 

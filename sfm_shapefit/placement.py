@@ -5,23 +5,28 @@ its own. The largest is the answer; the others are kept apart.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.baselines import FILTERS, solve_baseline
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
-from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.robust.options import Filter, PlacementOptions
+from sfm_shapefit.robust.rival import Rival, find_rival
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
-from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.solver.options import IterationInfo, SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
+_MOST_WATCHED = 100_000
+"""Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -35,17 +40,27 @@ class Placement:
     """The whole graph."""
     num_cameras: int
     """The nodes 0..num_cameras-1 are cameras."""
+    dropped: IntArray
+    """Its edges that the filter left out, ascending."""
     pieces: list[RigidPiece]
-    """Its parallel-rigid pieces, most cameras first."""
+    """The parallel-rigid pieces of the others, most cameras first."""
     piece: int
     """The one that is solved: 0, the largest, or one of the further ones."""
     solve: SolverResult
-    """The certified ShapeFit optimum. Row k belongs to node `nodes[k]` of the graph, row e of the dual to
-    its edge `edges[e]`."""
+    """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
+    `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
     finish: Finish
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
+    rival: Rival | None = None
+    """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
+    history: tuple[IterationInfo, ...] = ()
+    """The iterations of the solve; empty for graphs so large that watching them would take long."""
+    bodies: Bodies | None = None
+    """The rigid bodies of all nodes of the graph, if nodes do not move one by one."""
+    unit: float | None = None
+    """Length of the unit of the offsets inside rigid bodies, in the solver's units; None without bodies."""
 
     @property
     def nodes(self) -> IntArray:
@@ -78,6 +93,11 @@ class Placement:
         return int(np.sum((self.graph.edges < self.num_cameras).all(axis=1)))
 
     @property
+    def considered(self) -> ViewGraph:
+        """The whole graph without the edges that the filter left out."""
+        return _without(self.graph, self.dropped)
+
+    @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
         rejected = self.pairs[~self.assessment.inliers[self.pairs]]
@@ -106,9 +126,15 @@ def place(
     """
     options = options or PlacementOptions()
     num_cameras = graph.num_cameras if num_cameras is None else num_cameras
-    pieces = ordered_pieces(graph, num_cameras)
-    refuse_without_triangle(graph, pieces, num_cameras)
-    return _place_piece(graph, pieces, 0, options, covariance, evidence, num_cameras)
+    dropped = _dropped_edges(graph, options.filter, num_cameras)
+    considered = _without(graph, dropped)
+    edge_of = np.setdiff1d(np.arange(graph.num_edges), dropped)
+    pieces = [
+        RigidPiece(piece.cameras, edge_of[piece.edges], piece.hinges)
+        for piece in ordered_pieces(considered, num_cameras)
+    ]
+    refuse_without_triangle(considered, pieces, num_cameras)
+    return _place_piece(graph, (dropped, pieces), 0, options, covariance, evidence, num_cameras)
 
 
 def place_further(
@@ -130,9 +156,34 @@ def place_further(
     pieces, num_cameras = placement.pieces, placement.num_cameras
     for k in range(1, count_large(pieces, num_cameras)):
         try:
-            yield _place_piece(placement.graph, pieces, k, options, covariance, evidence, num_cameras)
+            parts = placement.dropped, pieces
+            yield _place_piece(placement.graph, parts, k, options, covariance, evidence, num_cameras)
         except UnsolvableError:
             continue
+
+
+def _dropped_edges(graph: ViewGraph, name: Filter, num_cameras: int) -> IntArray:
+    """Return the edges that a filter leaves out; it looks at pairs of cameras only."""
+    pairs = np.flatnonzero((graph.edges < num_cameras).all(axis=1))
+    if name == "none":
+        return pairs[:0]
+    between = ViewGraph(num_cameras, graph.edges[pairs], graph.directions[pairs], graph.weights[pairs])
+    dropped: IntArray = pairs[~FILTERS[name](between)]
+    if len(dropped) == len(pairs):
+        raise UnsolvableError(
+            f"the filter {name} leaves none of the {len(pairs)} pairs; use another, or none"
+        )
+    return dropped
+
+
+def _without(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
+    """Return a graph of the same nodes without some of its edges."""
+    if len(dropped) == 0:
+        return graph
+    kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
+    return ViewGraph(
+        graph.num_cameras, graph.edges[kept], graph.directions[kept], graph.weights[kept], graph.names
+    )
 
 
 def ordered_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
@@ -156,28 +207,41 @@ def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_came
 
 def _place_piece(
     graph: ViewGraph,
-    pieces: list[RigidPiece],
+    parts: tuple[IntArray, list[RigidPiece]],
     k: int,
     options: PlacementOptions,
     covariance: FloatArray | None,
     evidence: Evidence | None,
     num_cameras: int,
 ) -> Placement:
-    """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`."""
+    """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`.
+
+    `parts` are the edges that the filter left out, and the pieces of the others.
+    """
+    dropped, pieces = parts
     nodes, edges = pieces[k].cameras, pieces[k].edges
     piece, _ = graph.restricted_to(edges)
     known = None if covariance is None else covariance[edges]
     classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
     heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
-    solved = solve(piece, options)
+    history: list[IterationInfo] = []
+    watch = history.append if piece.num_edges <= _MOST_WATCHED else None
+    solved = (
+        solve(piece, options, watch) if options.solves_shapefit else solve_baseline(piece, options.objective)
+    )
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
+    assessment = assess(piece, finished.locations, known, heard, placed)
+    rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,
         num_cameras=num_cameras,
+        dropped=dropped,
         pieces=pieces,
         piece=k,
         solve=solved,
         finish=finished,
-        assessment=assess(piece, finished.locations, known, heard, placed),
+        assessment=assessment,
+        rival=None if rival is None else replace(rival, cameras=nodes[rival.cameras]),
+        history=tuple(history),
     )

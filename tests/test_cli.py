@@ -46,7 +46,7 @@ def ring_out(tmp_path_factory):
 def test_locate_writes_the_model_and_its_tables(ring_out):
     written = {path.name for path in ring_out.iterdir()}
     model = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    assert written == model | {"locate.json", "cameras.csv", "pairs.csv"}
+    assert written == model | {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert pycolmap.Reconstruction(ring_out).num_reg_images() == 8
 
 
@@ -239,12 +239,12 @@ def test_an_unwritable_place_is_refused_before_any_work(tmp_path):
 
 
 def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    from sfm_shapefit import results
+    from sfm_shapefit.results import files
 
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(results, "write_rows", interrupted)
+    monkeypatch.setattr(files, "write_rows", interrupted)
     assert "interrupted" in refused(run("locate", RING_MODEL, tmp_path / "out"), 130)
     assert list(tmp_path.iterdir()) == []
 
@@ -344,8 +344,9 @@ def test_a_model_without_points_is_warned_about(tmp_path):
 def test_a_signal_while_writing_leaves_nothing(tmp_path, number):
     script = f"""
 import os, sys
-from sfm_shapefit import cli, results
-results.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
+from sfm_shapefit import cli
+from sfm_shapefit.results import files
+files.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()
 """

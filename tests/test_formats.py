@@ -84,8 +84,8 @@ def test_a_last_coordinate_of_zero_is_no_weight(tmp_path):
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "no pairs"),
-        ("# nothing\n\n", "no pairs"),
+        ("", "no lines of the form i j vx vy vz"),
+        ("# nothing\n\n", "no lines of the form"),
         ("0 1 1 0 0\n\n1 2 0 1\n", "line 3: has 4 columns"),
         ("0 1 1 0 0\n1 2 0 x 1\n", "line 2: 'x' is not a number"),
         ("0 1 1 0 0\n1 2 0 nan 1\n", "line 2: has a number that is not finite"),
@@ -121,7 +121,8 @@ def test_solve_places_a_bare_graph(tmp_path, d):
     assert (facts["num_images"], facts["num_placed"], facts["dimension"]) == (13, 12, d)
     assert facts["solve"]["gap"] <= 1e-8
     assert (tmp_path / "g.txt").read_bytes() == before
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"locate.json", "cameras.csv", "pairs.csv"}
+    written = {path.name for path in (tmp_path / "out").iterdir()}
+    assert written == {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
 
     header, *lines = (tmp_path / "out" / "cameras.csv").read_text().splitlines()
     rows = {line.split(",")[0]: dict(zip(header.split(","), line.split(","), strict=True)) for line in lines}
@@ -138,3 +139,18 @@ def test_a_graph_that_determines_nothing_exits_with_4(tmp_path):
     result = CliRunner().invoke(app, ["solve", str(tmp_path / "g.txt"), str(tmp_path / "out")])
     assert result.exit_code == 4
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("word", ["--5", "-", "9" * 5000])
+def test_ids_that_only_look_like_numbers_are_words(tmp_path, word):
+    path = tmp_path / "graph.txt"
+    path.write_text(f"1 2 1 0 0\n2 {word} 0 1 0\n")
+    assert read_graph(path).names == tuple(sorted(["1", "2", word]))
+
+
+@pytest.mark.parametrize("weight", ["1e308", "1e-300"])
+def test_weights_whose_squares_overflow_are_refused_by_line(tmp_path, weight):
+    path = tmp_path / "graph.txt"
+    path.write_text(f"1 2 1 0 0 1\n2 3 0 1 0 {weight}\n")
+    with pytest.raises(InputError, match="line 2: has a weight beyond"):
+        read_graph(path)

@@ -1,4 +1,4 @@
-"""scripts/benchmark.py on bare graphs: `solver`, `scale`, `peers-graphs`, and what their limits mean."""
+"""scripts/benchmark.py on bare graphs: `solver`, `scale`, `peers`, and what their limits mean."""
 
 import math
 import os
@@ -242,7 +242,7 @@ def test_a_peer_is_beaten_by_error_or_by_time():
     [
         (["solver", "--sizes", "50,x"], "'50,x' is not a list of sizes"),
         (["scale", "--families", "geo,star"], "unknown family star; known: geo, comm, er, seq"),
-        (["peers-graphs", "--problems", "er2-9"], "unknown problem er2-9; known: er2-100"),
+        (["peers", "--problems", "er2-9"], "unknown problem er2-9; known: er2-100"),
     ],
 )
 def test_wrong_usage_is_explained(arguments, message, capsys):
@@ -255,7 +255,7 @@ def test_wrong_usage_is_explained(arguments, message, capsys):
 def test_a_peer_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
     monkeypatch.setattr(graph_peers, "find_spec", lambda _package: None)
     peer = next(one for one in graph_peers.CONTENDERS if one.package == "gtsam")
-    found = graph_peers._answer(peer, SMALL, 1.0)
+    found = graph_peers.answer(peer, SMALL, 1.0)
     assert found.note == "skipped: gtsam is not installed"
     assert math.isnan(found.error)
 
@@ -312,5 +312,5 @@ def test_the_scale_benchmark_writes_its_section_and_plot(tmp_path):
 
 @pytest.mark.slow
 def test_an_answer_that_comes_too_late_is_shown_as_a_failure():
-    found = graph_peers._answer(graph_peers.CONTENDERS[0], SMALL, 0.01)
+    found = graph_peers.answer(graph_peers.CONTENDERS[0], SMALL, 0.01)
     assert found.note == "failed: no answer within 0.01 s"

@@ -34,6 +34,21 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     np.testing.assert_allclose(found.edges, whole[edges[:, 0], :, edges[:, 1], :], atol=limit)
 
 
+def test_entries_are_right_where_the_factor_is_cut_into_tasks():
+    edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
+    factor = factorise(analyse(6000, edges), np.ones(len(edges)), ground=7.0)
+    assert len(factor.symbolic.tasks) > 1
+    found = selected_inverse(factor, edges)
+    for node in range(0, 6000, 600):
+        right = np.zeros((6000, 1))
+        right[node] = 1.0
+        column = factor.solve(right)[:, 0]
+        tied = edges[edges[:, 0] == node]
+        limit = 1e-9 * np.abs(column).max()
+        np.testing.assert_allclose(found.nodes[node, 0, 0], column[node], atol=limit)
+        np.testing.assert_allclose(found.edges[edges[:, 0] == node, 0, 0], column[tied[:, 1]], atol=limit)
+
+
 def test_a_single_precision_factor_is_refused():
     edges = box_graph_problem(20, 8.0).edges
     factor = factorise(analyse(20, edges), np.tile(np.eye(3), (len(edges), 1, 1)), dtype=np.float32)

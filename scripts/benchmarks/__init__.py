@@ -10,8 +10,12 @@
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
+    rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
     trust.py     subcommand `trust`: standard deviations and trust against errors
-    graph_peers.py    subcommand `peers-graphs`: pytheia and gtsam on bare graphs
+    onedsfm.py   subcommand `onedsfm`: the published scene Madrid Metropolis
+    peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
+    graph_peers.py    ... on bare graphs
+    real_peers.py     ... on real scenes
 
 A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.
 """

@@ -137,6 +137,33 @@ def position(database: Path, model: Path, setting: Setting) -> Positioned:
     return Positioned(reconstruction, num_tracks, read - start, done - read)
 
 
+def map_globally(database: Path, min_num_matches: int) -> tuple[pycolmap.Reconstruction, float]:
+    """Run pycolmap's whole global mapping: own rotations, positioning, triangulation, bundle adjustment.
+
+    Args:
+        database: the COLMAP database; only a copy of it is opened.
+        min_num_matches: pairs with fewer matches are not used.
+
+    Returns:
+        The largest model and the seconds of the call.
+
+    Raises:
+        RuntimeError: if no model came out.
+    """
+    options = pycolmap.GlobalPipelineOptions()
+    options.min_num_matches = min_num_matches
+    options.random_seed = 0
+    options.mapper.global_positioning.use_gpu = False
+    with tempfile.TemporaryDirectory() as folder:
+        copied = copy_database(database, Path(folder))
+        start = time.perf_counter()
+        models = pycolmap.global_mapping(copied, folder, Path(folder) / "out", options)
+        seconds = time.perf_counter() - start
+    if not models:
+        raise RuntimeError("pycolmap.global_mapping made no model")
+    return max(models.values(), key=lambda model: model.num_reg_images()), seconds
+
+
 def take_rotations(reconstruction: pycolmap.Reconstruction, reference: pycolmap.Reconstruction) -> None:
     """Give images of `reconstruction` the reference's rotations and intrinsics, by name, and centres 0."""
     ids = {image.name: image_id for image_id, image in reconstruction.images.items()}

@@ -11,30 +11,24 @@ pytheia and gtsam are optional (`pip install pytheia gtsam`, the extra `peers`);
 so.
 """
 
-import argparse
 import contextlib
 import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from benchmarks.graphs import GraphSpec, draw, relative_error, view_graph
-from benchmarks.metrics import Check, Quantity, number, numbers, ratio, times, verdict
-from benchmarks.process import call, thread_environment
-from benchmarks.record import environment, legend, table, write_section
+from benchmarks.metrics import Check, numbers, ratio
+from benchmarks.process import call, peak_memory_mb, reset_peak, thread_environment
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
     from sfm_shapefit.viewgraph import ViewGraph
 
-HELP = "Bare graphs beside pytheia and gtsam; a peer that is not installed is skipped with a sentence."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pytheia", "gtsam")
 TIMEOUT_S = 150.0
 FASTER = 5.0
 """Times faster than the fastest peer of equal or better error, to be reached."""
@@ -64,6 +58,8 @@ class Answer:
     ours: bool
     error: float = math.nan
     seconds: float = math.nan
+    peak_mb: float = math.nan
+    """Peak resident memory of its process while the clock ran, in 10^6 bytes."""
     note: str = ""
     """Why there is no answer, or what else it says."""
 
@@ -78,99 +74,23 @@ class Compared:
     answers: tuple[Answer, ...]
 
 
-QUANTITIES = (
-    Quantity(
-        name="error",
-        unit="1",
-        better="lower",
-        rel_tol=0.05,
-        meaning="against the truth, both centred and of unit norm; a peer's random start changes its own",
-    ),
-    Quantity(
-        name="seconds", unit="s", better="lower", rel_tol=0.5, meaning="wall-clock of the call alone, one run"
-    ),
-    Quantity(
-        name="error / ours",
-        unit="1",
-        better="higher",
-        rel_tol=0.05,
-        meaning="a peer's error over that of our best answer; above 1 ours is better",
-    ),
-    Quantity(
-        name="seconds / ours",
-        unit="1",
-        better="higher",
-        rel_tol=0.5,
-        meaning="a peer's time over that of our best answer (the same one); above 1 ours is faster",
-    ),
-)
+# --- running ---------------------------------------------------------------------------------------
 
 
-# --- the subcommand --------------------------------------------------------------------------------
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `peers-graphs`."""
-    parser.add_argument(
-        "--problems", type=problems, default=list(PROBLEMS), help="names, with commas; all by default"
-    )
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds per answer (default 150)")
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
-
-
-def problems(text: str) -> list[str]:
-    """Parse `--problems`."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in names if name not in PROBLEMS]
-    if unknown or not names:
-        raise argparse.ArgumentTypeError(
-            f"unknown problem {', '.join(unknown) or '(none)'}; known: {', '.join(PROBLEMS)}"
-        )
-    return list(dict.fromkeys(names))
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section and write it; a missed limit is no failure."""
-    about = environment(PACKAGES, command_line(args))
-    compared = []
-    for name in args.problems:
-        spec = PROBLEMS[name]
-        answers = []
-        for contender in CONTENDERS:
-            answers.append(_answer(contender, spec, args.timeout))
-            found = answers[-1]
-            figures = f"error {number(found.error)}, {number(found.seconds)} s"
-            print(f"{name}, {found.name}: {figures} {found.note}", file=sys.stderr, flush=True)
-        compared.append(
-            Compared(name=name, num_cameras=spec.n, num_edges=len(draw(spec).edges), answers=tuple(answers))
-        )
-    body = section(compared, about, args.timeout)
-    print(body)
-    write_section(args.out, "peers-graphs", body)
-    return 0
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats the measurement, without paths."""
-    chosen = "" if args.problems == list(PROBLEMS) else f" --problems {','.join(args.problems)}"
-    limit = "" if args.timeout == TIMEOUT_S else f" --timeout {args.timeout:g}"
-    return f"python scripts/benchmark.py peers-graphs{chosen}{limit}"
-
-
-def _answer(contender: "Contender", spec: GraphSpec, timeout_s: float) -> Answer:
+def answer(contender: "Contender", spec: GraphSpec, timeout_s: float) -> Answer:
     """Return a contender's answer, or why there is none."""
     empty = Answer(name=contender.name, ours=contender.package is None)
     if contender.package is not None and find_spec(contender.package) is None:
         return replace(empty, note=f"skipped: {contender.package} is not installed")
     try:
-        error, seconds, note = call(
+        error, seconds, note, peak_mb = call(
             measure, contender.name, spec, environment=thread_environment(1), timeout_s=timeout_s
         )
     except TimeoutError:
         return replace(empty, note=f"failed: no answer within {timeout_s:g} s")
     except RuntimeError as reason:
         return replace(empty, note=f"failed: {reason}")
-    return replace(empty, error=error, seconds=seconds, note=note)
+    return replace(empty, error=error, seconds=seconds, note=note, peak_mb=peak_mb)
 
 
 # --- the contenders --------------------------------------------------------------------------------
@@ -294,14 +214,15 @@ CONTENDERS = (
 # --- measuring -------------------------------------------------------------------------------------
 
 
-def measure(name: str, spec: GraphSpec) -> tuple[float, float, str]:
-    """Return a contender's error, seconds and note on a problem; to be called once per process."""
+def measure(name: str, spec: GraphSpec) -> tuple[float, float, str, float]:
+    """Return error, seconds, note and peak memory of a contender; to be called once per process."""
     contender = next(one for one in CONTENDERS if one.name == name)
     if contender.package is None:
         for warm_up in dict.fromkeys((spec.family, "er2", "small")):  # compiled code is loaded
             contender.prepare(view_graph(draw(WARM_UP[warm_up])))()
     problem = draw(spec)
     runs = []
+    reset_peak()
     for _ in range(contender.runs):
         solver = contender.prepare(view_graph(problem))
         start = time.perf_counter()
@@ -311,7 +232,7 @@ def measure(name: str, spec: GraphSpec) -> tuple[float, float, str]:
     error, seconds, note = runs[len(runs) // 2]
     if len(runs) > 1:
         note = f"median of {len(runs)} random starts, errors {numbers([run[0] for run in runs])}"
-    return error, seconds, note
+    return error, seconds, note, peak_memory_mb()
 
 
 def _gathered(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
@@ -372,54 +293,3 @@ def checks(one: Compared) -> list[Check]:
             Check(name="times faster", value=ratio(min(as_good), seconds), limit=FASTER, better="higher")
         )
     return found
-
-
-# --- the section -----------------------------------------------------------------------------------
-
-
-def section(compared: Sequence[Compared], about: str, timeout_s: float) -> str:
-    """Return the section of the file of results."""
-    every = [check for one in compared for check in checks(one)]
-    parts = [
-        "## Peers on bare graphs",
-        about
-        + f"- Threads: 1; a fresh process each, ended after {timeout_s:g} s, imports included; our code is"
-        " warmed up on a small graph first, so that nothing is compiled while the clock runs",
-        f"**{sum(check.met for check in every)} of {len(every)} limits met**: our best answer has the lowest"
-        f" error, and is {FASTER:g} times faster than the fastest peer of equal or lower error, if any. Peers"
-        " without an answer are in no limit.",
-        _answer_table(compared),
-        _verdict_table(compared),
-        "### What the columns mean",
-        legend(QUANTITIES),
-    ]
-    return "\n\n".join(part.strip() for part in parts)
-
-
-def _answer_table(compared: Sequence[Compared]) -> str:
-    rows = []
-    for one in compared:
-        ours = best_of_ours(one)
-        for answer in one.answers:
-            compare = ours is not None and not answer.ours
-            rows.append(
-                [
-                    f"{one.name} ({one.num_edges} pairs)",
-                    answer.name,
-                    number(answer.error),
-                    number(answer.seconds),
-                    times(ratio(answer.error, ours.error)) if ours and compare else "-",
-                    times(ratio(answer.seconds, ours.seconds)) if ours and compare else "-",
-                    answer.note,
-                ]
-            )
-    header = ["problem", "method", "error", "seconds", "error / ours", "seconds / ours", "note"]
-    return table(header, rows)
-
-
-def _verdict_table(compared: Sequence[Compared]) -> str:
-    rows = []
-    for one in compared:
-        ours = best_of_ours(one)
-        rows.append([one.name, "-" if ours is None else ours.name, verdict(checks(one))])
-    return table(["problem", "our best answer", "verdict"], rows)

@@ -1,59 +1,39 @@
-"""Real scenes: pytheia's and gtsam's translation averaging beside ours, on the same directions.
+"""Real scenes: pytheia's, gtsam's and pycolmap's ways to positions beside ours.
 
-Peers get the directions that `locate` measures, all of its rigid piece, with the same rotations and before
-any bundle adjustment. Ours stands twice: from the same directions alone, all cameras kept, and as `locate`
-does it by default, with points as nodes and without the cameras it does not trust. Every contender runs in
-its own fresh process, on one thread, once; errors are taken after robust alignment to the truth, over the
-cameras that the contender places. Differences below 5 % count as equal: the truth is no better.
+pytheia and gtsam get the directions that `locate` measures, all of its rigid piece, with the same rotations
+and before any bundle adjustment. pycolmap's global positioning gets the same rotations and intrinsics and the
+tracks of the same matches, in the three settings of `glomap`; its global mapping gets the database alone,
+averages rotations itself and ends with bundle adjustment, in two settings. Ours stands twice: from the same
+directions alone, all cameras kept, and as `locate` does it by default, with points as nodes and without the
+cameras it does not trust. Every contender runs in its own fresh process, on one thread, once; errors are
+taken after robust alignment to the truth, over the cameras that the contender places.
 """
 
-import argparse
 import math
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from benchmarks.graph_peers import CONTENDERS as GRAPH_CONTENDERS
-from benchmarks.graph_peers import Contender
-from benchmarks.metrics import Check, Quantity, number, verdict
-from benchmarks.process import call, thread_environment
-from benchmarks.real import SCENES, Errors, Scene, scene_names
-from benchmarks.record import environment, legend, table, write_section
+from benchmarks.metrics import Check
+from benchmarks.process import call, peak_memory_mb, reset_peak, thread_environment
+from benchmarks.real import Errors, Scene
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results import LocateResult
+    import pycolmap
 
-HELP = (
-    "Real scenes beside pytheia and gtsam on the same directions; a missing peer is skipped with a sentence."
-)
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pycolmap", "pytheia", "gtsam")
-TIMEOUT_S = 150.0
+    from sfm_shapefit.arrays import FloatArray
+
 EQUAL = 1.05
-PEERS = tuple(contender for contender in GRAPH_CONTENDERS if contender.package is not None)
+"""Differences below count as equal: the truth is no better."""
 SAME_DIRECTIONS, BY_DEFAULT = "ours, the same directions", "ours, `locate` by default"
-OURS = (Contender(name=SAME_DIRECTIONS, prepare=None), Contender(name=BY_DEFAULT, prepare=None))
-
-QUANTITIES = (
-    Quantity(
-        name="median / mean / max",
-        unit="the set's",
-        better="lower",
-        rel_tol=0.05,
-        meaning="position error after robust (L1) alignment, over the cameras that are placed",
-    ),
-    Quantity(
-        name="seconds",
-        unit="s",
-        better="lower",
-        rel_tol=0.5,
-        meaning="the call that turns directions into positions, one run; for `locate`, placing and judging",
-    ),
-)
+POSITIONING, MAPPING = "pycolmap positioning", "pycolmap mapping"
+_MAPPING_MATCHES = (15, 30)
+_ON_DIRECTIONS = tuple(one.name for one in GRAPH_CONTENDERS if one.package is not None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,136 +43,176 @@ class Row:
     name: str
     errors: Errors | None = None
     seconds: float = math.nan
+    peak_mb: float = math.nan
     note: str = ""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `peers-real`."""
-    parser.add_argument("--sets", type=scene_names, default=list(SCENES), help="names, with commas")
-    parser.add_argument(
-        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the sets"
-    )
-    parser.add_argument("--timeout", type=float, default=TIMEOUT_S, help="seconds per answer (default 150)")
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+class Directions(NamedTuple):
+    """The graph that peers get, as plain arrays that can be sent to another process."""
+
+    cameras: Any
+    """(n,) images of the model, by position."""
+    edges: Any
+    directions: Any
+    weights: Any
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section and write it; a missed limit is no failure."""
-    about = environment(PACKAGES, "python scripts/benchmark.py peers-real")
-    found = {}
-    for name in args.sets:
-        scene, folder = SCENES[name], args.data / name
-        if not folder.is_dir():
-            print(f"skipped: {name} not found in {args.data}", file=sys.stderr)
-            continue
-        found[name] = [_answer(c, folder, scene, args.timeout) for c in (*OURS, *PEERS)]
-        for row in found[name]:
-            print(name, row.name, _cell(row.errors), row.note, file=sys.stderr, flush=True)
-    if found:
-        body = section(found, about)
-        print(body)
-        write_section(args.out, "peers-real", body)
-    return 0
+class Located(NamedTuple):
+    """What a contender gave, named as in the model."""
+
+    names: tuple[str, ...]
+    centers: Any
+    seconds: float
+    peak_mb: float
+    note: str
 
 
-def _answer(contender: Contender, folder: Path, scene: Scene, timeout_s: float) -> Row:
-    """Return a contender's answer, or why there is none."""
-    empty = Row(name=contender.name)
-    if contender.package is not None and find_spec(contender.package) is None:
-        return replace(empty, note=f"skipped: {contender.package} is not installed")
+def contenders() -> tuple[str, ...]:
+    """Return the names of all contenders, ours first."""
+    from benchmarks.glomap import SETTINGS
+
+    positioning = (f"{POSITIONING}, {setting.label}" for setting in SETTINGS)
+    mapping = (f"{MAPPING}, min_num_matches {count}" for count in _MAPPING_MATCHES)
+    return (SAME_DIRECTIONS, BY_DEFAULT, *_ON_DIRECTIONS, *positioning, *mapping)
+
+
+def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, timeout_s: float) -> Row:
+    """Return a contender's answer on a set, or why there is none.
+
+    Args:
+        name: one of `contenders`.
+        folder: of the set.
+        scene: what the set is.
+        directions: what `measured_directions` gave, or the reason why there are none.
+        timeout_s: limit of the process, imports included.
+    """
+    empty = Row(name=name)
+    package = next((one.package for one in GRAPH_CONTENDERS if one.name == name), None)
+    if package is not None and find_spec(package) is None:
+        return replace(empty, note=f"skipped: {package} is not installed")
+    if package is not None and isinstance(directions, str):
+        return replace(empty, note=f"failed: {directions}")
+    run = partial(_located, name) if package is None else partial(_solved, name, directions)
     try:
-        errors, seconds, note = call(
-            measure, contender.name, folder, scene, environment=thread_environment(1), timeout_s=timeout_s
-        )
+        found = call(run, folder, environment=thread_environment(1), timeout_s=timeout_s)
+        errors = _errors(found, folder, scene)
     except TimeoutError:
         return replace(empty, note=f"failed: no answer within {timeout_s:g} s")
     except RuntimeError as reason:
         return replace(empty, note=f"failed: {reason}")
-    return replace(empty, errors=errors, seconds=seconds, note=note)
+    return replace(empty, errors=errors, seconds=found.seconds, peak_mb=found.peak_mb, note=found.note)
 
 
-def measure(name: str, folder: Path, scene: Scene) -> tuple[Errors, float, str]:
-    """Return a contender's errors, seconds and note on a set; to be called once per process."""
+def measured_directions(folder: Path) -> Directions:
+    """Return the directions of the rigid piece that `locate` places."""
+    from sfm_shapefit import locate
+    from sfm_shapefit.options import LocateOptions
+
+    placement = locate(
+        folder / "sparse" / "0", options=LocateOptions(threads=1, points="never", min_trust=0.0)
+    ).placement
+    graph, cameras = placement.graph.restricted_to(placement.edges)
+    return Directions(cameras, graph.edges, graph.directions, graph.weights)
+
+
+def _solved(name: str, directions: Directions, folder: Path) -> Located:
+    """Run a solver of bare graphs; to be called once per process."""
+    from sfm_shapefit import ViewGraph
+    from sfm_shapefit.colmap.model import read_model
+
+    model = read_model(folder / "sparse" / "0")
+    graph = ViewGraph(len(directions.cameras), directions.edges, directions.directions, directions.weights)
+    solver = next(one for one in GRAPH_CONTENDERS if one.name == name).prepare(graph)
+    reset_peak()
+    start = time.perf_counter()
+    locations, note = solver()
+    seconds, peak = time.perf_counter() - start, peak_memory_mb()
+    return Located(tuple(model.names[c] for c in directions.cameras), locations, seconds, peak, note)
+
+
+def _located(name: str, folder: Path) -> Located:
+    """Run what starts from the database; to be called once per process."""
+    if name in (SAME_DIRECTIONS, BY_DEFAULT):
+        return _ours(name, folder)
+    from benchmarks.glomap import SETTINGS, map_globally, position, quiet
+
+    database = folder / "database.db"
+    reset_peak()
+    with quiet():
+        if name.startswith(MAPPING):
+            model, seconds = map_globally(database, int(name.rsplit(" ", 1)[1]))
+            note = "own rotations, bundle adjusted"
+        else:
+            setting = next(one for one in SETTINGS if name == f"{POSITIONING}, {one.label}")
+            found = position(database, folder / "sparse" / "0", setting)
+            model, seconds, note = found.reconstruction, found.positioning_s, f"{found.num_tracks} tracks"
+    peak = peak_memory_mb()
+    names, centers = _centers(model)
+    return Located(names, centers, seconds, peak, note)
+
+
+def _ours(name: str, folder: Path) -> Located:
     import numpy as np
 
     from sfm_shapefit import locate
     from sfm_shapefit.options import LocateOptions
 
     options = LocateOptions(threads=1)
-    if name != BY_DEFAULT:
+    if name == SAME_DIRECTIONS:
         options = replace(options, points="never", min_trust=0.0)
-    model = folder / "sparse" / "0"
-    found = locate(model, options=options)
-    if name in (SAME_DIRECTIONS, BY_DEFAULT):
-        found = locate(model, options=options)  # the first run also loads compiled code
-        left = int(np.sum(~found.kept))
-        cameras = found.placement.cameras[found.kept]
-        note = f"{left} not trusted" if left else ""
-        locations, seconds = found.placement.locations[found.kept], found.timings_s["solve"]
-    else:
-        contender = next(peer for peer in PEERS if peer.name == name)
-        graph, cameras = found.placement.graph.restricted_to(found.placement.edges)
-        solver = contender.prepare(graph)
-        start = time.perf_counter()
-        locations, note = solver()
-        seconds = time.perf_counter() - start
-    return _errors(found, cameras, locations, folder / scene.truth), seconds, note
+    locate(folder / "sparse" / "0", options=options)  # compiled code is loaded
+    reset_peak()
+    found = locate(folder / "sparse" / "0", options=options)
+    peak, left = peak_memory_mb(), int(np.sum(~found.kept))
+    cameras = found.placement.cameras[found.kept]
+    return Located(
+        tuple(found.model.names[c] for c in cameras),
+        found.placement.locations[found.kept],
+        found.timings_s["solve"],
+        peak,
+        f"{left} not trusted" if left else "",
+    )
 
 
-def _errors(found: "LocateResult", cameras: Sequence[int], locations: object, truth: Path) -> Errors:
-    """Return the position errors of some of a model's cameras."""
+def _centers(model: "pycolmap.Reconstruction") -> "tuple[tuple[str, ...], FloatArray]":
+    import numpy as np
+
+    images = [model.image(image_id) for image_id in sorted(model.reg_image_ids())]
+    return tuple(image.name for image in images), np.array([image.projection_center() for image in images])
+
+
+def _errors(found: Located, folder: Path, scene: Scene) -> Errors:
+    """Return the position errors of the cameras that a contender placed."""
+    import numpy as np
+
     from sfm_shapefit.colmap.model import read_model
     from sfm_shapefit.evaluation import evaluate_poses
 
-    model, reference = found.model, read_model(truth, poses_only=True)
-    position = evaluate_poses(
-        [model.names[c] for c in cameras],
-        model.rotations[cameras],
-        locations,
-        reference.names,
-        reference.rotations,
-        reference.centers,
-    ).position
-    missing = sum(name in set(reference.names) for name in model.names) - len(cameras)
+    truth = read_model(folder / scene.truth)
+    if len(set(found.names) & set(truth.names)) < 3:
+        raise RuntimeError("fewer than three cameras of the truth are placed")
+    nowhere = np.tile(np.eye(3), (len(found.names), 1, 1))  # rotations are not compared
+    errors = evaluate_poses(found.names, nowhere, found.centers, truth.names, truth.rotations, truth.centers)
+    given = set(read_model(folder / "sparse" / "0").names) & set(truth.names)
+    position = errors.position
+    missing = len(given - set(found.names))
     return Errors(median=position.median, mean=position.mean, max=position.max, num_missing=missing)
 
 
 def checks(rows: Sequence[Row]) -> list[Check]:
-    """Return the limits of one set: our default's errors against the lowest of the peers'."""
+    """Return the limits of one set: our default's errors against the lowest of the peers'.
+
+    Mapping ends with bundle adjustment and is no peer of positions alone; it is shown, not raced.
+    """
     ours = next(row for row in rows if row.name == BY_DEFAULT)
-    peers = [row.errors for row in rows if row.name not in (SAME_DIRECTIONS, BY_DEFAULT) and row.errors]
+    peers = [
+        row.errors
+        for row in rows
+        if row.name not in (SAME_DIRECTIONS, BY_DEFAULT) and not row.name.startswith(MAPPING) and row.errors
+    ]
     if ours.errors is None or not peers:
         return []
     return [
         Check(name=kind, value=getattr(ours.errors, kind), limit=EQUAL * min(getattr(e, kind) for e in peers))
         for kind in ("median", "mean")
     ]
-
-
-def section(found: dict[str, list[Row]], about: str) -> str:
-    """Return the section of the file of results."""
-    every = [check for rows in found.values() for check in checks(rows)]
-    rows = [
-        [f"{name} ({SCENES[name].unit})", row.name, _cell(row.errors), number(row.seconds), row.note]
-        for name, answers in found.items()
-        for row in answers
-    ]
-    verdicts = [[name, verdict(checks(answers))] for name, answers in found.items()]
-    parts = [
-        "## Peers on real scenes",
-        about + "- Threads: 1; a fresh process each",
-        f"**{sum(check.met for check in every)} of {len(every)} limits met**: by default `locate` has a"
-        " median and a mean error at most 5 % above the lowest of the peers'.",
-        table(["set", "method", "median / mean / max", "seconds", "note"], rows),
-        table(["set", "verdict"], verdicts),
-        "### What the columns mean",
-        legend(QUANTITIES),
-    ]
-    return "\n\n".join(part.strip() for part in parts)
-
-
-def _cell(errors: Errors | None) -> str:
-    if errors is None:
-        return "-"
-    text = f"{number(errors.median)} / {number(errors.mean)} / {number(errors.max)}"
-    return f"{text} ({errors.num_missing} missing)" if errors.num_missing else text

@@ -11,25 +11,33 @@ place of cones: Moulon, Monasse and Marlet, "Global fusion of relative motions",
 import warnings
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.baselines.gauge import unit_gauge
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.viewgraph import ViewGraph
 
+_MOST_PAIRS = 20_000  # minutes
+
 
 def locate_linf(graph: ViewGraph) -> FloatArray:
     """Return the l_inf locations (n, d).
 
     Raises:
-        UnsolvableError: if the cone solver finds no point.
+        UnsolvableError: if the graph is too large, or the cone solver finds no point.
     """
     import cvxpy as cp
 
     n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
-    incidence = np.zeros((m, n))
-    incidence[np.arange(m), graph.edges[:, 0]] = 1.0
-    incidence[np.arange(m), graph.edges[:, 1]] = -1.0
+    if m > _MOST_PAIRS:
+        raise UnsolvableError(
+            f"l_inf goes through a generic cone solver, for at most {_MOST_PAIRS} pairs; this graph has {m}, "
+            "so choose another objective"
+        )
+    rows = np.tile(np.arange(m), 2)
+    signs = np.repeat([1.0, -1.0], m)
+    incidence = csr_array((signs, (rows, graph.edges.T.ravel())), shape=(m, n))
     t, s, gamma = cp.Variable((n, d)), cp.Variable((m, 1)), cp.Variable()
     misfits = incidence @ t - cp.multiply(s, graph.directions)
     bounded = cp.SOC(gamma * np.ones(m), misfits, axis=1)

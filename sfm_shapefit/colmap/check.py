@@ -31,6 +31,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.jit import kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
@@ -68,6 +69,8 @@ def check_model_files(folder: Path) -> None:
             repeated, or refers to something that is not there.
     """
     suffix = model_suffix(folder)
+    for name in (*REQUIRED_FILES, "rigs", "frames"):
+        refuse_irregular_file(folder / f"{name}{suffix}")
     has_rigs = (folder / f"rigs{suffix}").exists()
     has_frames = (folder / f"frames{suffix}").exists()
     if has_rigs != has_frames:

@@ -15,6 +15,7 @@ to 4.2 (columns that came later, identity or zero poses that mean "none") measur
 """
 
 import os
+import secrets
 import shutil
 import sqlite3
 import struct
@@ -24,6 +25,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import numpy as np
@@ -32,7 +34,9 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.matches import MatchBatch, RelativePoses
 from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.output import locked_folder, remove_abandoned
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
@@ -47,6 +51,21 @@ _WAL_VERSION = 2  # bytes 18 and 19 of the header
 _LOCK_TIMEOUT_S = 2.0
 _COPY_ATTEMPTS = 3
 _MIN_TRANSLATION = 1e-12  # stored translations are 1, or of the scene's size; shorter ones mean "none"
+
+# A database may come from anywhere: what no query of this module needs is not allowed.
+_LIMITS = {
+    sqlite3.SQLITE_LIMIT_LENGTH: 2**29,  # bytes of a value or a row; 20 million keypoints, 67 million matches
+    sqlite3.SQLITE_LIMIT_SQL_LENGTH: 100_000,  # of the schema's statements too
+    sqlite3.SQLITE_LIMIT_COLUMN: 100,
+    sqlite3.SQLITE_LIMIT_EXPR_DEPTH: 20,
+    sqlite3.SQLITE_LIMIT_COMPOUND_SELECT: 3,
+    sqlite3.SQLITE_LIMIT_VDBE_OP: 10_000,
+    sqlite3.SQLITE_LIMIT_FUNCTION_ARG: 10,
+    sqlite3.SQLITE_LIMIT_ATTACHED: 0,
+    sqlite3.SQLITE_LIMIT_LIKE_PATTERN_LENGTH: 100,
+    sqlite3.SQLITE_LIMIT_TRIGGER_DEPTH: 1,
+    sqlite3.SQLITE_LIMIT_WORKER_THREADS: 0,
+}
 
 _REQUIRED_COLUMNS = {
     "images": ("image_id", "name"),
@@ -87,6 +106,25 @@ def open_database(
             _check_schema(file, connection)
             database = MatchDatabase(file, connection, model, cache_bytes)
         yield database
+
+
+def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
+    """Return the rows of the first query whose columns `table` has; none if it fits none of them.
+
+    Args:
+        path: the database; it is not changed.
+        table: whose columns decide, for schemas differ from version to version.
+        queries: what to select, by the columns of `table` that it needs.
+
+    Raises:
+        InputError: if the file is missing, is no sqlite database, is locked or damaged.
+    """
+    with _sqlite_errors(path), _readonly_connection(path) as connection:
+        columns = _columns(connection, table)
+        for needed, query in queries.items():
+            if columns.issuperset(needed):
+                return connection.execute(query).fetchall()
+    return []
 
 
 class MatchDatabase:
@@ -224,9 +262,9 @@ class MatchDatabase:
         return np.frombuffer(qvec + tvec, dtype="<f8")
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
-        """Return the matches of the chosen pairs, without repetitions and matches that have no ray."""
+        """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
         keypoints, pair_of = self._read_match_rows(chosen)
-        keypoints, pair_of = _without_repetitions(keypoints, pair_of)
+        keypoints, pair_of = _in_order(keypoints, pair_of)
         bounds = np.searchsorted(pair_of, np.arange(len(chosen) + 1))
         rays = np.empty((2, len(keypoints), 3))
         for k, pair in enumerate(chosen.tolist()):
@@ -316,20 +354,24 @@ def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
             closing(sqlite3.connect(uri, uri=True, timeout=_LOCK_TIMEOUT_S, isolation_level=None))
         )
         connection.text_factory = lambda raw: raw.decode("utf-8", "surrogateescape")
+        for limit, value in _LIMITS.items():
+            connection.setlimit(limit, value)
         connection.execute("PRAGMA trusted_schema = OFF")
+        connection.execute("PRAGMA cell_size_check = ON")
         connection.execute("PRAGMA query_only = ON")
         yield connection
 
 
 def _read_header(path: Path) -> bytes:
     """Return the first 100 bytes of a database, or refuse a file that is none."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder; give the database file itself")
+    refuse_irregular_file(path)
     try:
         with path.open("rb") as stream:
             header = stream.read(100)
     except FileNotFoundError:
         raise InputError(f"the database {path} does not exist") from None
-    except IsADirectoryError:
-        raise InputError(f"{path} is a folder; give the database file itself") from None
     except OSError as error:
         raise InputError(f"the database {path} cannot be read: {error.strerror}") from None
     if not header:
@@ -370,10 +412,13 @@ def _size(path: Path) -> int:
 def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
     files = [path, *(_sidecar(path, suffix) for suffix in _SIDECARS)]
+    parent = Path(tempfile.gettempdir())
+    remove_abandoned(parent, ".shapefit-*.copy")
     for _ in range(_COPY_ATTEMPTS):
         before = _fingerprints(files)
         try:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sfm_shapefit_")))
+            name = f".shapefit-{secrets.token_hex(8)}.copy"
+            folder = stack.enter_context(locked_folder(parent / name))
             for file in filter(Path.exists, files):
                 shutil.copyfile(file, folder / file.name)
         except OSError as error:
@@ -428,12 +473,33 @@ def _columns(connection: sqlite3.Connection, table: str) -> set[str]:
 
 
 def _check_schema(path: Path, connection: sqlite3.Connection) -> None:
-    """Refuse a database without the tables and columns that are read."""
+    """Refuse a database without the tables and columns that are read, or that computes what they hold.
+
+    A view, a virtual table and a generated column run code of whoever made the database when they are read.
+    """
     for table, required in _REQUIRED_COLUMNS.items():
+        _refuse_computed(path, connection, table)
         columns = _columns(connection, table)
         if missing := [name for name in required if name not in columns]:
             what = f"no column {missing[0]} in its table {table}" if columns else f"no table {table}"
             raise InputError(f"{path} is not a COLMAP database: it has {what}")
+
+
+def _refuse_computed(path: Path, connection: sqlite3.Connection, table: str) -> None:
+    """Refuse a table that is none, or whose rows are computed."""
+    kinds = connection.execute(
+        "SELECT type, rootpage FROM sqlite_master WHERE type IN ('table', 'view') AND lower(name) = ?",
+        (table,),
+    )
+    if any(kind != "table" or not page for kind, page in kinds):  # a virtual table has no page of its own
+        raise InputError(
+            f"{path} is not a COLMAP database: its {table} is a view or a virtual table, not a table"
+        )
+    hidden = connection.execute(
+        "SELECT name FROM pragma_table_xinfo(?) WHERE hidden != 0", (table,)
+    ).fetchone()
+    if hidden is not None:
+        raise InputError(f"{path} is not a COLMAP database: its {table} has a computed column {hidden[0]!r}")
 
 
 def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) -> dict[int, int]:
@@ -518,17 +584,18 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
 
 def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     """Return whether `data` is a blob of rows x cols items."""
-    return isinstance(data, bytes) and isinstance(rows, int) and len(data) == rows * cols * itemsize
+    if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
+        return False
+    return len(data) == rows * cols * itemsize
 
 
-def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Drop all but the first occurrence of each match (M, 2) within its pair; pairs stay in order."""
-    columns = (pair_of, keypoints[:, 0], keypoints[:, 1])
-    order = np.lexsort(columns[::-1])
-    in_order = [column[order] for column in columns]
-    repeated = np.logical_and.reduce([column[1:] == column[:-1] for column in in_order])
-    if not repeated.any():
-        return keypoints, pair_of
-    keep = np.ones(len(keypoints), dtype=np.bool_)
-    keep[order[1:][repeated]] = False  # lexsort is stable: the first of equals comes first
+def _in_order(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Sort the matches (M, 2) within each pair and drop repetitions; pairs stay in order.
+
+    Sums over matches then do not depend on the order in which the database lists them.
+    """
+    order = np.lexsort((keypoints[:, 1], keypoints[:, 0], pair_of))
+    keypoints, pair_of = keypoints[order], pair_of[order]
+    repeated = (pair_of[1:] == pair_of[:-1]) & (keypoints[1:] == keypoints[:-1]).all(axis=1)
+    keep = np.append(True, ~repeated)[: len(pair_of)]
     return keypoints[keep], pair_of[keep]

@@ -42,8 +42,11 @@ def estimate_directions(
         estimate_pairs(rows, offsets, a, b, pixel_angles, *settings, directions, measures, moments)
 
     shares = np.array_split(np.arange(k, dtype=np.int64), max(1, threads))
-    with ThreadPoolExecutor(max(1, threads)) as pool:
-        list(pool.map(run, shares))
+    if len(shares) == 1:
+        run(shares[0])
+    else:
+        with ThreadPoolExecutor(len(shares)) as pool:
+            list(pool.map(run, shares))
     return _judged(pairs, np.diff(offsets), directions, measures, moments, options)
 
 

@@ -22,6 +22,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
+_DIVERGED = 1e6  # times the least residual so far: rounding leads, and no longer the system
+
 Operator = Callable[[FloatArray], FloatArray]
 
 
@@ -360,6 +362,9 @@ def conjugate_gradients(
 ) -> GradientsResult:
     """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
 
+    Where rhs is out of L's reach by rounding, or L is singular beyond constants, steps in the end lead away:
+    the iteration stops then, and the iterate of least residual is returned.
+
     Args:
         operator: maps (n, k) to L times it.
         preconditioner: an `ApproximateCholesky`, `JacobiPreconditioner` or `CholeskyFactor`.
@@ -382,8 +387,9 @@ def conjugate_gradients(
     scale = np.where(scale > 0.0, scale, 1.0)
     p = np.zeros_like(b)
     rho_before = np.ones_like(scale)
-    k = 0
-    while (_norms(r, coupled) > tol * scale).any() and k < max_iterations:
+    k, best, least = 0, x, float(np.max(_norms(r, coupled) / scale, initial=0.0))
+    largest = least
+    while (_norms(r, coupled) > tol * scale).any() and k < max_iterations and largest <= _DIVERGED * least:
         z = preconditioner.solve(r)
         z = z - z.mean(axis=0)
         rho = _products(r, z, coupled)
@@ -395,8 +401,10 @@ def conjugate_gradients(
         r = r - alpha * q
         rho_before = np.where(rho > 0.0, rho, 1.0)
         k += 1
-    residual = float(np.max(_norms(r, coupled) / scale, initial=0.0))
-    return GradientsResult(x - x.mean(axis=0), k, residual, bool(residual <= tol))
+        largest = float(np.max(_norms(r, coupled) / scale, initial=0.0))
+        if largest < least:
+            best, least = x, largest
+    return GradientsResult(best - best.mean(axis=0), k, least, bool(least <= tol))
 
 
 def _products(a: FloatArray, b: FloatArray, coupled: bool) -> FloatArray:

@@ -48,18 +48,27 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
         raise ValueError("selected_inverse takes a float64 factor and the edges it was planned for")
     nodes = np.empty((plan.num_nodes, b, b))
     blocks = np.empty((plan.num_edges, b, b))
-    waiting = np.empty(plan.stack_size * b * b)
+    waiting = np.empty((plan.stack_size + plan.arena_size) * b * b)
+    places = _places(plan) * b * b
     with one_blas_thread():
         for s in range(plan.num_supernodes - 1, -1, -1):
-            front = _front_inverse(factor, s, waiting)
-            _hand_to_children(plan, b, s, front, waiting)
+            front = _front_inverse(factor, s, int(places[s]), waiting)
+            _hand_to_children(plan, b, s, front, places, waiting)
             _store(plan, b, s, front, nodes, blocks)
     reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
     blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
     return SelectedInverse(nodes=nodes, edges=blocks)
 
 
-def _front_inverse(factor: CholeskyFactor, s: int, waiting: FloatArray) -> FloatArray:
+def _places(plan: SymbolicFactor) -> IntArray:
+    """Return where the block of each supernode waits, (S,): one task at a time has the arena."""
+    places = plan.update_offsets.copy()
+    for begin, end in plan.tasks.tolist():
+        places[begin : end - 1] += plan.stack_size
+    return places
+
+
+def _front_inverse(factor: CholeskyFactor, s: int, start: int, waiting: FloatArray) -> FloatArray:
     """Return the inverse on all rows of a supernode's panel, own columns first."""
     plan, b = factor.symbolic, factor.block
     width = int(plan.first[s + 1] - plan.first[s]) * b
@@ -71,7 +80,6 @@ def _front_inverse(factor: CholeskyFactor, s: int, waiting: FloatArray) -> Float
     front = np.empty((width + below, width + below))
     front[:width, :width] = inverse_root.T @ inverse_root
     if below:
-        start = int(plan.update_offsets[s]) * b * b
         rest = waiting[start : start + below * below].reshape(below, below)
         y = panel[:, width:].T @ inverse_root
         cross = -(rest @ y)
@@ -82,12 +90,14 @@ def _front_inverse(factor: CholeskyFactor, s: int, waiting: FloatArray) -> Float
     return front
 
 
-def _hand_to_children(plan: SymbolicFactor, b: int, s: int, front: FloatArray, waiting: FloatArray) -> None:
+def _hand_to_children(
+    plan: SymbolicFactor, b: int, s: int, front: FloatArray, places: IntArray, waiting: FloatArray
+) -> None:
     """Copy to each child's place on the stack what it needs of its parent's front."""
     for child in plan.children[plan.child_pointers[s] : plan.child_pointers[s + 1]].tolist():
         there = plan.relative[plan.row_pointers[child] : plan.row_pointers[child + 1]].astype(np.int64)
         rows = (there[:, None] * b + np.arange(b)).ravel()
-        start = int(plan.update_offsets[child]) * b * b
+        start = int(places[child])
         waiting[start : start + len(rows) ** 2] = front[np.ix_(rows, rows)].ravel()
 
 

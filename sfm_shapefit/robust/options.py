@@ -5,7 +5,8 @@ from typing import Literal, get_args
 
 from sfm_shapefit.solver.options import SolverOptions
 
-Objective = Literal["auto", "shapefit", "lud"]
+Filter = Literal["none", "1dsfm", "triangles"]
+Objective = Literal["auto", "shapefit", "lud", "least-squares", "linf"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -13,15 +14,29 @@ class PlacementOptions(SolverOptions):
     """Settings of a placement."""
 
     objective: Objective = "auto"
-    """Which start the locations come from. ShapeFit is solved and certified always. "auto" solves LUD
-    too, which does not collapse on long chains, refines both and keeps the one that fits the angles
-    better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its fit."""
+    """Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which does not
+    collapse on long chains, refines both and keeps the one that fits the angles better; "shapefit" is the
+    certified answer itself, unrefined; "lud" takes LUD whatever its fit. "least-squares" and "linf" are
+    those baselines' own answers, unrefined and without any certificate, for comparison."""
+    filter: Filter = "none"
+    """What drops pairs before anything is solved: "1dsfm", those that contradict the order of the cameras
+    along random axes; "triangles", those that contradict their triangles. Goes with every objective."""
     refine: bool = True
-    """Refine the start robustly in the angles of the directions; never for "shapefit"."""
+    """Refine the start robustly in the angles of the directions; only for "auto" and "lud"."""
 
     def __post_init__(self) -> None:
         super(PlacementOptions, self).__post_init__()
-        if self.objective not in get_args(Objective):
-            raise ValueError(
-                f"PlacementOptions.objective must be one of {get_args(Objective)}, got {self.objective!r}"
-            )
+        for name, kind in (("objective", Objective), ("filter", Filter)):
+            choices, value = get_args(kind), getattr(self, name)
+            if value not in choices:
+                raise ValueError(f"PlacementOptions.{name} must be one of {choices}, got {value!r}")
+
+    @property
+    def solves_shapefit(self) -> bool:
+        """Whether ShapeFit is solved, which alone is certified."""
+        return self.objective in ("auto", "shapefit", "lud")
+
+    @property
+    def refines(self) -> bool:
+        """Whether the start is to be refined in angles."""
+        return self.refine and self.objective in ("auto", "lud")

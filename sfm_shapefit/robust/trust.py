@@ -3,19 +3,22 @@
     trust = min(1, agreement / usual) * hold
 
 agreement    the share of the camera's matches with the main body of cameras that agree with the
-             solution, with a prior of a few matches for and as many against. A pair agrees if its direction
+             solution, with a prior of a few matches, of which half the square of the median share are for
+             the camera. A pair agrees if its direction
              lies within 3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts
              if the direction lies farther off, or if it has none because most of its matches contradict
-             the given rotations. A pair counts with its number of matches, up to a limit.
+             the given rotations. A pair counts with its number of matches, up to a limit; if it agrees,
+             less its leverage: a direction that decides itself where the camera goes is no evidence.
 usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere,
              having its part of them says nothing against a camera.
 hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median
              distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
              leave 10 % open.
 
-So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. In a clean scene 2/3
-means that there is no evidence either way; a camera whose matches speak against it as much as for it has
-1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
+So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. Where there is no
+evidence either way, trust is 2/3 in a clean scene, and 2/3 of the median share where pairs are wrong: what
+nothing checks is right as often as the rest. In a clean scene a camera whose matches speak against it as much
+as for it has 1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
 
 Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
 symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
@@ -23,7 +26,7 @@ they stand to the rest. Counted are only the pairs with the main body of cameras
 correlation clustering: two bodies join while the agreeing matches between them outweigh the contradicting
 ones, the strongest first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of
 image and mesh graphs by lifted multicuts", section 4). So each group is judged by all its pairs with the rest
-together.
+together. Bodies are about who agrees with whom, not about evidence: leverages do not count there.
 
 Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
 together they count at most half as much as all agreements.
@@ -43,7 +46,8 @@ _AGREEING_ANGLE_RAD = np.radians(3.0)
 _AGREEING_SIGMAS = 5.0
 _MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
-_PRIOR = 15.0  # matches for the camera, and as many against
+_PRIOR = 30.0  # matches, half of them for the camera in a clean scene
+_LEAST_MEDIAN = 0.5
 _MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
 _UNKNOWN_SUPPORT = 50.0  # of a pair that does not say
 _USUAL_SHARE = 0.75  # of the median agreement of all cameras: a camera with that much loses nothing
@@ -106,7 +110,9 @@ def judge_cameras(
     sigmas_of_pairs: FloatArray,
     sigmas: FloatArray,
     conditioning: Conditioning,
+    leverages: FloatArray,
     evidence: Evidence | None = None,
+    rigid: IntArray | None = None,
 ) -> CameraTrust:
     """Return the trust of each camera and the reasons for a low one.
 
@@ -118,18 +124,29 @@ def judge_cameras(
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
         conditioning: how well the pairs hold its k cameras; nodes beyond are points, whose rays speak for or
             against a camera like pairs.
+        leverages: (m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside
+            the largest rigid piece of those, and everywhere if unknown.
         evidence: support and contradicting pairs; unknown if None.
+        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of
+            all its cameras together; every node is its own if None.
     """
     num_cameras = len(conditioning.num_pairs)
     votes = _votes(graph, angles, sigmas_of_pairs, evidence)
-    body: BoolArray = np.ones(graph.num_cameras, dtype=np.bool_)
+    labels = np.arange(graph.num_cameras) if rigid is None else rigid
+    heard, votes = _checked(votes, leverages), votes.of_bodies(labels)
+    body: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
-        body = main_body(graph.num_cameras, votes.pairs, signed)
-    agreement = _shares(votes, body)[:num_cameras]
+        body = main_body(len(body), votes.pairs, signed)
+    agreement = _shares(heard.of_bodies(labels), body, int(labels[:num_cameras].max()) + 1)[
+        labels[:num_cameras]
+    ]
+    body = body[labels]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
-    trust = np.minimum(agreement / usual, 1.0) * hold
+    # Where most cameras have no agreement at all, any agreement is more than usual.
+    relative = agreement / usual if usual > 0.0 else (agreement > 0.0).astype(np.float64)
+    trust = np.minimum(relative, 1.0) * hold
     few = conditioning.num_pairs <= FEW_PAIRS
     reasons = [""] * num_cameras
     for k in np.flatnonzero(trust < _LOW).tolist():
@@ -144,6 +161,12 @@ class _Votes:
     pairs: IntArray
     agrees: BoolArray
     weights: FloatArray
+
+    def of_bodies(self, labels: IntArray) -> "_Votes":
+        """Return the votes between the bodies of these labels (n,) in place of their nodes."""
+        pairs = labels[self.pairs]
+        outer = pairs[:, 0] != pairs[:, 1]
+        return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])
 
 
 def _votes(
@@ -164,8 +187,17 @@ def _votes(
     return _Votes(pairs, agrees, weights)
 
 
-def _shares(votes: _Votes, body: BoolArray) -> FloatArray:
-    """Return the share of each node's matches with the body that agree, prior included."""
+def _checked(votes: _Votes, leverages: FloatArray) -> _Votes:
+    """Return the votes with agreeing pairs counted by how far others check them; as they are if unknown."""
+    if not np.isfinite(leverages).any():
+        return votes
+    checked = np.ones(len(votes.pairs))
+    checked[: len(leverages)] = 1.0 - np.nan_to_num(leverages, nan=1.0)
+    return _Votes(votes.pairs, votes.agrees, np.where(votes.agrees, checked, 1.0) * votes.weights)
+
+
+def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
+    """Return the share of each camera's matches with the body that agree, prior included."""
     n = len(body)
     i, j = votes.pairs.T
     counts = np.zeros((2, n))
@@ -173,8 +205,11 @@ def _shares(votes: _Votes, body: BoolArray) -> FloatArray:
         for row, chosen in enumerate((votes.agrees, ~votes.agrees)):
             used = chosen & body[other]
             counts[row] += np.bincount(own[used], weights=votes.weights[used], minlength=n)
-    good, bad = counts + _PRIOR
-    return np.asarray(good / (good + bad))
+    good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
+    spoken = heard > 0.0
+    median = float(np.median(good[spoken] / heard[spoken])) if spoken.any() else 1.0
+    median = max(median, _LEAST_MEDIAN)  # a collapsed answer, with which hardly anything agrees
+    return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
 
 
 def main_body(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:

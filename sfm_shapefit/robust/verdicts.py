@@ -18,17 +18,21 @@ camera say together is `trust`.
 
 import enum
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtri
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
 from sfm_shapefit.rigidity import parallel_rigid_pieces
+from sfm_shapefit.robust.body_uncertainty import propagate_bodies
 from sfm_shapefit.robust.conditioning import LooseGroup, condition
 from sfm_shapefit.robust.trust import Evidence, judge_cameras
 from sfm_shapefit.robust.uncertainty import propagate
+from sfm_shapefit.solver.bodies import largest_tied
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -96,6 +100,8 @@ def assess(
     covariance: FloatArray | None = None,
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
+    bodies: Bodies | None = None,
+    held: int | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -107,6 +113,8 @@ def assess(
         evidence: support of the pairs, and pairs that have no direction because their matches contradict the
             given rotations; unknown if None.
         num_cameras: k, the first so many nodes are cameras and the others points; all if None.
+        bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
+        held: the body that stays where it is; the mean of the cameras does if None.
     """
     freedom = graph.dimension - 1
     k = graph.num_cameras if num_cameras is None else num_cameras
@@ -114,7 +122,8 @@ def assess(
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
-    num_unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    num_bodies = graph.num_cameras if bodies is None else bodies.num_bodies
+    num_unknowns = graph.dimension * (num_bodies - 1) - (1 if bodies is None else 0)
     excess, inliers = _excess(residuals, own, behind, num_unknowns)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
@@ -128,10 +137,14 @@ def assess(
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if errors is None else errors / scale
-    sigmas, leverages = _propagated(graph, locations, inliers, information, k, errors)
+    propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
+    sigmas, leverages = propagated(graph, locations, inliers, information, k, errors)
     sigmas = scale * sigmas
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
-    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, evidence)
+    rigid = None if bodies is None else bodies.body_of
+    judged = judge_cameras(
+        graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
+    )
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,
@@ -254,5 +267,47 @@ def _propagated(
     extent = np.ptp(locations[held], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
     sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
+    leverages[rows] = found.leverages
+    return sigmas, leverages
+
+
+def _propagated_over(
+    bodies: Bodies,
+    held: int | None,
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    errors: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the standard deviations (n, d) and the leverages (m,) of rigid bodies, their scale held.
+
+    Only the bodies that the inlier pairs tie at these locations have any: those around the one that is held,
+    or most cameras.
+    """
+    sigmas = np.full(locations.shape, np.inf)
+    leverages = np.where(inliers, np.nan, 0.0)
+    cameras = np.bincount(bodies.body_of[:num_cameras], minlength=bodies.num_bodies)
+    tied = largest_tied(graph.edges[inliers], bodies, cameras, locations, around=held)
+    inside = np.isin(bodies.body_of, tied)
+    rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
+    if len(tied) < 2 or len(rows) == 0:
+        return sigmas, leverages
+    nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
+    share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
+    samples = None if errors is None else errors[rows]
+    part = bodies.restricted_to(nodes)
+    try:
+        found = propagate_bodies(
+            locations[nodes], edges, information[rows], part, share / share.sum(), samples
+        )
+    except UnsolvableError:
+        found = None
+    if found is None:
+        return np.full(locations.shape, np.nan), leverages
+    extent = np.ptp(locations[nodes], axis=0).max()
+    is_loose = (found.sigmas > extent).any(axis=1)
+    sigmas[nodes] = np.where(is_loose[:, None], np.inf, found.sigmas)
     leverages[rows] = found.leverages
     return sigmas, leverages

@@ -63,11 +63,10 @@ _REPAIRS = 4  # each repair shrinks the equality residual to the rounding of the
 _CG_STEPS = 500  # 10 to 60 on all but long chains
 _EDGE_BLOCKS, _LARGE = 4, 200_000  # pairs from which the passes over them run by blocks, on several threads
 _SEED = 1
-_EXACT_PER_GAP = (
-    1e-5  # an equality residual that needs no repair, per gap: it moves the bound by some 100 times it
-)
+_EXACT_PER_GAP = 1e-5  # an equality residual that needs no repair, per gap: the bound moves by 100 times it
 _LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of it
 _ENOUGH = 0.8  # rounds end at this share of the gap asked for: the exact repair may cost the rest
+_UNREPAIRED = 1e-9  # an equality residual, relative to the largest degree, that no bound may rest on
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
 _REGULAR_SINGLE = 1e-3  # the same for a factor in single precision: far above its rounding, n d eps
@@ -145,7 +144,8 @@ def certify(
         y *= scale
         total *= scale
     bound = float(np.sum(total * c) / np.sum(c * c))
-    if bound <= 0.0:  # y = 0 is feasible and proves at least this
+    # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
+    if not (bound > 0.0 and _largest(total - bound * c) <= _UNREPAIRED * degree):
         y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
     return Certificate(
         objective=value,

@@ -21,6 +21,7 @@ class Status(enum.Enum):
         "the solver stalled above the tolerance; the certified gap says how far off the answer may be"
     )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+    NOT_SOLVED = "another objective was asked for, so ShapeFit was not solved and nothing is certified"
     CANCELLED = "on_iteration cancelled the solve; these are the last iterate and what it proves"
 
 

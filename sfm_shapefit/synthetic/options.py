@@ -84,6 +84,35 @@ _SMALLEST_INTEGERS = {
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RenderOptions:
+    """How a scene is drawn, where images are asked for. Every field is a flag of `sfm-shapefit synth`."""
+
+    repeated_fraction: float = 0.0
+    """Fraction of the houses (of the tower's sides in a ring) that look the same, so that matches of
+    different ones are wrong and agree."""
+    radial_k1: float = -0.05
+    """First radial distortion coefficient of the lens, as OpenCV and COLMAP define it."""
+    radial_k2: float = 0.01
+    """Second radial distortion coefficient."""
+    gray_noise: float = 2.0
+    """Standard deviation of the sensor's noise, in grey levels of 255."""
+    exposure_spread: float = 0.05
+    """Standard deviation of the brightness factor from image to image."""
+    jpeg_quality: int = 92
+    """Of the image files, 1 to 100."""
+
+    def __post_init__(self) -> None:
+        for name in ("radial_k1", "radial_k2"):
+            if not -0.5 <= getattr(self, name) <= 0.5:
+                raise ValueError(f"RenderOptions.{name} must lie in [-0.5, 0.5], got {getattr(self, name)}")
+        for name, most in (("repeated_fraction", 1.0), ("gray_noise", 100.0), ("exposure_spread", 0.3)):
+            if not 0.0 <= getattr(self, name) <= most:
+                raise ValueError(f"RenderOptions.{name} must lie in [0, {most}], got {getattr(self, name)}")
+        if not 1 <= self.jpeg_quality <= 100:
+            raise ValueError(f"RenderOptions.jpeg_quality must lie in [1, 100], got {self.jpeg_quality}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WorkspaceOptions:
     """What stands in the workspace. Every field is a flag of `sfm-shapefit synth`."""
 

@@ -1,0 +1,340 @@
+"""Faults while running: signals at random moments, full disks, little memory, rivals, locks.
+
+What must hold each time: OUT is absent or whole, the input is untouched, the message is one sentence, and
+what a killed run left behind is gone after the next run.
+"""
+
+import argparse
+import os
+import resource
+import shutil
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from abuse import verdicts
+from abuse.fuzz import caches, command_line, make_base, warm
+from abuse.sandbox import Outcome, run_forked, start_forked
+
+HELP = "signals, full disks, little memory, rivals and locks while a command runs"
+_PROJECT = Path(__file__).resolve().parents[2]
+_NOBODY = 65534
+_EXTRA_MEMORY = (0, 2, 5, 10, 20, 40, 80, 160, 320)  # MB beyond what the idle process maps
+_FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)  # bytes that a file may have
+
+Problems = Iterator[str]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--moments", type=int, default=50, help="per signal, in a warm process")
+    parser.add_argument("--cold", type=int, default=5, help="per signal, in processes of their own")
+    parser.add_argument("--rivals", type=int, default=20, help="rounds of two runs into the same place")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--work", type=Path, help="where cases are made; a temporary folder by default")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all faults, print each problem and a table; 1 if there is a problem."""
+    with tempfile.TemporaryDirectory() as temporary:
+        bench = Bench((args.work or Path(temporary)).resolve())
+        rng = np.random.default_rng(args.seed)
+        checks: dict[str, Callable[[], Problems]] = {
+            **{
+                f"{number.name} at {args.moments} moments": partial(
+                    signals, bench, number, rng.random(args.moments)
+                )
+                for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+            },
+            **{
+                f"{number.name} at {args.cold} moments of a cold process": partial(
+                    cold_signals, bench, number, rng.random(args.cold)
+                )
+                for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+            },
+            "files that may not grow": partial(small_files, bench),
+            "a full disk": partial(full_disk, bench),
+            "little memory": partial(little_memory, bench),
+            f"two runs at once, {args.rivals} times": partial(rivals, bench, args.rivals),
+            "a read-only input": partial(read_only_input, bench),
+            "a database in use": partial(locked_database, bench),
+        }
+        failed = False
+        for name, check in checks.items():
+            bench.endings.clear()
+            problems = list(check())
+            failed |= bool(problems)
+            endings = ", ".join(f"{count} x {ending}" for ending, count in bench.endings.most_common())
+            print(f"{'FAILED' if problems else 'held':7}{name}: {endings}", flush=True)
+            for problem in problems:
+                print(f"    {problem}", flush=True)
+    return int(failed)
+
+
+class Bench:
+    """A warm process with a sound scene, and folders to run commands in."""
+
+    def __init__(self, work: Path) -> None:
+        self.base = make_base(work / "base")
+        self.expected = warm(self.base)["database"]
+        self.folder = work / "case"
+        self.endings: Counter[str] = Counter()
+        self.duration_s = min(self._sound_run_s() for _ in range(3))
+        self.before: dict[str, str] = {}
+
+    def _sound_run_s(self) -> float:
+        self.prepare()
+        start = time.perf_counter()
+        outcome = run_forked(self.locate(), self.folder, [self.folder, *caches()])
+        if outcome.code:
+            raise RuntimeError(f"the sound run failed: {outcome.stderr}")
+        return time.perf_counter() - start
+
+    def prepare(self) -> None:
+        """Make a fresh folder with the input."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+        (self.folder / "tmp").mkdir(parents=True)
+        (self.folder / "place").mkdir()
+        shutil.copytree(self.base / "sparse", self.folder / "sparse")
+        shutil.copyfile(self.base / "database.db", self.folder / "database.db")
+        self.before = verdicts.snapshot(self.folder)
+
+    def arguments(self, *extra: str, out: str = "place/out") -> tuple[str, ...]:
+        """Return the command that is disturbed."""
+        return ("locate", "sparse/0", out, "--database", "database.db", "--threads", "1", *extra)
+
+    def locate(self, *extra: str, out: str = "place/out") -> Callable[[], None]:
+        """Return the command as a function for a child."""
+        return partial(command_line, self.arguments(*extra, out=out), self.folder / "tmp")
+
+    def note(self, outcome: Outcome) -> Outcome:
+        """Count how a run ended."""
+        sentence = outcome.stderr.strip().replace(str(self.folder), "").removeprefix("sfm-shapefit: ")
+        self.endings[f"exit {outcome.code}" + (f" ({sentence[:90]})" if sentence else "")] += 1
+        return outcome
+
+    def problems(self, *, strays: bool = False) -> Problems:
+        """Yield what is not as it must be: the input, OUT, and, unless accepted, strays."""
+        after = verdicts.snapshot(self.folder)
+        yield from (f"changed {name}" for name in self.before if after.get(name) != self.before[name])
+        out = self.folder / "place" / "out"
+        if out.exists():
+            yield from self.problems_of(out)
+        new = [name for name in after.keys() - self.before.keys() if not name.startswith("place/out")]
+        if new and not strays:
+            yield f"left {sorted(new)[0]}"
+
+    def problems_of(self, out: Path) -> Problems:
+        """Yield what is wrong with an output."""
+        try:
+            yield from verdicts.faults_of_tables(out)
+            yield from verdicts.faults_of_model(out)
+            if verdicts.differs(verdicts.positions(out), self.expected):
+                yield "another answer"
+        except OSError as error:
+            yield f"the output is not whole: {error}"
+
+
+# --- signals ---------------------------------------------------------------------------------------------
+
+
+def signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Problems:
+    """Send a signal at random moments of a run; every other run replaces an earlier output."""
+    for k, moment in enumerate(moments.tolist()):
+        bench.prepare()
+        overwrite = k % 2 == 1
+        if overwrite:
+            run_forked(bench.locate(), bench.folder, [bench.folder])
+        extra = ("--overwrite",) if overwrite else ()
+        child = start_forked(bench.locate(*extra), bench.folder, [bench.folder, *caches()])
+        time.sleep(moment * 1.05 * bench.duration_s)
+        os.kill(child.pid, number)
+        outcome = bench.note(child.finish())
+        yield from _after_signal(bench, number, outcome.code, outcome.stderr, overwrite=overwrite)
+
+
+def cold_signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Problems:
+    """The same in processes that start afresh: most of their time goes into loading."""
+    command = [sys.executable, "-m", "sfm_shapefit.cli", *bench.arguments()]
+    environment = {**os.environ, "PYTHONPATH": str(_PROJECT), "TMPDIR": str(bench.folder / "tmp")}
+    start = time.perf_counter()
+    bench.prepare()
+    subprocess.run(command, cwd=bench.folder, env=environment, check=True, capture_output=True)
+    duration_s = time.perf_counter() - start
+    for moment in moments.tolist():
+        bench.prepare()
+        process = subprocess.Popen(
+            command, cwd=bench.folder, env=environment, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL
+        )
+        time.sleep((0.3 + 0.7 * moment) * duration_s)
+        process.send_signal(number)
+        _, raw = process.communicate(timeout=60)
+        stderr = raw.decode(errors="replace")
+        bench.endings[f"exit {process.returncode} ({stderr.strip().splitlines()[-1:]})"] += 1
+        yield from _after_signal(bench, number, process.returncode, stderr, overwrite=False, cold=True)
+
+
+def _after_signal(
+    bench: Bench, number: signal.Signals, code: int, stderr: str, *, overwrite: bool, cold: bool = False
+) -> Problems:
+    """Yield what is wrong after a run was hit, and after the next run."""
+    killed = number == signal.SIGKILL
+    accepted = {0, -number if killed else 130, *([-number] if cold else [])}
+    if code not in accepted:
+        yield f"exit {code} after {number.name}: {stderr[-300:]}"
+    exists = (bench.folder / "place" / "out").exists()
+    if code == 130 and stderr not in (
+        "sfm-shapefit: interrupted; nothing was written\n",
+        "sfm-shapefit: interrupted; the output is complete\n",
+        "",  # before the command began or after it ended
+    ):
+        yield f"the message is {stderr!r}"
+    if code == 130 and stderr and not overwrite and exists != ("complete" in stderr):
+        yield f"the message is {stderr!r}, and OUT {'exists' if exists else 'does not exist'}"
+    if overwrite and not exists:
+        yield "the earlier output is gone"
+    yield from bench.problems(strays=killed or code < 0)
+    if killed:
+        run_forked(bench.locate("-q", out="place/later"), bench.folder, [bench.folder, *caches()])
+        shutil.rmtree(bench.folder / "place" / "later")
+        yield from (f"after the next run: {problem}" for problem in bench.problems())
+
+
+# --- limits ----------------------------------------------------------------------------------------------
+
+
+def _limited(main: Callable[[], None], what: int, value: int) -> None:
+    resource.setrlimit(what, (value, value))
+    main()
+
+
+def small_files(bench: Bench) -> Problems:
+    """No file may be larger than so many bytes, as on a disk that is full."""
+    for size in _FILE_SIZES:
+        bench.prepare()
+        main = partial(_limited, bench.locate("-q"), resource.RLIMIT_FSIZE, size)
+        child = start_forked(main, bench.folder, [bench.folder, *caches()])
+        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
+        outcome = bench.note(child.finish())
+        # What the child prints goes into files too, and is cut.
+        cut = len(outcome.stderr) >= size
+        if outcome.code not in (0, 3) or (outcome.stderr.count("\n") != outcome.code // 3 and not cut):
+            yield f"{size} bytes: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+        yield from bench.problems()
+
+
+def full_disk(bench: Bench) -> Problems:
+    """OUT on a file system of a few pages."""
+    for pages in (2, 4, 6, 8):
+        bench.prepare()
+        with _small_disk(bench.folder / "place", pages * 4096) as mounted:
+            if not mounted:
+                bench.endings["left out: no file system can be mounted here"] += 1
+                return
+            outcome = bench.note(run_forked(bench.locate("-q"), bench.folder, [bench.folder, *caches()]))
+            if outcome.code not in (0, 3) or outcome.stderr.count("\n") != outcome.code // 3:
+                yield f"{pages} pages: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+            yield from bench.problems()
+
+
+@contextmanager
+def _small_disk(folder: Path, size: int) -> Iterator[bool]:
+    """Mount a small file system on a folder, if this user may."""
+    command = ["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)]
+    mounted = subprocess.run(command, check=False, capture_output=True).returncode == 0
+    try:
+        yield mounted
+    finally:
+        if mounted:
+            subprocess.run(["umount", str(folder)], check=True)
+
+
+def little_memory(bench: Bench) -> Problems:
+    """The address space may grow by so many megabytes."""
+    for megabytes in _EXTRA_MEMORY:
+        bench.prepare()
+        main = partial(_with_memory, bench.locate("-q"), megabytes * 1_000_000)
+        outcome = bench.note(run_forked(main, bench.folder, [bench.folder, *caches()]))
+        lines = outcome.stderr.count("\n")
+        if outcome.code not in (0, 3) or lines != outcome.code // 3:
+            yield f"{megabytes} MB: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+        yield from bench.problems()
+
+
+def _with_memory(main: Callable[[], None], extra: int) -> None:
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    _limited(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
+
+
+# --- others ----------------------------------------------------------------------------------------------
+
+
+def rivals(bench: Bench, rounds: int) -> Problems:
+    """Two runs into the same OUT: one wins, the other says so."""
+    for k in range(rounds):
+        bench.prepare()
+        extra = ("--overwrite", "-q") if k % 2 else ("-q",)
+        children = [
+            start_forked(bench.locate(*extra), bench.folder, [bench.folder, *caches()], logs=str(side))
+            for side in range(2)
+        ]
+        outcomes = [bench.note(child.finish()) for child in children]
+        codes = sorted(outcome.code for outcome in outcomes)
+        if codes != [0, 3]:
+            yield f"round {k}: exits {codes}, {[outcome.stderr for outcome in outcomes]}"
+        yield from bench.problems()
+
+
+def read_only_input(bench: Bench) -> Problems:
+    """A user who may read the input and write to OUT's parent only."""
+    bench.prepare()
+    for path in (bench.folder, *bench.folder.rglob("*")):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    for name in ("place", "tmp"):
+        (bench.folder / name).chmod(0o777)
+    for parent in bench.folder.parents:
+        if not parent.stat().st_mode & 0o001:
+            bench.endings[f"left out: others may not enter {parent}"] += 1
+            return
+    main = partial(_as_nobody, bench.locate("-q"))
+    outcome = bench.note(run_forked(main, bench.folder, [bench.folder, *caches()]))
+    if outcome.code:
+        yield f"exit {outcome.code}: {outcome.stderr[-300:]}"
+    yield from bench.problems()
+
+
+def _as_nobody(main: Callable[[], None]) -> None:
+    if os.geteuid() == 0:
+        os.setgroups([])
+        os.setresgid(_NOBODY, _NOBODY, _NOBODY)
+        os.setresuid(_NOBODY, _NOBODY, _NOBODY)
+    main()
+
+
+def locked_database(bench: Bench) -> Problems:
+    """Another program in the middle of a transaction, in either journal mode."""
+    for mode in ("delete", "wal"):
+        for begin in ("BEGIN EXCLUSIVE", "BEGIN IMMEDIATE", "written"):
+            bench.prepare()
+            path = bench.folder / "database.db"
+            with closing(sqlite3.connect(path, isolation_level=None)) as connection:
+                connection.execute(f"PRAGMA journal_mode = {mode}")
+                connection.execute("BEGIN EXCLUSIVE" if begin == "written" else begin)
+                if begin == "written":
+                    connection.execute("PRAGMA cache_size = 1")  # so that it reaches the file
+                    connection.execute("UPDATE keypoints SET data = zeroblob(100000)")
+                bench.before = verdicts.snapshot(bench.folder)
+                outcome = bench.note(run_forked(bench.locate("-q"), bench.folder, [bench.folder, *caches()]))
+                if outcome.code not in (0, 3) or outcome.stderr.count("\n") != outcome.code // 3:
+                    yield f"{mode}, {begin}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+                yield from bench.problems()
+                connection.execute("ROLLBACK")

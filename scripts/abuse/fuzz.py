@@ -1,0 +1,430 @@
+"""Hostile and broken input: thousands of damaged models, databases and graphs through the real commands.
+
+Case k of seed s is always the same, so a failure is repeated by `--only k`. Each runs in a forked child of
+one warm process (see `abuse/sandbox.py`) in a folder of its own, and must end in a correct result or in one
+sentence with exit code 2, 3 or 4; where the damage does not concern what is asked, the answer must stay.
+"""
+
+import argparse
+import collections
+import contextlib
+import os
+import shutil
+import sqlite3
+import struct
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from numpy.random import Generator
+
+from abuse import databases, mutations
+from abuse.layouts import binary_fields
+from abuse.sandbox import Outcome, run_forked
+from abuse.verdicts import (
+    MODEL_FILES,
+    differs,
+    faults,
+    faults_of_model,
+    faults_of_tables,
+    positions,
+    snapshot,
+)
+
+HELP = "damaged models, databases and graphs through the commands"
+_OLD_FILES = ("cameras", "images", "points3D")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A damaged input and how it is used."""
+
+    label: str
+    """What was damaged and how."""
+    arguments: tuple[str, ...]
+    """Of the command line, relative to the case's folder."""
+    same_answer: bool = False
+    """Whether the positions must be those of the sound input, since the damage does not concern them."""
+    encoding: str = "utf-8"
+    """Of the child's standard streams."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Report:
+    """How one case went."""
+
+    number: int
+    case: Case
+    outcome: Outcome
+    faults: tuple[str, ...]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--cases", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", type=int, help="run this case alone, and keep its folder")
+    parser.add_argument("--work", type=Path, help="where cases are made; a temporary folder by default")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run all cases, print what failed and a summary; 1 if any failed."""
+    with tempfile.TemporaryDirectory() as temporary:
+        work = (args.work or Path(temporary)).resolve()
+        base = make_base(work / "base")
+        expected = warm(base)
+        numbers = range(args.cases) if args.only is None else [args.only]
+        start = time.perf_counter()
+        codes: collections.Counter[tuple[str, int]] = collections.Counter()
+        slowest = largest = failed = 0.0
+        done = 0
+        with contextlib.suppress(KeyboardInterrupt):  # which ends it early, with the figures so far
+            for report in reports(
+                base, work / "case", numbers, args.seed, expected, keep=args.only is not None
+            ):
+                done += 1
+                codes[report.case.label.partition(":")[0], report.outcome.code] += 1
+                slowest, largest = (
+                    max(slowest, report.outcome.cpu_s),
+                    max(largest, report.outcome.peak_bytes / 1e9),
+                )
+                if report.faults:
+                    failed += 1
+                    print(
+                        f"case {report.number} ({report.case.label}): {'; '.join(report.faults)}", flush=True
+                    )
+                    print(
+                        f"    {' '.join(report.case.arguments)}: {report.outcome.stderr[-1200:]}", flush=True
+                    )
+                if args.only is not None:
+                    print(report)
+        print(f"{done} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
+        print(f"slowest {slowest:.1f} s of processor time, largest {largest:.2f} GB")
+        for (kind, code), count in sorted(codes.items()):
+            print(f"{kind:10} exit {code:3}: {count}")
+    return int(failed > 0)
+
+
+# --- sound input -----------------------------------------------------------------------------------------
+
+
+def make_base(folder: Path) -> Path:
+    """Write a small sound scene in every form that is read: binary, without rigs, text, database, graph."""
+    import pycolmap
+
+    from sfm_shapefit.colmap.workspace import write_workspace
+    from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+
+    options = SceneOptions(shape="cloud", num_images=6, num_points=60, pixel_noise_px=0.2, min_matches=15)
+    shutil.rmtree(folder, ignore_errors=True)
+    write_workspace(make_scene(options), folder, WorkspaceOptions(relative_poses=True))
+    model = pycolmap.Reconstruction(folder / "sparse" / "0")
+    for name in ("text", "truth"):
+        (folder / name).mkdir()
+    model.write_text(folder / "text")
+    model.write_binary(folder / "truth")
+    shutil.copytree(folder / "sparse" / "0", folder / "old")
+    for name in ("rigs", "frames"):
+        (folder / "old" / f"{name}.bin").unlink()
+    rng = np.random.default_rng(0)
+    centers = rng.normal(size=(8, 3))
+    pairs = [(i, j) for i in range(8) for j in range(i) if rng.random() < 0.7]
+    units = [(centers[i] - centers[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
+    lines = [f"{i} {j} {' '.join(map(repr, v.tolist()))} 1.5" for (i, j), v in zip(pairs, units, strict=True)]
+    (folder / "graph.txt").write_text("# i j vx vy vz weight\n" + "\n".join(lines) + "\n")
+    return folder
+
+
+def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
+    """Run every command once in this process, so that the children find all code loaded and compiled.
+
+    Returns the positions that each form of the input leads to.
+    """
+    expected = {}
+    out = base.parent / "warm"
+    database = ("--database", str(base / "database.db"))
+    for form, extra in {"sparse/0": database, "old": (), "text": ()}.items():
+        _command("locate", str(base / form), str(out), *extra, "--threads", "1", "-q")
+        expected["database" if extra else form] = positions(out)
+        shutil.rmtree(out)
+    poses = (*database, "--directions", "relative-poses")
+    for command in (
+        ("locate", str(base / "old"), str(out), *poses, "--threads", "1", "-q"),
+        ("locate", str(base / "old"), str(out), "--bundle-adjust", "--overwrite", "--threads", "1", "-q"),
+        ("locate", str(base / "old"), str(out), *database, "--overwrite", "--refine-rotations", "-q"),
+        ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
+    ):
+        _command(*command)
+    shutil.rmtree(out)
+    for command in (("evaluate", str(base / "old"), str(base / "truth")), ("inspect", str(base / "old"))):
+        _command(*command)
+    return expected
+
+
+def _command(*arguments: str) -> None:
+    """Run a sound command in this process."""
+    from contextlib import redirect_stdout
+    from io import StringIO
+
+    from typer.testing import CliRunner
+
+    from sfm_shapefit.cli import app
+
+    with redirect_stdout(StringIO()):
+        result = CliRunner().invoke(app, list(arguments))
+    if result.exit_code:
+        raise RuntimeError(f"{' '.join(arguments)} failed: {result.output} {result.exception!r}")
+
+
+# --- cases -----------------------------------------------------------------------------------------------
+
+
+def reports(
+    base: Path,
+    folder: Path,
+    numbers: "range | list[int]",
+    seed: int,
+    expected: dict[str, list[tuple[float, ...]]],
+    *,
+    keep: bool = False,
+) -> Iterator[Report]:
+    """Make, run and judge the cases of these numbers, one after the other, in `folder`."""
+    for number in numbers:
+        shutil.rmtree(folder, ignore_errors=True)
+        (folder / "tmp").mkdir(parents=True)
+        rng = np.random.default_rng([seed, number])
+        make = mutations.pick(rng, _KINDS)
+        case = make(base, folder, rng)
+        before = snapshot(folder)
+        main = partial(command_line, case.arguments, folder / "tmp")
+        outcome = run_forked(main, folder, [folder, *caches()], encoding=case.encoding)
+        yield Report(
+            number=number,
+            case=case,
+            outcome=outcome,
+            faults=tuple(_judge(case, outcome, folder, before, expected)),
+        )
+        if not keep:
+            shutil.rmtree(folder)
+
+
+def command_line(arguments: tuple[str, ...], temporary: Path) -> None:
+    """Be `sfm-shapefit`, in a child."""
+    from sfm_shapefit.cli import main
+
+    tempfile.tempdir = str(temporary)
+    sys.argv = ["sfm-shapefit", *arguments]
+    main()
+
+
+def caches() -> list[Path]:
+    """Return where numba keeps compiled code."""
+    own = Path(__file__).resolve().parents[2] / "sfm_shapefit"
+    return [own, *([Path(os.environ["NUMBA_CACHE_DIR"])] if "NUMBA_CACHE_DIR" in os.environ else [])]
+
+
+def _judge(
+    case: Case,
+    outcome: Outcome,
+    folder: Path,
+    before: dict[str, str],
+    expected: dict[str, list[tuple[float, ...]]],
+) -> Iterator[str]:
+    yield from faults(outcome)
+    after = snapshot(folder)
+    changed = [name for name in before if after.get(name) != before[name]]
+    if changed:
+        yield f"changed its input {changed[0]}"
+    new = sorted({Path(name).parts[0] for name in after.keys() - before.keys()})
+    writes = outcome.code == 0 and case.arguments[0] in ("locate", "solve")
+    if new != (["out"] if writes else []):
+        yield f"left {', '.join(new) or 'nothing'} behind"
+    strays = [name for name in after if name.startswith("tmp/")]
+    if strays:
+        yield f"left {strays[0]} behind"
+    if writes and (folder / "out").is_dir():
+        yield from faults_of_tables(folder / "out")
+        if case.arguments[0] == "locate":
+            yield from faults_of_model(folder / "out")
+    if case.same_answer:
+        if outcome.code:
+            yield f"refused what is sound: {outcome.stderr[:300]!r}"
+        elif differs(positions(folder / "out"), expected[_form(case)]):
+            yield "another answer"
+
+
+def _form(case: Case) -> str:
+    """Return which of the sound inputs a case's answer is to be compared with."""
+    return "database" if "--database" in case.arguments else case.arguments[1]
+
+
+def _used(source: str, rng: Generator, *, database: bool, locate_only: bool = False) -> tuple[str, ...]:
+    """Return a command that reads a model, most often locate."""
+    choice = 1.0 if locate_only else rng.random()
+    extra = ("--database", "database.db") if database else ()
+    if choice < 0.1:
+        return ("evaluate", *mutations.pick(rng, ((source, "truth"), ("truth", source))))
+    if choice < 0.2:
+        return ("inspect", source, *extra)
+    adjust = ("--bundle-adjust",) if choice < 0.24 else ()
+    json = ("--json",) if rng.random() < 0.3 else ()
+    return ("locate", source, "out", *extra, *adjust, *json, "--threads", "1")
+
+
+def _copy(base: Path, folder: Path, *names: str) -> None:
+    for name in names:
+        if (base / name).is_dir():
+            shutil.copytree(base / name, folder / name)
+        else:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(base / name, folder / name)
+
+
+def _encoding(rng: Generator) -> str:
+    return "ascii" if rng.random() < 0.1 else "utf-8"
+
+
+def _binary(base: Path, folder: Path, rng: Generator) -> Case:
+    """One damaged binary file; if it holds points, which a database makes superfluous, the answer stays."""
+    source = str(mutations.pick(rng, ("sparse/0", "sparse/0", "old")))
+    database = rng.random() < 0.3
+    _copy(base, folder, source, "truth", *(["database.db"] if database else []))
+    name = str(mutations.pick(rng, MODEL_FILES if source != "old" else _OLD_FILES))
+    path = folder / source / f"{name}.bin"
+    data = path.read_bytes()
+    fields = binary_fields(name, data)
+    way = mutations.pick(
+        rng,
+        (
+            *[mutations.changed_fields] * 3,
+            *(mutations.cut_at_field, mutations.shuffled_fields),
+        ),
+    )
+    if rng.random() < 0.3:
+        path.write_bytes(mutations.changed_bytes(data, rng))
+        label = "bytes"
+    else:
+        path.write_bytes(way(data, fields, rng))
+        label = way.__name__
+    arguments = _used(source, rng, database=database)
+    return Case(label=f"binary: {name} {label}", arguments=arguments, encoding=_encoding(rng))
+
+
+def _text(base: Path, folder: Path, rng: Generator) -> Case:
+    database = rng.random() < 0.3
+    _copy(base, folder, "text", "truth", *(["database.db"] if database else []))
+    name = str(mutations.pick(rng, MODEL_FILES))
+    path = folder / "text" / f"{name}.txt"
+    way = mutations.pick(
+        rng,
+        (
+            *[mutations.changed_words] * 4,
+            *(
+                mutations.changed_lines,
+                mutations.changed_lines,
+                mutations.cut_at_word,
+                mutations.changed_bytes,
+            ),
+        ),
+    )
+    path.write_bytes(way(path.read_bytes(), rng))
+    arguments = _used("text", rng, database=database)
+    return Case(label=f"text: {name} {way.__name__}", arguments=arguments, encoding=_encoding(rng))
+
+
+def _database(base: Path, folder: Path, rng: Generator) -> Case:
+    _copy(base, folder, "sparse/0", "database.db", "truth")
+    way = mutations.pick(rng, databases.WAYS)
+    same = way(folder / "database.db", rng)
+    arguments = _used("sparse/0", rng, database=True, locate_only=same)
+    if not same and rng.random() < 0.15 and arguments[0] == "locate":
+        arguments = (*arguments, "--directions", "relative-poses")
+    return Case(
+        label=f"database: {way.__name__}", arguments=arguments, same_answer=same, encoding=_encoding(rng)
+    )
+
+
+def _graph(base: Path, folder: Path, rng: Generator) -> Case:
+    _copy(base, folder, "graph.txt")
+    path = folder / "graph.txt"
+    way = mutations.pick(
+        rng,
+        (
+            *[mutations.changed_words] * 3,
+            *(mutations.changed_lines, mutations.cut_at_word, mutations.changed_bytes),
+        ),
+    )
+    path.write_bytes(way(path.read_bytes(), rng))
+    command = ("inspect", "graph.txt") if rng.random() < 0.15 else ("solve", "graph.txt", "out")
+    return Case(label=f"graph: {way.__name__}", arguments=command, encoding=_encoding(rng))
+
+
+def _names(base: Path, folder: Path, rng: Generator) -> Case:
+    """Hostile but sound names, the same in the model and in the database: the answer must stay."""
+    _copy(base, folder, "sparse/0", "database.db")
+    path = folder / "sparse" / "0" / "images.bin"
+    data = path.read_bytes()
+    names = [field for field in binary_fields("images", data) if field.kind == "name"]
+    chosen = rng.permutation(len(mutations.HOSTILE_NAMES))[: int(rng.integers(1, len(names) + 1))]
+    with closing(sqlite3.connect(folder / "database.db")) as connection:
+        for field, k in sorted(zip(names, chosen, strict=False), key=lambda item: -item[0].offset):
+            old, new = data[field.offset : field.offset + field.size - 1], mutations.HOSTILE_NAMES[int(k)]
+            data = data[: field.offset] + new + data[field.offset + field.size - 1 :]
+            connection.execute("UPDATE images SET name = CAST(? AS TEXT) WHERE name = ?", (new, old.decode()))
+        connection.commit()
+    path.write_bytes(data)
+    arguments = _used("sparse/0", rng, database=True, locate_only=True)
+    return Case(label="names: hostile", arguments=arguments, same_answer=True, encoding=_encoding(rng))
+
+
+def _place(base: Path, folder: Path, rng: Generator) -> Case:
+    """Something else in the place of a file, or a place for OUT that cannot be."""
+    _copy(base, folder, "sparse/0", "text", "database.db", "graph.txt", "truth")
+    target = str(
+        mutations.pick(
+            rng,
+            (
+                *(f"sparse/0/{name}.bin" for name in MODEL_FILES),
+                *(f"text/{name}.txt" for name in MODEL_FILES),
+                *("database.db", "graph.txt"),
+            ),
+        )
+    )
+    kind = mutations.misplaced(folder / target, rng)
+    if target == "graph.txt":
+        return Case(label=f"place: {kind}", arguments=("solve", "graph.txt", "out"))
+    source = "text" if target.startswith("text") else "sparse/0"
+    return Case(
+        label=f"place: {kind} as {target}", arguments=_used(source, rng, database=target == "database.db")
+    )
+
+
+def _several(base: Path, folder: Path, rng: Generator) -> Case:
+    """All files of a model damaged consistently: records removed or repeated with the count put right."""
+    _copy(base, folder, "sparse/0", "truth")
+    name = str(mutations.pick(rng, MODEL_FILES))
+    path = folder / "sparse" / "0" / f"{name}.bin"
+    data = path.read_bytes()
+    starts = _record_starts(name, data)
+    records = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data)], strict=True)]
+    order = rng.integers(len(records), size=int(rng.integers(0, 2 * len(records) + 1)))
+    if rng.random() < 0.5:
+        order = rng.permutation(len(records))[: int(rng.integers(0, len(records) + 1))]
+    path.write_bytes(struct.pack("<Q", len(order)) + b"".join(records[int(k)] for k in order))
+    return Case(label=f"records: {name}", arguments=_used("sparse/0", rng, database=False))
+
+
+def _record_starts(name: str, data: bytes) -> list[int]:
+    """Return where the records of a sound binary file start: at their ids, all of one kind."""
+    return [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
+
+
+_KINDS: tuple[Callable[[Path, Path, Generator], Case], ...] = (
+    *(_binary, _binary, _binary, _text, _text, _database, _database, _database, _graph, _graph),
+    *(_names, _place, _several),
+)

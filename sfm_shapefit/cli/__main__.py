@@ -1,0 +1,5 @@
+"""`python -m sfm_shapefit.cli`."""
+
+from sfm_shapefit.cli import main
+
+main()

@@ -1,0 +1,40 @@
+"""The command line's root: commands join it as their modules are loaded."""
+
+import sys
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination, refuse_little_memory
+
+_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
+"""Of the commands in the help, by importance."""
+
+
+class _ByImportance(TyperGroup):
+    """Commands in the order of their importance, not of the alphabet."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        known = [name for name in _ORDER if name in self.commands]
+        return known + [name for name in super().list_commands(ctx) if name not in _ORDER]
+
+
+app = typer.Typer(
+    cls=_ByImportance,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # its columns break long sentences into one word a line
+    help="Place the cameras of a COLMAP model whose rotations are known.",
+)
+
+
+def main() -> None:
+    """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
+    catch_termination()
+    try:
+        refuse_little_memory()
+        app()
+    except KeyboardInterrupt:  # outside a command: while modules are loaded
+        sys.exit(EXIT_INTERRUPTED)

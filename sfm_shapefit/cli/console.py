@@ -1,0 +1,145 @@
+"""What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
+
+The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
+130 interrupted.
+"""
+
+import os
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from sfm_shapefit.errors import ShapeFitError, UnsolvableError
+
+if TYPE_CHECKING:
+    from sfm_shapefit.pipeline import Progress
+
+Rows = list[tuple[str, str]]
+"""A two-column table: label and what stands beside it."""
+
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_INTERRUPTED = 3, 4, 130
+NAMES_SHOWN = 8
+SEE_JSON = "see --json"
+
+_LIBRARIES_BYTES = 850_000_000  # measured: with less, loading them or their first call fails
+_THREAD_BYTES = 50_000_000  # stack and work space of one thread of the linear algebra library
+
+
+_NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
+"""How Python, C++ and the dynamic linker say that there is no memory."""
+
+_received: list[int] = []
+"""Numbers of the signals that asked this process to end."""
+
+
+@contextmanager
+def reported(interrupted: str = "interrupted; nothing was written") -> Iterator[None]:
+    """Turn every known error into one sentence on stderr and its exit code."""
+    try:
+        yield
+    except (KeyboardInterrupt, Exception) as error:
+        # Native code that a signal interrupts may turn the interrupt into an error of its own.
+        if isinstance(error, KeyboardInterrupt) or _received:
+            _fail(interrupted, EXIT_INTERRUPTED)
+        if isinstance(error, UnsolvableError):
+            _fail(str(error), EXIT_UNSOLVABLE)
+        if isinstance(error, ShapeFitError):
+            _fail(str(error), EXIT_INPUT)
+        if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
+            _fail(
+                "the memory that this process may use is not enough; allow more, or give a smaller model",
+                EXIT_INPUT,
+            )
+        raise
+
+
+def catch_termination() -> None:
+    """Turn SIGTERM into an interrupt; again once pycolmap is loaded, which brings a handler of its own.
+
+    A signal that whoever started this process wants ignored, as nohup does, stays ignored.
+    """
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) != signal.SIG_IGN:
+            signal.signal(number, _interrupt)
+
+
+def _interrupt(number: int, _frame: object) -> None:
+    _received.append(number)
+    raise KeyboardInterrupt
+
+
+def refuse_little_memory() -> None:
+    """Refuse an address space in which the libraries cannot even be loaded: they would crash or hang."""
+    import resource
+
+    limit, _ = resource.getrlimit(resource.RLIMIT_AS)
+    needed = _LIBRARIES_BYTES + _THREAD_BYTES * (os.cpu_count() or 1)
+    if limit != resource.RLIM_INFINITY and limit < needed:
+        _say(
+            f"this process may use {limit / 1e6:.0f} MB of address space, but its libraries need "
+            f"{needed / 1e6:.0f} MB; raise the limit (ulimit -v)"
+        )
+        sys.exit(EXIT_INPUT)
+
+
+def _fail(message: str, code: int) -> None:
+    _say(message)
+    raise typer.Exit(code)
+
+
+def _say(message: str) -> None:
+    print(f"sfm-shapefit: {printable(message)}", file=sys.stderr)  # noqa: T201
+
+
+def printable(text: str) -> str:
+    """Return text without control characters: names come from strangers, and may move the cursor."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
+
+
+@contextmanager
+def shown_progress(enabled: bool) -> "Iterator[Progress | None]":
+    """Show stages on stderr if it is a terminal. Written to a copy of it, which nobody silences."""
+    if not (enabled and sys.stderr.isatty()):
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Display
+
+    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with (
+        os.fdopen(os.dup(2), "w") as stream,
+        Display(*columns, console=Console(file=stream, force_terminal=True)) as display,
+    ):
+        tasks: dict[str, Any] = {}
+
+        def advance(stage: str, done: int, total: int) -> None:
+            if stage not in tasks:
+                tasks[stage] = display.add_task(stage, total=total)
+            if total > 1 or display.tasks[tasks[stage]].total == 1:
+                display.update(tasks[stage], completed=done, total=total)
+
+        yield advance
+
+
+def print_table(title: str, rows: Rows) -> None:
+    """Print a two-column table on stdout."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    # Text, not markup: names and paths come from strangers, and brackets in them mean nothing.
+    table = Table(title=Text(printable(title)), show_header=False, title_justify="left")
+    for label, value in rows:
+        table.add_row(label, Text("\n".join(printable(line) for line in value.split("\n"))))
+    Console().print(table)
+
+
+def shortened(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:
+    """Return the first lines, and how many there are more and where."""
+    more = [f"and {len(lines) - NAMES_SHOWN} more, {elsewhere}"] if len(lines) > NAMES_SHOWN else []
+    return "\n".join([*lines[:NAMES_SHOWN], *more])

@@ -1,0 +1,33 @@
+"""Lines that more than one command's table has."""
+
+from typing import TYPE_CHECKING, Any
+
+from sfm_shapefit.cli.console import Rows, shortened
+from sfm_shapefit.solver.options import Status
+
+if TYPE_CHECKING:
+    from sfm_shapefit.solver.options import SolverResult
+
+
+def pieces_line(facts: dict[str, Any]) -> Rows:
+    """Return a row that says where the further pieces stand, if there are any."""
+    lines = [
+        f"{piece['folder']}: {piece['num_placed']} of {piece['num_cameras']} cameras, hinged at "
+        f"{', '.join(piece['hinges']) or 'nothing'}, with a scale of its own"
+        for piece in facts["pieces"][1:]
+        if piece["folder"]
+    ]
+    return [("further pieces", shortened(lines))] if lines else []
+
+
+def objective_line(solve: "SolverResult") -> str:
+    """Say what the solver reached, how sure that is, and which solver it was."""
+    chosen = f"{solve.method}: {solve.method_reason}"
+    if solve.status is Status.NOT_SOLVED:
+        return f"{solve.objective:.6g}, not certified ({chosen})"
+    return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
+
+
+def pictures_line(report: bool, scene: bool) -> str:
+    """Name the pictures that were written, to follow the names of other files."""
+    return ", report.html" * report + ", scene.glb, scene.ply" * scene

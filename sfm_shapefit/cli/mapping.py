@@ -1,0 +1,90 @@
+"""`sfm-shapefit map DATABASE OUT`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sfm_shapefit.cli.app import app
+from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
+from sfm_shapefit.cli.flags import (
+    Config,
+    Json,
+    OutArgument,
+    OutputPath,
+    Overwrite,
+    Quiet,
+    Report,
+    Scene,
+    one_path,
+    options_from,
+    takes,
+)
+from sfm_shapefit.mapping.options import MapOptions
+
+if TYPE_CHECKING:
+    from sfm_shapefit.mapping.results import MapResult
+
+
+@app.command("map")
+@takes(MapOptions)
+def map_command(
+    database: Annotated[
+        Path | None, typer.Argument(metavar="DATABASE", help="COLMAP database with verified matches.")
+    ] = None,
+    out: OutArgument = None,
+    *,
+    database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
+    output_path: OutputPath = None,
+    overwrite: Overwrite = False,
+    report: Report = True,
+    scene: Scene = False,
+    config: Config = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    **given: Any,
+) -> None:
+    """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
+    source = one_path(database, database_path, "DATABASE")
+    target = one_path(out, output_path, "OUT")
+    with reported():
+        from sfm_shapefit.output import check_output
+
+        options = options_from(MapOptions, given, config)
+        protect = [path for path in (source, config) if path is not None]
+        check_output(target, overwrite=overwrite, protect=protect)
+
+        from sfm_shapefit.mapping.results import map_summary, write_map_result
+        from sfm_shapefit.mapping.run import map_database
+        from sfm_shapefit.report import dumps
+
+        catch_termination()
+        with shown_progress(not quiet) as progress:
+            found = map_database(source, options, progress)
+            write_map_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
+        if as_json:
+            print(dumps(map_summary(found)))  # noqa: T201
+        elif not quiet:
+            print_table(f"{found.num_images} images of {source}", _map_table(found, target))
+
+
+def _map_table(found: "MapResult", out: Path) -> Rows:
+    """Return what each model has, what was left out, and where it is."""
+    rows: Rows = [("pairs", f"{found.num_pairs} with a relative rotation")]
+    for number, model in enumerate(found.models):
+        located = model.located
+        rows += [
+            (f"model {number}", f"{int(located.kept.sum())} of {len(model.names)} images placed"),
+            ("  rotations", model.averaging.statement),
+            ("  points", str(located.reconstruction.num_points3D())),
+            ("  scale", located.gauge.statement),
+            *[("  warning", warning) for warning in located.warnings],
+        ]
+    left_out = [f"{name}: {reason}" for name, reason in found.left_out.items()]
+    return [
+        *rows,
+        *([("in no model", shortened(left_out, "see map.json"))] if left_out else []),
+        *[("warning", warning) for warning in found.warnings],
+        ("time", f"{sum(found.timings_s.values()):.1f} s"),
+        ("written to", f"{out}: models {', '.join(str(k) for k in range(len(found.models)))}, map.json"),
+    ]

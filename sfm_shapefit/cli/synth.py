@@ -1,0 +1,68 @@
+"""`sfm-shapefit synth OUT`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from sfm_shapefit.cli.app import app
+from sfm_shapefit.cli.console import print_table, reported
+from sfm_shapefit.cli.flags import OutArgument, OutputPath, fields_of, one_path, options_from, takes
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
+
+Images = Annotated[
+    bool,
+    typer.Option("--images", help="Draw images, and let COLMAP find the keypoints and matches in them."),
+]
+
+
+@app.command("synth")
+@takes(SceneOptions)
+@takes(WorkspaceOptions)
+@takes(RenderOptions)
+def synth_command(
+    out: OutArgument = None, *, output_path: OutputPath = None, images: Images = False, **given: Any
+) -> None:
+    """Make a synthetic COLMAP workspace in OUT: a database, a model, the exact truth, and images if asked."""
+    target = one_path(out, output_path, "OUT")
+    with reported():
+        scene = options_from(SceneOptions, fields_of(SceneOptions, given))
+        workspace = options_from(WorkspaceOptions, fields_of(WorkspaceOptions, given))
+        render = options_from(RenderOptions, fields_of(RenderOptions, given))
+        if not images and render != RenderOptions():
+            raise InputError("the options of drawing need --images; add it, or leave them out")
+        rows = _write_drawn(scene, render, target, workspace) if images else _write(scene, target, workspace)
+        print_table(f"{scene.shape}, seed {scene.seed}", [*rows, ("written to", str(target))])
+
+
+def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[tuple[str, str]]:
+    """Write a workspace whose keypoints are projected points; return what to print of it."""
+    from sfm_shapefit.colmap.workspace import write_workspace
+    from sfm_shapefit.synthetic import make_scene
+
+    scene = make_scene(options)
+    write_workspace(scene, target, workspace)
+    return [
+        ("images", str(len(scene.keypoints))),
+        ("points", str(len(scene.points))),
+        ("pairs", f"{len(scene.pairs)}, of which {int(scene.pair_is_corrupted.sum())} wrong"),
+    ]
+
+
+def _write_drawn(
+    options: SceneOptions, render: RenderOptions, target: Path, workspace: WorkspaceOptions
+) -> list[tuple[str, str]]:
+    """Write a workspace with images; return what to print of it."""
+    from sfm_shapefit.colmap.photographs import judge_matches, write_rendered_workspace
+    from sfm_shapefit.synthetic import make_rendered_scene
+
+    scene = make_rendered_scene(options, render)
+    write_rendered_workspace(scene, target, workspace)
+    rows = [("images", str(scene.num_images))]
+    if workspace.database:
+        judged = judge_matches(scene, target / "database.db")
+        wrong = int(judged.pair_is_wrong.sum())
+        rows.append(("matches", f"{len(judged.is_right)}, of which {int((~judged.is_right).sum())} wrong"))
+        rows.append(("pairs", f"{len(judged.pair_is_wrong)}, of which {wrong} wrong"))
+    return rows

@@ -1,0 +1,173 @@
+"""Position priors of cameras: the pose priors of a COLMAP database, or a table of names and positions.
+
+Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in metres) become metres east,
+north and up of their median. Their covariances are taken as metres squared in those axes.
+
+Source: https://colmap.github.io/database.html; `colmap/geometry/pose_prior.h`: coordinate system -1 is
+undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP 3.12 a row names its image,
+from then on its sensor and datum, and an image is the datum of a camera.
+"""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.database import readonly_rows
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.gauge import PositionPriors
+
+_WGS84, _CARTESIAN = 0, 1
+_SENSOR_IS_CAMERA = 0
+_TABLE_COLUMNS = (4, 5, 7)  # name and position, and one standard deviation or three
+_GEODETIC_NAMES = {"lat", "latitude"}
+
+
+def database_priors(path: Path, model: PosedModel) -> PositionPriors:
+    """Read the pose priors of a database.
+
+    Args:
+        path: the database; it is not changed.
+        model: the posed images, matched by name.
+
+    Raises:
+        InputError: if the database has no prior of these images, mixes coordinate systems, or is damaged.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    for name, position, covariance, system in _prior_rows(path):
+        index = index_of_name.get(name)
+        xyz = _numbers(path, name, position, 3)
+        if index is None or system not in (_WGS84, _CARTESIAN) or not np.isfinite(xyz).all():
+            continue
+        found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3), system
+    if not found:
+        raise InputError(f"{path} has no position prior of the model's images; give a table with --priors")
+    systems = {system for _, _, system in found.values()}
+    if len(systems) > 1:
+        raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind with --priors")
+    return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
+
+
+def table_priors(path: Path, model: PosedModel) -> PositionPriors:
+    """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
+
+    A first line that names the columns is optional; where it calls the second one lat or latitude, rows
+    are latitude, longitude (degrees) and altitude (metres). Lines that begin with # are comments.
+
+    Args:
+        path: the table.
+        model: the posed images, matched by name; other names are passed over.
+
+    Raises:
+        InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
+            is one of the model's.
+    """
+    refuse_irregular_file(path)
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"the priors {path} cannot be read as text: {error}") from None
+    index_of_name = {name: index for index, name in enumerate(model.names)}
+    found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
+    system, seen, first = _CARTESIAN, set(), True
+    for number, line in enumerate(lines, start=1):
+        if not line.strip() or line.lstrip().startswith("#"):
+            continue
+        cells = next(csv.reader([line])) if "," in line else line.split()
+        cells = [cell.strip() for cell in cells]
+        if first and len(cells) > 1 and not _is_number(cells[1]):
+            system = _WGS84 if cells[1].lower() in _GEODETIC_NAMES else _CARTESIAN
+        else:
+            position, covariance = _parsed(path, number, cells)
+            if cells[0] in seen:
+                raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
+            seen.add(cells[0])
+            if cells[0] in index_of_name:
+                found[index_of_name[cells[0]]] = position, covariance, system
+        first = False
+    if not found:
+        raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
+    return _priors(found, f"{len(found)} positions of {path}", geodetic=system == _WGS84)
+
+
+def _prior_rows(path: Path) -> list[tuple[str, object, object, object]]:
+    """Return name, position, covariance and coordinate system of all priors, of any schema version."""
+    newer = (
+        "SELECT images.name, position, position_covariance, coordinate_system FROM pose_priors "
+        f"JOIN images ON images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
+    )
+    older = (
+        "SELECT images.name, position, position_covariance, coordinate_system FROM pose_priors "
+        "JOIN images ON images.image_id = pose_priors.image_id"
+    )
+    oldest = (
+        "SELECT images.name, position, NULL, coordinate_system FROM pose_priors "
+        "JOIN images ON images.image_id = pose_priors.image_id"
+    )
+    return readonly_rows(
+        path,
+        "pose_priors",
+        {
+            ("corr_data_id", "corr_sensor_type", "position_covariance"): newer,
+            ("image_id", "position_covariance"): older,
+            ("image_id", "position"): oldest,
+        },
+    )
+
+
+def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
+    """Return the doubles of a blob, NaN if it is NULL."""
+    if blob is None:
+        return np.full(count, np.nan)
+    if not isinstance(blob, bytes) or len(blob) != 8 * count:
+        raise InputError(f"{path}: the pose prior of image {name} is damaged; leave it out or write it again")
+    return np.frombuffer(blob, dtype="<f8").astype(np.float64)
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _parsed(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
+    """Return position and covariance of a line of a table."""
+    if len(cells) not in _TABLE_COLUMNS or not all(map(_is_number, cells[1:])):
+        raise InputError(
+            f"{path}, line {number}: expected a name, three coordinates and at most one standard deviation "
+            "or three"
+        )
+    values = np.array([float(cell) for cell in cells[1:]])
+    if not np.isfinite(values).all() or (values[3:] <= 0.0).any():
+        raise InputError(
+            f"{path}, line {number}: coordinates must be finite and standard deviations positive"
+        )
+    variances = np.broadcast_to(values[3:] ** 2 if len(values) > 3 else np.nan, 3)
+    return values[:3], np.diag(variances) if len(values) > 3 else np.full((3, 3), np.nan)
+
+
+def _priors(
+    found: dict[int, tuple[FloatArray, FloatArray, int]], source: str, *, geodetic: bool
+) -> PositionPriors:
+    """Return priors in Cartesian axes."""
+    cameras = np.array(sorted(found), dtype=np.int64)
+    positions = np.array([found[k][0] for k in cameras.tolist()])
+    covariances = np.array([found[k][1] for k in cameras.tolist()])
+    statement = source
+    if geodetic:
+        if (np.abs(positions[:, 0]) > 90.0).any() or (np.abs(positions[:, 1]) > 360.0).any():
+            raise InputError(f"{source}: a latitude or longitude is out of range; give degrees")
+        latitude, longitude, altitude = np.median(positions, axis=0).tolist()
+        transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+        positions = np.asarray(transform.ellipsoid_to_enu(positions, latitude, longitude, altitude))
+        statement += (
+            f", in metres east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+        )
+    return PositionPriors(cameras=cameras, positions=positions, covariances=covariances, statement=statement)

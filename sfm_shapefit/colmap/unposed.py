@@ -1,0 +1,109 @@
+"""The images of a COLMAP database as a model without rotations: what `map` starts from.
+
+Every image stands in a frame of its own, at the origin with the identity as its rotation, so that rays of
+its keypoints in "world" axes are rays in camera axes. Intrinsics are those of the database: calibrated, or
+COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.colmap.database import readonly_rows
+from sfm_shapefit.errors import InputError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnposedImages:
+    """What a database says of its images."""
+
+    reconstruction: pycolmap.Reconstruction
+    """All cameras and images; every rotation is the identity, every centre the origin."""
+    num_guessed_cameras: int
+    """Cameras in use whose focal length is COLMAP's guess."""
+    has_rigs: bool
+    """Whether the database ties several cameras into a rig; the model here does not."""
+
+
+def read_images(path: Path) -> UnposedImages:
+    """Read cameras and images of a database, which is not changed.
+
+    Raises:
+        InputError: if it is no COLMAP database, has fewer than two images, or a camera or image is damaged.
+    """
+    camera_columns = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
+    image_columns = ("image_id", "name", "camera_id")
+    cameras, images = (
+        readonly_rows(path, table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
+        for table, columns in (("cameras", camera_columns), ("images", image_columns))
+    )
+    has_rigs = bool(
+        readonly_rows(path, "rig_sensors", {("rig_id",): "SELECT rig_id FROM rig_sensors LIMIT 1"})
+    )
+    if len(images) < 2:
+        raise InputError(
+            f"{path} has {len(images)} images, but two or more are needed; extract features first"
+        )
+    model = pycolmap.Reconstruction()
+    for row in cameras:
+        model.add_camera_with_trivial_rig(_camera(path, row))
+    for image_id, name, camera_id in images:
+        if not (isinstance(image_id, int) and isinstance(name, str) and model.exists_camera(camera_id)):
+            raise InputError(
+                f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
+            )
+        image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    used = {row[2] for row in images}
+    guessed = sum(1 for row in cameras if row[0] in used and not row[5])
+    return UnposedImages(reconstruction=model, num_guessed_cameras=guessed, has_rigs=has_rigs)
+
+
+def posed_at_origin(
+    images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
+) -> pycolmap.Reconstruction:
+    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centres 0."""
+    model = pycolmap.Reconstruction()
+    for camera_id in sorted({images.image(i).camera_id for i in image_ids}):
+        model.add_camera_with_trivial_rig(images.camera(camera_id))
+    for image_id, rotation in zip(image_ids, rotations, strict=True):
+        known = images.image(image_id)
+        image = pycolmap.Image(name=known.name, camera_id=known.camera_id, image_id=image_id)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
+        model.add_image_with_trivial_frame(image, pose)
+    return model
+
+
+def rotations_of(model: pycolmap.Reconstruction, image_ids: list[int]) -> tuple[FloatArray, BoolArray]:
+    """Return (k, 3, 3) cam_from_world of some images, the identity without a pose, and (k,) who has one."""
+    rotations, posed = np.tile(np.eye(3), (len(image_ids), 1, 1)), np.zeros(len(image_ids), dtype=np.bool_)
+    for k, image_id in enumerate(image_ids):
+        if model.exists_image(image_id) and model.image(image_id).has_pose:
+            rotations[k], posed[k] = model.image(image_id).cam_from_world().rotation.matrix(), True
+    return rotations, posed
+
+
+def _camera(path: Path, row: tuple[object, ...]) -> pycolmap.Camera:
+    """Return the camera of a row of the table cameras."""
+    camera_id, model_id, width, height, params, prior = row
+    sound = all(isinstance(value, int) for value in (camera_id, model_id, width, height))
+    if not (sound and isinstance(params, bytes) and len(params) % 8 == 0):
+        raise InputError(f"{path}: the camera with id {camera_id!r} is damaged; extract features again")
+    values = np.frombuffer(params, dtype="<f8")
+    known = {int(model) for name, model in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
+    if model_id not in known:
+        raise InputError(f"{path}: camera {camera_id} has the model {model_id}, which pycolmap does not know")
+    camera = pycolmap.Camera(
+        camera_id=camera_id,
+        model=pycolmap.CameraModelId(model_id),
+        width=width,
+        height=height,
+        params=values.tolist(),
+        has_prior_focal_length=bool(prior),
+    )
+    if not (camera.verify_params() and np.isfinite(values).all()):
+        raise InputError(f"{path}: the parameters of camera {camera_id} are damaged; extract features again")
+    return camera

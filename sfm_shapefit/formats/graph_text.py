@@ -1,0 +1,81 @@
+"""Bare view graphs as text.
+
+A graph file has one pair per line,
+
+    i j v1 v2 ... vd [weight]        # comments and empty lines are skipped
+
+with the unit direction of t_i - t_j (it points from j to i). Node ids are words; they need not be
+numbers, nor contiguous. All lines have the same number of columns. The last column is a weight if it is
+positive and the columns before it are unit vectors, in every line; otherwise it belongs to the direction.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.viewgraph import ViewGraph
+
+_UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
+_ROUNDED = 1e-7
+_LARGEST_WEIGHT = 1e30  # sums of squares of products of weights must not overflow
+_FORM = "i j vx vy vz [weight]"
+_MIN_COLUMNS = 4  # two ids and a direction in the plane
+
+
+def read_graph(path: Path | str) -> ViewGraph:
+    """Read a bare view graph; the ids become its names, numbers in numerical order, else alphabetically.
+
+    Directions are normalised; a pair that stands twice is merged (see `ViewGraph`).
+
+    Raises:
+        InputError: if the file cannot be read, naming the first malformed line by its number.
+    """
+    file = Path(path)
+    numbers, rows = read_lines(file, _FORM)
+    width = len(rows[0])
+    if width < _MIN_COLUMNS:
+        raise InputError(f"{file}, line {numbers[0]}: expected i j and a direction, got {width} columns")
+    values = number_table(file, numbers, rows, first=2, width=width)
+    with np.errstate(over="ignore"):  # a length that overflows is no unit length
+        directions, weights = _directions_and_weights(values)
+        lengths = np.linalg.norm(directions, axis=1)
+    ids, nodes = node_indices([word for row in rows for word in row[:2]])
+    edges = nodes.reshape(-1, 2)
+
+    refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
+    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
+    refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
+    extreme = (weights < 1.0 / _LARGEST_WEIGHT) | (weights > _LARGEST_WEIGHT)
+    refuse(file, numbers, extreme, f"has a weight beyond 1 / {_LARGEST_WEIGHT:g} to {_LARGEST_WEIGHT:g}")
+    rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
+    directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
+    try:
+        return ViewGraph(len(ids), edges, directions, weights, ids)
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from error
+
+
+def graph_text(graph: ViewGraph) -> str:
+    """Return a view graph in the text format that `read_graph` takes; numbers round-trip."""
+    ids = graph.names or tuple(str(k) for k in range(graph.num_cameras))
+    weighted = bool(np.any(graph.weights != 1.0))
+    lines = []
+    for (i, j), v, weight in zip(
+        graph.edges.tolist(), graph.directions.tolist(), graph.weights.tolist(), strict=True
+    ):
+        numbers = [*v, weight] if weighted else v
+        lines.append(" ".join([ids[i], ids[j], *map(repr, numbers)]))
+    return "\n".join(lines) + "\n"
+
+
+def _directions_and_weights(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Tell whether the last column is a weight, and split it off if it is."""
+    head, last = values[:, :-1], values[:, -1]
+    if head.shape[1] >= _MIN_COLUMNS - 2:
+        is_unit = np.abs(np.linalg.norm(head, axis=1) - 1.0) <= _UNIT_TOLERANCE
+        if bool(np.all(is_unit)) and not np.all(last == 0.0):
+            return head, last
+    return values, np.ones(len(values))

@@ -1,0 +1,215 @@
+"""The 1DSfM format: `EGs.txt`, `cc.txt`, `rots.txt`, `soln.txt`, and edge lists (`prob.txt`).
+
+    EGs.txt    i j R11 R12 ... R33 t1 t2 t3      a pair's relative pose, R by rows
+    cc.txt     i                                 the cameras to place, a connected component of the pairs
+    rots.txt   i R11 R12 ... R33                 world-to-camera rotations, by rows
+    soln.txt   i x y z                           locations
+
+With world-to-camera rotations R_i, the rotation of a pair is R_i R_j^T, cam_i_from_cam_j; its t is the unit
+direction to camera j in the axes of camera i, so that R_i^T t points along C_j - C_i in the world. Camera
+axes are Bundler's: x to the right, y up, the camera looks along -z. Here they are turned into those of
+COLMAP and OpenCV (y down, along +z) by S = diag(1, -1, -1) on reading, and back on writing; world axes stay.
+
+Checked on the published Madrid Metropolis: among triangles whose rotations close to 2 degrees, the three
+directions in the axes of i are coplanar to 0.004 (0.065 if t is taken in the axes of j).
+
+Source: Wilson, Snavely, "Robust global translations with 1DSfM", ECCV 2014, and the manual of its data.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.geometry import normalized, rotation_angles_deg
+from sfm_shapefit.viewgraph import ViewGraph
+
+_PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
+_PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
+_ROTATION_TOLERANCE = 1e-3  # of R R^T and of |t|; the published files have six digits
+_FLIP = np.diag([1.0, -1.0, -1.0])
+"""From Bundler's camera axes to COLMAP's, and back."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class EpipolarGeometries:
+    """Relative poses of pairs of cameras, in COLMAP's camera axes."""
+
+    names: tuple[str, ...]
+    """(n,) the cameras' ids in the file, numbers in numerical order."""
+    pairs: IntArray
+    """(m, 2) indices (i, j)."""
+    rotations: FloatArray
+    """(m, 3, 3) cam_j_from_cam_i."""
+    to_second: FloatArray
+    """(m, 3) unit directions to camera j in the axes of camera i."""
+
+    def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
+        """Return some of the pairs of the same cameras."""
+        return EpipolarGeometries(
+            names=self.names,
+            pairs=self.pairs[rows],
+            rotations=self.rotations[rows],
+            to_second=self.to_second[rows],
+        )
+
+    def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
+        """Return (m,) by how many degrees each relative rotation contradicts the cameras' (n, 3, 3)."""
+        i, j = self.pairs.T
+        return rotation_angles_deg(self.rotations @ rotations[i] @ rotations[j].swapaxes(1, 2))
+
+    def view_graph(self, rotations: FloatArray, known: BoolArray) -> ViewGraph:
+        """Return the directions in world axes of all pairs both of whose cameras have a rotation.
+
+        Args:
+            rotations: (n, 3, 3) cam_from_world.
+            known: (n,) which cameras have one.
+
+        Raises:
+            InputError: if no pair is left.
+        """
+        kept = known[self.pairs].all(axis=1)
+        if not kept.any():
+            raise InputError("no pair joins two cameras that have a rotation; check the rotations' ids")
+        i = self.pairs[kept, 0]
+        to_first = -np.einsum("eba,eb->ea", rotations[i], self.to_second[kept])
+        return ViewGraph(len(self.names), self.pairs[kept], normalized(to_first), names=self.names)
+
+
+def is_onedsfm(source: Path | str) -> bool:
+    """Return whether a path is a folder with EGs.txt, or a text file whose first line is one of its lines."""
+    path = Path(source)
+    if path.is_dir():
+        return (path / _PAIRS_FILE).is_file()
+    try:
+        with path.open(encoding="utf-8") as stream:
+            first = next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
+        values = np.array(first[2:], dtype=np.float64)
+    except (OSError, ValueError):
+        return False
+    return len(first) == _PAIR_COLUMNS and not _is_no_rotation(values[None, :9].reshape(1, 3, 3))[0]
+
+
+def read_onedsfm(source: Path | str) -> EpipolarGeometries:
+    """Read a 1DSfM folder (EGs.txt, and cc.txt if it has one, whose cameras alone are kept) or an EGs.txt.
+
+    A pair that stands twice, in whatever order, is an error.
+
+    Raises:
+        InputError: if a file cannot be read, naming the first malformed line by its number.
+    """
+    path = Path(source)
+    file = path / _PAIRS_FILE if path.is_dir() else path
+    numbers, rows = read_lines(file, "i j R11 ... R33 t1 t2 t3")
+    values = number_table(file, numbers, rows, first=2, width=_PAIR_COLUMNS)
+    rotations, translations = values[:, :9].reshape(-1, 3, 3), values[:, 9:]
+    names, nodes = node_indices([word for row in rows for word in row[:2]])
+    pairs = nodes.reshape(-1, 2)
+    refuse(file, numbers, _is_no_rotation(rotations), "has no rotation matrix in columns 3 to 11")
+    lengths = np.linalg.norm(translations, axis=1)
+    refuse(file, numbers, np.abs(lengths - 1.0) > _ROTATION_TOLERANCE, "has no unit direction at its end")
+    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
+    refuse(file, numbers, _repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
+    found = EpipolarGeometries(
+        names=tuple(names),
+        pairs=pairs,
+        rotations=_FLIP @ _nearest_rotations(rotations).swapaxes(1, 2) @ _FLIP,
+        to_second=normalized(translations) @ _FLIP,
+    )
+    component = path / _COMPONENT_FILE
+    return _restricted(found, component) if path.is_dir() and component.is_file() else found
+
+
+def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
+    """Read rots.txt: the rotations (n, 3, 3) cam_from_world of the named cameras, and (n,) who has one.
+
+    Cameras of the file that are not among `names` are passed over.
+
+    Raises:
+        InputError: if the file cannot be read, naming the first malformed line, or has none of the cameras.
+    """
+    file = Path(path)
+    numbers, rows = read_lines(file, "i R11 R12 ... R33")
+    rotations = number_table(file, numbers, rows, first=1, width=_ROTATION_COLUMNS).reshape(-1, 3, 3)
+    refuse(file, numbers, _is_no_rotation(rotations), "has no rotation matrix")
+    index = {name: k for k, name in enumerate(names)}
+    ids = [row[0] for row in rows]
+    _, as_node = node_indices(ids)
+    refuse(file, numbers, _repeated(as_node[:, None]), "gives an earlier camera a second rotation")
+    inside = [k for k, name in enumerate(ids) if name in index]
+    if not inside:
+        raise InputError(f"{file} has a rotation of none of the {len(names)} cameras; check its ids")
+    found, known = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros(len(names), dtype=np.bool_)
+    where = [index[ids[k]] for k in inside]
+    found[where] = _FLIP @ _nearest_rotations(rotations[inside])
+    known[where] = True
+    return found, known
+
+
+def onedsfm_files(
+    found: EpipolarGeometries, rotations: FloatArray, cameras: IntArray, locations: FloatArray
+) -> dict[str, str]:
+    """Return the text of EGs.txt, cc.txt, rots.txt and soln.txt, by name; numbers round-trip.
+
+    Args:
+        found: the pairs to write.
+        rotations: (n, 3, 3) cam_from_world, of all cameras.
+        cameras: (k,) those that are placed, which alone stand in the last three files.
+        locations: (k, 3) of these.
+    """
+    relative = _FLIP @ found.rotations.swapaxes(1, 2) @ _FLIP
+    pair_rows = np.concatenate([relative.reshape(-1, 9), found.to_second @ _FLIP], axis=1)
+    ids = [f"{found.names[i]} {found.names[j]}" for i, j in found.pairs.tolist()]
+    placed = [found.names[k] for k in cameras.tolist()]
+    return {
+        _PAIRS_FILE: _text(ids, pair_rows),
+        _COMPONENT_FILE: "".join(f"{name}\n" for name in placed),
+        "rots.txt": _text(placed, (_FLIP @ rotations[cameras]).reshape(-1, 9)),
+        "soln.txt": _text(placed, locations),
+    }
+
+
+def _text(ids: list[str], values: FloatArray) -> str:
+    lines = [f"{name} {' '.join(map(repr, row))}\n" for name, row in zip(ids, values.tolist(), strict=True)]
+    return "".join(lines)
+
+
+def _restricted(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:
+    """Return the cameras of a cc.txt and the pairs between them."""
+    numbers, rows = read_lines(component, "i")
+    refuse(component, numbers, np.array([len(row) != 1 for row in rows]), "is not one camera's id")
+    wanted = {row[0] for row in rows}
+    inside = np.array([name in wanted for name in found.names])
+    kept = inside[found.pairs].all(axis=1)
+    if not kept.any():
+        raise InputError(f"{component} keeps no pair of {_PAIRS_FILE}; remove it, or correct its ids")
+    left = found.subset(np.flatnonzero(kept).tolist())
+    renumbered = np.cumsum(inside) - 1
+    return replace(
+        left, names=tuple(name for name in found.names if name in wanted), pairs=renumbered[left.pairs]
+    )
+
+
+def _is_no_rotation(matrices: FloatArray) -> BoolArray:
+    """Return which of (k, 3, 3) matrices are not orthonormal, or mirror."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
+        bad: BoolArray = ~((off <= _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0.0))
+    return bad
+
+
+def _nearest_rotations(matrices: FloatArray) -> FloatArray:
+    """Return the rotations nearest to (k, 3, 3) matrices that are rotations but for rounding."""
+    u, _, vt = np.linalg.svd(matrices)
+    return np.asarray(u @ vt)
+
+
+def _repeated(rows: IntArray) -> BoolArray:
+    """Return which rows occurred before."""
+    repeated = np.ones(len(rows), dtype=np.bool_)
+    repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return repeated

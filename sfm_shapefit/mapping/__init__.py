@@ -1,0 +1,1 @@
+"""`map`: from a database alone to placed cameras; rotations are averaged first."""

@@ -1,0 +1,36 @@
+"""How long each stage takes, and how far it is."""
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of a stage, the work done so far and the work in all."""
+
+
+def _silent(_stage: str, _done: int, _total: int) -> None:
+    """Report to nobody."""
+
+
+@dataclass(slots=True)
+class Clock:
+    """Measures stages and passes their progress on."""
+
+    progress: Progress = _silent
+    seconds: dict[str, float] = field(default_factory=dict)
+    stage: str = ""
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time a stage."""
+        self.stage = stage
+        self.progress(stage, 0, 1)
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - start
+        self.progress(stage, 1, 1)
+
+    def advance(self, done: int, total: int) -> None:
+        """Report progress inside the current stage."""
+        self.progress(self.stage, done, total)

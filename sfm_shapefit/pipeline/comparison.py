@@ -1,0 +1,38 @@
+"""`evaluate`: a model's poses against a reference."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.evaluation import Evaluation, evaluate_poses
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+def evaluate(
+    reconstruction: "pycolmap.Reconstruction | Path | str",
+    reference: "pycolmap.Reconstruction | Path | str",
+    thresholds: Sequence[float] = (),
+) -> Evaluation:
+    """Return position and rotation errors of a model against a reference, after robust alignment.
+
+    Args:
+        reconstruction, reference: reconstructions or model folders; cameras are matched by name.
+        thresholds: position errors, in the reference's units, at which recall is wanted too.
+
+    Raises:
+        InputError: if a model cannot be read, or they have fewer than three cameras in common.
+    """
+    model = read_model(reconstruction)
+    truth = read_model(reference)
+    return evaluate_poses(
+        model.names,
+        model.rotations,
+        model.centers,
+        truth.names,
+        truth.rotations,
+        truth.centers,
+        thresholds=thresholds,
+    )

@@ -1,0 +1,149 @@
+"""From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.directions import (
+    CONTRADICTIONS,
+    DirectionStatus,
+    PairDirections,
+    concatenate,
+    estimate_directions,
+    from_relative_poses,
+)
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.sources import MatchSource
+from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.robust.trust import Evidence
+from sfm_shapefit.tracks import JointGraph, build_tracks, covering_set, join_points
+from sfm_shapefit.viewgraph import ViewGraph
+
+_CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
+_ADVICE = {
+    DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
+    DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
+    DirectionStatus.NO_PARALLAX: "cameras that only turn cannot be placed; use images from different places",
+}
+"""What to do where no pair has a direction, by the most frequent reason."""
+
+
+def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock) -> PairDirections:
+    """Return the direction of every pair that the source has."""
+    model = source.model
+    if source.database is not None and source.kind == "relative-poses":
+        poses = source.database.relative_poses()
+        if len(poses.pairs) == 0:
+            raise UnsolvableError("the database has no stored relative pose; use directions from matches")
+        return from_relative_poses(
+            poses.pairs,
+            (poses.rotations, poses.translations),
+            model.rotations,
+            poses.num_inliers,
+            options.for_directions(),
+        )
+    parts: list[PairDirections] = []
+    for batch in source.batches():
+        focal_lengths = model.focal_lengths_px[batch.pairs].min(axis=1)
+        parts.append(
+            estimate_directions(
+                batch.pairs,
+                batch.offsets,
+                batch.rays_i,
+                batch.rays_j,
+                1.0 / focal_lengths,
+                options.for_directions(),
+                threads=options.num_threads(),
+            )
+        )
+        clock.advance(sum(len(part.pairs) for part in parts), source.total)
+    if not parts:
+        raise UnsolvableError(
+            "no two posed images share matches; match the images, or give the database that has their matches"
+        )
+    return concatenate(parts)
+
+
+def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
+    """Return the graph of the usable directions; it has at least one edge."""
+    usable = directions.usable()
+    if len(usable) == 0:
+        counts = directions.counts()
+        reasons = ", ".join(f"{count} {status.value}" for status, count in counts.items())
+        raise UnsolvableError(
+            f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
+            f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
+        )
+    return ViewGraph(
+        model.num_images,
+        directions.pairs[usable],
+        directions.directions[usable],
+        directions.weights()[usable],
+        names=model.names,
+    )
+
+
+def joint_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> JointGraph:
+    """Return the view graph, with 3D points as further nodes if the options want them."""
+    model = source.model
+    graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
+    if not options.uses_points(model.num_images):
+        return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
+    pixel_angles = 1.0 / model.focal_lengths_px
+    tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
+    chosen = tracks.subset(covering_set(tracks, model.num_images))
+    return join_points(graph, covariance, chosen, pixel_angles)
+
+
+def shared_errors(
+    source: MatchSource, directions: PairDirections, options: LocateOptions
+) -> FloatArray | None:
+    """Return samples of the usable directions' errors, which share keypoints; None if not known."""
+    usable = directions.usable()
+    if source.kind == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
+        return None
+    row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
+    errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
+    for batch in source.batches():
+        rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
+        errors[rows] = sample_direction_errors(
+            batch.pairs,
+            batch.offsets,
+            batch.keypoints,
+            (batch.rays_i, batch.rays_j),
+            1.0 / source.model.focal_lengths_px[batch.pairs].min(axis=1),
+            directions.directions[rows],
+            directions.covariance[rows],
+            1.4826 * directions.median_residual_px[rows],
+            options.inlier_threshold_px,
+        )
+    return errors[usable]
+
+
+def evidence_of(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
+    """Return what the matches say of the cameras beyond the usable directions."""
+    usable = directions.usable()
+    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
+    return Evidence(
+        support=directions.num_matches[usable],
+        contradicting=directions.pairs[against].reshape(-1, 2),
+        contradicting_support=directions.num_matches[against],
+        errors=errors,
+    )
+
+
+def with_points(evidence: Evidence, joint: JointGraph) -> Evidence:
+    """Return the evidence with a row for each direction to a point: one match, errors of their own."""
+    own = joint.covariance[len(evidence.support) :]
+    support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
+    if evidence.errors is None:
+        return replace(evidence, support=support)
+    draws = np.random.default_rng(0).standard_normal((len(own), *evidence.errors.shape[1:]))
+    sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    errors = np.concatenate([evidence.errors, sigmas[:, None, :] * draws])
+    return replace(evidence, support=support, errors=errors)

@@ -1,0 +1,75 @@
+"""Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
+from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.colmap.model import PosedModel, track_matches
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.options import Source
+from sfm_shapefit.results import Inputs
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchSource:
+    """A model with the matches of its images, which can be read again and again."""
+
+    model: PosedModel
+    kind: Source
+    """What directions are made from; never "auto"."""
+    database: MatchDatabase | None
+    """The open database; None where the model's own tracks serve."""
+
+    def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
+        """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
+        if self.database is None:
+            return track_matches(self.model, 1)
+        return self.database.iter_matches(1, among=among)
+
+    @property
+    def total(self) -> int:
+        """The work in all, for a progress bar: pairs of a database, or images."""
+        return self.model.num_images if self.database is None else self.database.num_pairs
+
+
+@contextmanager
+def open_source(model: PosedModel, inputs: Inputs) -> Iterator[MatchSource]:
+    """Open the matches that were chosen, and close them in the end."""
+    if inputs.database is None:
+        yield MatchSource(model=model, kind=inputs.source, database=None)
+        return
+    with open_database(inputs.database, model) as database:
+        yield MatchSource(model=model, kind=inputs.source, database=database)
+
+
+def choose_inputs(
+    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source
+) -> Inputs:
+    """Decide where directions come from, and say how."""
+    folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None
+    if source == "tracks":
+        if database is not None:
+            raise InputError("directions from tracks use no database; leave out one of the two")
+        return Inputs(
+            folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
+        )
+    is_folder = folder is not None and not folder.is_file()  # pixels of other programs' models may differ
+    found = find_database(folder) if folder is not None and is_folder else None
+    path = Path(database) if database is not None else found
+    if path is None:
+        if source != "auto":
+            raise InputError(f"directions from {source} need a database; give one with --database")
+        statement = "the model's own tracks; no database.db was given or found beside the model"
+        return Inputs(folder=folder, database=None, source="tracks", statement=statement)
+    what = "stored relative poses" if source == "relative-poses" else "inlier matches"
+    statement = f"{what} of {path}" + (" (found beside the model)" if database is None else "")
+    chosen: Source = "relative-poses" if source == "relative-poses" else "matches"
+    return Inputs(folder=folder, database=path, source=chosen, statement=statement)

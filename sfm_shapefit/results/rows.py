@@ -1,0 +1,196 @@
+"""One row per camera, per pair and per rigid piece of a placed graph."""
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.directions import PairDirections
+from sfm_shapefit.placement import Placement, count_large
+from sfm_shapefit.report import CameraRow, PairRow, PieceRow
+from sfm_shapefit.rigidity import left_out_reasons
+from sfm_shapefit.robust.verdicts import Verdict
+from sfm_shapefit.solver.options import Status
+from sfm_shapefit.viewgraph import ViewGraph
+
+_UNCHECKED = "no other pair checks it: the solution bends to fit it"
+_FILTERED = "left out by the filter"
+_OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
+_NOT_SOLVED = "free: its directions determine no placement"
+
+
+def camera_rows(
+    placement: Placement, centers: FloatArray, scale: float, further: Sequence[Placement] = ()
+) -> list[CameraRow]:
+    """Return one row per camera of a placed graph.
+
+    Args:
+        placement: the graph and its solution.
+        centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
+            because they are not trusted.
+        scale: the output's units in one unit of the solver.
+        further: the other pieces that are solved; the rows of their cameras say where they stand.
+    """
+    graph = placement.graph
+    homes = _home_pieces(placement)
+    reasons = _with_folders(left_out_reasons(placement.considered, placement.pieces), further)
+    degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
+    rows = [
+        CameraRow(
+            name=name_of(graph, camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
+        )
+        for camera, degree in enumerate(degrees.tolist())
+    ]
+    for camera, row in zip(
+        placement.cameras.tolist(), own_camera_rows(placement, centers, scale), strict=True
+    ):
+        rows[camera] = replace(row, degree=rows[camera].degree)
+    return rows
+
+
+def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+    """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
+    graph, assessment = placement.graph, placement.assessment
+    inside = graph.edges[placement.edges[placement.pairs]]
+    degrees = np.bincount(inside.ravel(), minlength=graph.num_cameras)
+    sigmas = scale * assessment.sigmas
+    rows = []
+    for k, camera in enumerate(placement.cameras.tolist()):
+        kept = bool(np.isfinite(centers[k]).all())
+        trust, reason = float(assessment.trust[k]), assessment.reasons[k]
+        rows.append(
+            CameraRow(
+                name=name_of(graph, camera),
+                placed=kept,
+                reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
+                piece=placement.piece,
+                center=tuple(centers[k].tolist()) if kept else (),
+                degree=int(degrees[camera]),
+                trust=trust,
+                sigma=tuple(sigmas[k].tolist()),
+            )
+        )
+    return rows
+
+
+def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:
+    """Return one row per pair of cameras.
+
+    Args:
+        placement: the graph and its largest piece.
+        support: (m,) the pairs' number of inlier matches.
+        further: the other pieces that are solved; their pairs are judged by them.
+    """
+    graph = placement.graph
+    judged: dict[int, tuple[Placement, int, float]] = {}
+    for piece in (placement, *further):
+        dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
+        if piece.solve.status is Status.NOT_SOLVED:
+            dual_norms[:] = np.nan
+        judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
+    dropped = set(placement.dropped.tolist())
+    rows = []
+    for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
+        row = PairRow(
+            name1=name_of(graph, i),
+            name2=name_of(graph, j),
+            direction=tuple(graph.directions[edge].tolist()),
+            support=int(support[edge]),
+            weight=float(graph.weights[edge]),
+        )
+        if edge not in judged:
+            inner = placement.bodies is not None and bool(
+                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            )
+            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
+            rows.append(replace(row, reason=_INNER if inner else elsewhere))
+            continue
+        piece, e, dual_norm = judged[edge]
+        assessment = piece.assessment
+        verdict = assessment.verdict(e)
+        rows.append(
+            replace(
+                row,
+                residual_deg=float(assessment.residuals_deg[e]),
+                dual_norm=float(dual_norm),
+                leverage=float(assessment.leverages[e]),
+                verdict=verdict.value,
+                reason=_UNCHECKED if verdict is Verdict.UNDETERMINED else "",
+            )
+        )
+    return rows
+
+
+def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[PieceRow]:
+    """Return one row per parallel-rigid piece of three cameras or more, and for the largest.
+
+    Args:
+        placement: the graph and its largest piece.
+        solved: number, scale and number of placed cameras of each piece that is solved.
+    """
+    facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
+    large = max(count_large(placement.pieces, placement.num_cameras), 1)
+    rows = []
+    for k, piece in enumerate(placement.pieces[:large]):
+        scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
+        hinges = piece.hinges[piece.hinges < placement.num_cameras]
+        rows.append(
+            PieceRow(
+                num_cameras=int(np.sum(piece.cameras < placement.num_cameras)),
+                scale=scale,
+                hinges=[name_of(placement.graph, hinge) for hinge in hinges.tolist()],
+                folder=folder_of(k) if k in facts else "",
+                num_placed=num_placed,
+            )
+        )
+    return rows
+
+
+def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int, str]:
+    """Say, for the cameras none of whose pairs has a usable direction, what became of their pairs."""
+    causes: dict[int, Counter[str]] = {c: Counter() for c in np.flatnonzero(graph.degrees() == 0).tolist()}
+    for pair, status in zip(directions.pairs.tolist(), directions.status, strict=True):
+        for camera in pair:
+            if camera in causes:
+                causes[camera][status.value] += 1
+    reasons = dict.fromkeys(causes, "no matches with any posed image")
+    for camera, counter in causes.items():
+        for cause, count in counter.most_common(1):
+            total = counter.total()
+            reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
+    return reasons
+
+
+def name_of(graph: ViewGraph, camera: int) -> str:
+    """Return a camera's name, or its number where the graph has no names."""
+    return str(camera) if graph.names is None else graph.names[camera]
+
+
+def folder_of(piece: int) -> str:
+    """Return where a piece stands in the output."""
+    return f"pieces/{piece}" if piece else "."
+
+
+def _with_folders(reasons: dict[int, str], further: Sequence[Placement]) -> dict[int, str]:
+    """Add to the reason for which a camera is left out in which further pieces it stands."""
+    homes: dict[int, list[str]] = {}
+    for placement in further:
+        for camera in placement.cameras.tolist():
+            homes.setdefault(camera, []).append(folder_of(placement.piece))
+    return {
+        camera: f"{reason}; see {', '.join(homes[camera])}" if camera in homes else reason
+        for camera, reason in reasons.items()
+    }
+
+
+def _home_pieces(placement: Placement) -> list[int | None]:
+    """Return the first piece of three cameras or more that holds each camera, or the largest."""
+    homes: list[int | None] = [None] * placement.graph.num_cameras
+    large = max(count_large(placement.pieces, placement.num_cameras), 1)
+    for k in reversed(range(large)):
+        for camera in placement.pieces[k].cameras.tolist():
+            homes[camera] = k
+    return homes

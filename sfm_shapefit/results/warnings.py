@@ -1,0 +1,77 @@
+"""What the user should know beyond the tables, a sentence each."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray
+from sfm_shapefit.placement import SMALLEST_PIECE, Placement
+from sfm_shapefit.results.rows import name_of
+from sfm_shapefit.robust.finish import Finish
+from sfm_shapefit.solver.options import Status
+
+_ALARMING_SHARE = 0.5  # of pairs that contradict the solution
+_ALARMING_LEVEL_DEG = 5.0
+_UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
+
+
+def quality_warnings(placement: Placement) -> Iterator[str]:
+    """Yield what the user should know about a solution, a sentence each."""
+    if placement.solve.status is Status.NOT_SOLVED:
+        yield placement.solve.status.value
+    elif placement.solve.status is not Status.CONVERGED:
+        yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
+    if placement.solve.unique is False:
+        yield "other placements may fit as well: the certificate does not prove the optimum unique"
+    level = placement.assessment.level_deg
+    if level > _ALARMING_LEVEL_DEG:
+        yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
+    yield from _collapse(placement.finish)
+    yield from _uncertain_cameras(placement)
+    share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    if share > _ALARMING_SHARE:
+        yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+    if placement.rival is not None:
+        yield placement.rival.statement()
+
+
+def _collapse(finish: Finish) -> Iterator[str]:
+    """Yield a warning where the two convex programs disagree about lengths."""
+    if not finish.collapsed:
+        return
+    assert finish.disagreement is not None
+    yield (
+        f"ShapeFit and LUD disagree about lengths (by {finish.disagreement:.0%}), as they do on long chains "
+        f"and under heavy corruption; kept: {finish.start}"
+        + ("" if finish.refined else ", unrefined; --objective auto refines both and compares")
+    )
+
+
+def _uncertain_cameras(placement: Placement) -> Iterator[str]:
+    """Yield a warning that names the least certain camera, if any is uncertain."""
+    extent = float(np.linalg.norm(np.ptp(placement.locations, axis=0)))
+    largest = placement.assessment.sigmas[: len(placement.cameras)].max(axis=1)
+    uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
+    if np.isnan(largest).any():
+        yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
+    if uncertain and len(placement.cameras) >= SMALLEST_PIECE:
+        worst = name_of(placement.graph, int(placement.cameras[np.argmax(largest)]))
+        yield (
+            f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
+            f"above all {worst}; see sigma and trust in cameras.csv"
+        )
+
+
+def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
+    """Yield which cameras are left out for want of trust, if any are."""
+    lost = np.flatnonzero(~kept)
+    if len(lost):
+        worst = int(lost[np.argmin(placement.assessment.trust[lost])])
+        name, reason = (
+            name_of(placement.graph, int(placement.cameras[worst])),
+            placement.assessment.reasons[worst],
+        )
+        yield (
+            f"{len(lost)} cameras are left out because they are not trusted, above all {name} ({reason}); "
+            "--min-trust 0 keeps them"
+        )

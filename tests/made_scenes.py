@@ -1,0 +1,111 @@
+"""Scenes to be drawn, made without solving anything: a ring of cameras around points, some pairs wrong."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.report import CameraRow, PairRow
+from sfm_shapefit.visual.scene import Points, Poses, build_scene
+
+UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
+
+
+def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0):
+    """Return a scene and what locate.json would say of it."""
+    rng = np.random.default_rng(seed)
+    names = names or [f"images/IMG_{k:05d}.jpg" for k in range(num_cameras)]
+    centers, rotations = _ring(num_cameras, rng)
+    cameras = [
+        CameraRow(
+            name=names[k],
+            placed=k != num_cameras - 1,
+            reason="no two pairs tie it to the others" if k == num_cameras - 1 else "",
+            piece=0,
+            center=tuple(centers[k]) if k != num_cameras - 1 else (),
+            degree=8,
+            trust=float(np.clip(1.1 - rng.exponential(0.12), 0, 1)) if k != num_cameras - 1 else float("nan"),
+            sigma=tuple(rng.uniform(0.001, 0.02, 3)),
+        )
+        for k in range(num_cameras)
+    ]
+    pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
+    history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
+    scene = build_scene(
+        cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape)
+    )
+    halves = np.tile([0.6, 0.45], (num_cameras, 1))
+    poses = Poses(rotations=rotations, centers=centers + rng.normal(0, 0.3, centers.shape), half_sizes=halves)
+    points = Points(
+        positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
+        colors=rng.integers(60, 220, (num_points, 3)),
+        num_all=3 * num_points,
+    )
+    pairs = replace(scene.pairs, input_deg=scene.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))
+    scene = replace(
+        scene, cameras=replace(scene.cameras, poses=poses), points=points, pairs=pairs, input_is_aligned=True
+    )
+    return replace(scene, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(
+        names
+    )
+
+
+def _ring(n, rng):
+    """Return centres and cam_from_world rotations of cameras that look inwards, y down."""
+    angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
+    centers = np.stack([8 * np.cos(angles), rng.normal(0, 0.2, n), 8 * np.sin(angles)], axis=1)
+    forward = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
+    right = np.cross(np.tile([0.0, 1.0, 0.0], (n, 1)), forward)
+    right /= np.linalg.norm(right, axis=1, keepdims=True)
+    return centers, np.stack([right, np.cross(forward, right), forward], axis=1)
+
+
+def _pair(e, names, centers, rng):
+    n = len(names)
+    i = e % n
+    j = (i + 1 + e // n) % n
+    wrong, undetermined = e % WRONG_EVERY == 0, e % UNDETERMINED_EVERY == 1
+    if e % NO_DIRECTION_EVERY == 2:
+        return PairRow(name1=names[i], name2=names[j], support=9, reason="too few matches")
+    baseline = centers[i] - centers[j]
+    direction = baseline / (np.linalg.norm(baseline) or 1.0)
+    return PairRow(
+        name1=names[i],
+        name2=names[j],
+        direction=tuple(direction),
+        support=int(rng.lognormal(4.5, 0.8)) + 15,
+        weight=float(rng.uniform(0.2, 1)),
+        residual_deg=float(rng.uniform(5, 160) if wrong else rng.lognormal(-2.5, 0.8)),
+        dual_norm=float(rng.uniform(0, 1)),
+        leverage=float(rng.uniform(0, 0.9)),
+        verdict="undetermined" if undetermined else "outlier" if wrong else "inlier",
+        reason="no other pair checks it" if undetermined else "",
+    )
+
+
+def _facts(names):
+    return {
+        "inputs": {
+            "model": "project/sparse/0",
+            "database": "project/database.db",
+            "directions": "inlier matches",
+        },
+        "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
+        "residual_level_deg": 0.07,
+        "mean_reprojection_error_px": 0.62,
+        "scale": "input: scale and origin of the input's centres",
+        "loose_groups": [{"cameras": list(names[:2]), "cause": "two agreeing pairs or fewer hold it"}],
+        "pieces": [
+            {
+                "num_cameras": len(names),
+                "scale": "input",
+                "hinges": [names[0]],
+                "folder": ".",
+                "num_placed": len(names) - 1,
+            },
+            {"num_cameras": 4, "scale": "unit", "hinges": [names[0]], "folder": "pieces/1", "num_placed": 4},
+        ],
+        "solve": {"objective": 0.02, "gap": 3e-9, "unique": True, "status": "converged"},
+        "timings_s": {"read": 0.11, "directions": 0.4, "solve": 0.3, "structure": 0.5},
+        "warnings": ["3 cameras are uncertain by more than 5% of the extent"],
+        "versions": {"sfm_shapefit": "0.1.0", "pycolmap": "4.2.1"},
+    }

@@ -1,0 +1,397 @@
+"""Scale, origin and axes: of the input's centres, of a known distance, of position priors."""
+
+import json
+import sqlite3
+
+import numpy as np
+import pycolmap
+import pytest
+from scenes import RING
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from sfm_shapefit import InputError, LocateOptions, locate
+from sfm_shapefit.cli import app
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.priors import database_priors, table_priors
+from sfm_shapefit.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.anchored import Anchors, refine_anchored
+from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.viewgraph import ViewGraph
+
+RING_MODEL = RING / "sparse" / "0"
+TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
+
+
+def cameras(seed, n=12):
+    return np.random.default_rng(seed).standard_normal((n, 3))
+
+
+def priors_of(positions, sigma=np.nan, rows=None):
+    rows = np.arange(len(positions)) if rows is None else np.asarray(rows)
+    return PositionPriors(
+        cameras=rows,
+        positions=positions[rows],
+        covariances=np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3)),
+        statement="a test",
+    )
+
+
+def run(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+# --- the input's centres -----------------------------------------------------------------------------
+
+
+def test_the_input_gauge_is_recovered_without_turning_the_axes():
+    t = cameras(8)
+    gauge = input_gauge(t, 7.0 * t + [1.0, -2.0, 3.0])
+    assert gauge.scale == "input"
+    assert gauge.similarity.scale == pytest.approx(7.0, rel=1e-9)
+    np.testing.assert_allclose(gauge.similarity.apply(t), 7.0 * t + [1.0, -2.0, 3.0], atol=1e-8)
+    np.testing.assert_array_equal(gauge.similarity.rotation, np.eye(3))
+
+
+def test_a_few_wild_cameras_do_not_set_the_scale():
+    t = cameras(9)
+    wild_input, wild_answer = 7.0 * t, t.copy()
+    wild_input[3] += 1e4
+    wild_answer[5] += 1e4
+    assert input_gauge(wild_answer, wild_input).similarity.scale == pytest.approx(7.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6)])
+def test_without_input_centres_the_scale_is_unit_and_said_so(centers):
+    t = cameras(10)
+    gauge = input_gauge(t, centers)
+    placed = gauge.similarity.apply(t)
+    assert gauge.scale == "unit"
+    assert "coincide" in gauge.statement
+    np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-12)
+    assert np.median(np.linalg.norm(placed, axis=1)) == pytest.approx(1.0, rel=1e-12)
+
+
+def test_centres_that_contradict_the_answer_do_not_turn_it_inside_out():
+    t = cameras(11)
+    gauge = input_gauge(t, -t)
+    assert gauge.scale == "unit"
+    assert gauge.similarity.scale > 0.0
+
+
+# --- a known distance --------------------------------------------------------------------------------
+
+
+def test_a_known_distance_becomes_true():
+    t = cameras(1)
+    placed = distance_gauge(t, 3, 7, 12.5, "a and b").apply(t)
+    assert np.linalg.norm(placed[3] - placed[7]) == pytest.approx(12.5, rel=1e-14)
+    np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-13)
+
+
+def test_the_distance_of_cameras_at_one_place_sets_no_scale():
+    t = cameras(2)
+    t[4] = t[5]
+    with pytest.raises(InputError, match="a and b coincide"):
+        distance_gauge(t, 4, 5, 1.0, "a and b")
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"scale": "distance"}, "needs known_distance"),
+        ({"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),
+        ({"known_distance": ("a", "b", -1.0)}, "must be positive"),
+        ({"known_distance": ("a", "a", 1.0)}, "two different images"),
+        ({"known_distance": ("a", "b")}, "two image names and a number"),
+        ({"known_distance": 3.0}, "two image names and a number"),
+    ],
+)
+def test_a_known_distance_that_says_nothing_is_refused(settings, message):
+    with pytest.raises(ValueError, match=message):
+        LocateOptions(**settings)
+
+
+def test_locate_makes_a_known_distance_true_and_says_so(tmp_path):
+    known = ("--known-distance", "0003.jpg", "0007.jpg", "42.5")
+    result = run("locate", RING_MODEL, tmp_path / "out", "--json", *known)
+    model = pycolmap.Reconstruction(tmp_path / "out")
+    centres = {image.name: image.projection_center() for image in model.images.values()}
+    assert np.linalg.norm(centres["0003.jpg"] - centres["0007.jpg"]) == pytest.approx(42.5, rel=1e-12)
+    assert "0003.jpg and 0007.jpg are 42.5 apart" in json.loads(result.stdout)["scale"]
+
+
+def test_a_known_distance_of_an_unknown_image_names_it(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--known-distance", "0003.jpg", "x.jpg", "1")
+    assert result.exit_code == 3
+    assert "no posed image x.jpg" in result.stderr
+
+
+# --- position priors ---------------------------------------------------------------------------------
+
+
+def test_exact_priors_give_back_scale_axes_and_origin():
+    t = cameras(3)
+    truth = 5.0 * t @ TURN.T + [100.0, -20.0, 3.0]
+    gauge = prior_gauge(t, priors_of(truth, rows=[0, 2, 3, 7, 9]))
+    np.testing.assert_allclose(gauge.apply(t), truth, atol=1e-9)
+    np.testing.assert_allclose(gauge.axes, TURN, atol=1e-12)
+
+
+def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
+    rng = np.random.default_rng(104)
+    t, sigma = cameras(4, n=60), 0.05
+    truth = 5.0 * t @ TURN.T
+    measured = truth + sigma * rng.standard_normal(truth.shape)
+    clean = prior_gauge(t, priors_of(measured, sigma)).apply(t)
+    wrong = rng.permutation(60)[:12]
+    measured[wrong] += 100.0 * sigma * rng.standard_normal((12, 3))
+    gauge = prior_gauge(t, priors_of(measured, sigma))
+    # Least squares of 7 unknowns on 3 * 48 coordinates leaves sigma sqrt(3 * 7 / 144) = 0.38 sigma a camera.
+    for placed in (clean, gauge.apply(t)):
+        assert np.median(np.linalg.norm(placed - truth, axis=1)) < 2.0 * 0.38 * sigma
+    agreeing = int(gauge.statement.split("; ")[1].split(" of ")[0])
+    assert 44 <= agreeing <= 50  # of the 48 right ones; a wrong one may be near by chance
+    assert gauge.warning == ""
+
+
+def test_priors_on_a_line_keep_the_axes_and_say_so():
+    t = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
+    gauge = prior_gauge(t, priors_of(3.0 * t + 1.0))
+    assert gauge.axes is None
+    assert "lie on a line" in gauge.warning
+    assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
+
+
+@pytest.mark.parametrize(("rows", "message"), [([4], "a scale needs two"), ([], "a scale needs two")])
+def test_too_few_priors_are_refused(rows, message):
+    t = cameras(5)
+    with pytest.raises(InputError, match=message):
+        prior_gauge(t, priors_of(t, rows=np.array(rows, dtype=np.int64)))
+
+
+def test_priors_at_one_place_are_refused():
+    t = cameras(6)
+    with pytest.raises(InputError, match="coincide"):
+        prior_gauge(t, priors_of(np.full((12, 3), 4.0)))
+
+
+def test_priors_that_have_nothing_to_do_with_the_cameras_are_warned_about():
+    assert "rough; check them" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
+
+
+@pytest.fixture(scope="module")
+def ring():
+    return read_model(RING_MODEL)
+
+
+def write_table(path, model, positions, lines=(), sep=" "):
+    rows = [
+        sep.join([name, *(repr(float(x)) for x in p)]) for name, p in zip(model.names, positions, strict=True)
+    ]
+    path.write_text("\n".join([*lines, *rows]) + "\n")
+    return path
+
+
+def test_a_table_is_read_by_name_with_either_separator(ring, tmp_path):
+    for sep in (" ", ","):
+        path = write_table(
+            tmp_path / "priors.txt", ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep
+        )
+        found = table_priors(path, ring)
+        np.testing.assert_array_equal(found.positions, ring.centers)
+        assert np.isnan(found.covariances).all()
+
+
+def test_standard_deviations_of_a_table_become_covariances(ring, tmp_path):
+    path = tmp_path / "priors.csv"
+    path.write_text(f"name,x,y,z,sx,sy,sz\n{ring.names[0]},1,2,3,0.5,0.25,2\n")
+    np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
+
+
+def test_latitudes_and_longitudes_become_metres_east_north_up(ring, tmp_path):
+    path = tmp_path / "gps.csv"
+    names = ring.names[:3]
+    path.write_text(
+        f"name,lat,lon,alt\n{names[0]},48.0,11.0,500\n{names[1]},48.0,11.001,500\n{names[2]},48.001,11.0,510\n"
+    )
+    found = table_priors(path, ring).positions
+    # WGS84 at 48 N: a degree of longitude is 74628 m, of latitude 111200 m.
+    np.testing.assert_allclose(found[1] - found[0], [74.628, 0.0, 0.0], atol=2e-2)
+    np.testing.assert_allclose(found[2] - found[0], [0.0, 111.20, 10.0], atol=2e-2)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0003.jpg 1 2", "line 2: expected a name"),
+        ("0003.jpg 1 2 x", "line 2: expected a name"),
+        ("0003.jpg 1 2 nan", "line 2: coordinates must be finite"),
+        ("0003.jpg 1 2 3 -1", "line 2: coordinates must be finite and standard deviations positive"),
+        ("0001.jpg 1 2 3", "line 2: 0001.jpg stands twice"),
+    ],
+)
+def test_a_malformed_line_of_a_table_is_named(ring, tmp_path, line, message):
+    path = tmp_path / "priors.txt"
+    path.write_text(f"0001.jpg 0 0 0\n{line}\n")
+    with pytest.raises(InputError, match=message):
+        table_priors(path, ring)
+
+
+def test_a_table_of_other_images_is_refused(ring, tmp_path):
+    path = tmp_path / "priors.txt"
+    path.write_text("other.jpg 1 2 3\n")
+    with pytest.raises(InputError, match="no prior of the model's images"):
+        table_priors(path, ring)
+
+
+NEW = (
+    "CREATE TABLE pose_priors (pose_prior_id INTEGER PRIMARY KEY, corr_data_id INTEGER, "
+    "corr_sensor_id INTEGER, corr_sensor_type INTEGER, position BLOB, position_covariance BLOB, "
+    "gravity BLOB, coordinate_system INTEGER)"
+)
+OLD = (
+    "CREATE TABLE pose_priors (image_id INTEGER PRIMARY KEY, position BLOB, coordinate_system INTEGER, "
+    "position_covariance BLOB)"
+)
+
+
+def database_with_priors(path, schema, rows):
+    """Rows: image id, name, position, covariance by columns, coordinate system."""
+    connection = sqlite3.connect(path)
+    connection.execute("CREATE TABLE images (image_id INTEGER PRIMARY KEY, name TEXT)")
+    connection.execute(schema)
+    for k, (image_id, name, position, covariance, system) in enumerate(rows):
+        connection.execute("INSERT INTO images VALUES (?, ?)", (image_id, name))
+        xyz = np.array(position, dtype="<f8").tobytes()
+        cov = None if covariance is None else np.array(covariance, dtype="<f8").tobytes()
+        if schema == NEW:
+            values = (k, image_id, 1, 0, xyz, cov, None, system)
+        else:
+            values = (image_id, xyz, system, cov)
+        connection.execute(f"INSERT INTO pose_priors VALUES ({','.join('?' * len(values))})", values)
+    connection.commit()
+    connection.close()
+    return path
+
+
+@pytest.mark.parametrize("schema", [NEW, OLD])
+def test_priors_of_a_database_of_any_version_are_read(ring, tmp_path, schema):
+    rows = [
+        (9, "0003.jpg", [1, 2, 3], np.diag([1.0, 4.0, 9.0]).ravel(), 1),
+        (4, "0001.jpg", [4, 5, 6], None, 1),
+    ]
+    rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0002.jpg", [np.nan, 0, 0], None, 1)]
+    found = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring)
+    by_name = {
+        ring.names[k]: p.tolist() for k, p in zip(found.cameras.tolist(), found.positions, strict=True)
+    }
+    assert by_name == {"0003.jpg": [1, 2, 3], "0001.jpg": [4, 5, 6]}
+    third = [ring.names[k] for k in found.cameras.tolist()].index("0003.jpg")
+    np.testing.assert_array_equal(found.covariances[third], np.diag([1.0, 4.0, 9.0]))
+
+
+def test_a_database_without_usable_priors_is_refused(ring, tmp_path):
+    with pytest.raises(InputError, match="no position prior"):
+        database_priors(RING / "database.db", ring)
+    rows = [(1, "0001.jpg", [1, 2, 3], None, 1), (2, "0002.jpg", [4, 5, 6], None, 0)]
+    with pytest.raises(InputError, match="mixes WGS84 and Cartesian"):
+        database_priors(database_with_priors(tmp_path / "d.db", NEW, rows), ring)
+
+
+def test_locate_turns_the_whole_model_onto_priors(ring, tmp_path):
+    plain = locate(RING_MODEL)
+    truth = 2.0 * ring.centers @ TURN.T + [1000.0, 0.0, -50.0]
+    table = write_table(tmp_path / "priors.txt", ring, truth)
+    found = locate(RING_MODEL, priors=table)
+    for image_id, centre in zip(ring.image_ids.tolist(), truth, strict=True):
+        image, before = found.reconstruction.image(image_id), plain.reconstruction.image(image_id)
+        apart = np.linalg.norm(before.projection_center() - ring.centers[ring.image_ids == image_id][0])
+        assert np.linalg.norm(image.projection_center() - centre) <= 2.0 * apart + 0.05
+        # A turn of the world by the axes A: cam_from_world becomes R A^T.
+        expected = before.cam_from_world().rotation.matrix() @ found.gauge.axes.T
+        np.testing.assert_allclose(image.cam_from_world().rotation.matrix(), expected, atol=1e-12)
+    before, after = (r.reconstruction.compute_mean_reprojection_error() for r in (plain, found))
+    assert after == pytest.approx(before, abs=1e-5)  # exact matches: rounding alone
+
+
+def test_priors_without_effect_are_refused(ring, tmp_path):
+    table = write_table(tmp_path / "priors.txt", ring, ring.centers)
+    result = run("locate", RING_MODEL, tmp_path / "out", "--priors", table, "--scale", "unit")
+    assert result.exit_code == 3
+    assert "no effect with the scale unit" in result.stderr
+    result = run("locate", RING_MODEL, tmp_path / "out", "--scale", "prior")
+    assert result.exit_code == 3
+    assert "give a table with --priors" in result.stderr
+
+
+# --- priors that pull --------------------------------------------------------------------------------
+
+
+def test_priors_with_refinement_mend_what_directions_leave_open():
+    """A drive along a line: directions with errors drift; positions known to a few centimetres do not."""
+    terms, start, truth, priors = drive(sigma=0.05)
+    before = np.linalg.norm(start - truth, axis=1)
+    moved = refine_anchored(*terms, priors)
+    after = np.linalg.norm(moved - truth, axis=1)
+    assert np.median(before) > 5.0 * np.median(after)
+    assert np.median(after) < 1.538 * 0.05  # the median error of the priors themselves
+
+
+def test_a_fifth_of_wrong_priors_does_not_pull():
+    terms, _, truth, priors = drive(sigma=0.05)
+    right = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
+    wrong = np.random.default_rng(1).permutation(len(truth))[: len(truth) // 5]
+    priors.positions[wrong] += 5.0 * np.random.default_rng(2).standard_normal((len(wrong), 3))
+    left = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
+    # A fifth fewer positions: sqrt(5 / 4) times the error, if the wrong ones have no part.
+    assert np.median(left) < 1.25 * np.sqrt(5.0 / 4.0) * np.median(right)
+
+
+def drive(sigma):
+    """Fifty cameras in a row, each seeing the next four, placed by directions alone; priors of all."""
+    rng = np.random.default_rng(5)
+    n = 50
+    truth = np.stack([np.arange(n), 2.0 * np.sin(np.arange(n) / 8.0), 0.3 * rng.standard_normal(n)], axis=1)
+    edges = np.array([(i, j) for i in range(n) for j in range(i + 1, min(i + 5, n))])
+    error = 0.01
+    exact = normalized(truth[edges[:, 0]] - truth[edges[:, 1]])
+    v = normalized(exact + error * rng.standard_normal(exact.shape))
+    graph = ViewGraph(n, edges, v)
+    covariance = np.broadcast_to(error**2 * np.eye(2), (len(edges), 2, 2))
+    metric = Metric(covariance, np.zeros(len(edges), dtype=np.int64))
+    found = refine_angles(graph, truth, metric, plan_refinement(graph))
+    positions = truth + sigma * rng.standard_normal(truth.shape)
+    gauge = prior_gauge(found.locations, priors_of(positions, sigma))
+    start = gauge.similarity.apply(found.locations)
+    if gauge.axes is not None:
+        positions, truth = positions @ gauge.axes, truth @ gauge.axes
+    anchors = Anchors(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
+    return (graph, start, metric, found.levels_rad), start, truth, anchors
+
+
+def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
+    rng = np.random.default_rng(3)
+    sigma = 0.01
+    noisy = ring.centers + sigma * rng.standard_normal(ring.centers.shape)
+    table = write_table(tmp_path / "priors.txt", ring, noisy)
+    table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
+    arguments = ("locate", RING_MODEL, "--priors", table, "--no-report", "--json")
+    plain = json.loads(run(*arguments, tmp_path / "plain").stdout)
+    facts = json.loads(run(*arguments, tmp_path / "out", "--refine-with-priors").stdout)
+    assert facts["scale"].startswith(plain["scale"] + "; the priors moved cameras by ")
+    off = []
+    for folder in ("plain", "out"):
+        model = pycolmap.Reconstruction(tmp_path / folder)
+        centres = {image.name: image.projection_center() for image in model.images.values()}
+        off.append([np.linalg.norm(centres[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
+    assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+
+
+def test_refinement_with_priors_needs_priors(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--refine-with-priors")
+    assert result.exit_code == 3
+    assert "needs priors" in result.stderr
+    with pytest.raises(ValueError, match="no effect with the scale unit"):
+        LocateOptions(scale="unit", refine_with_priors=True)

@@ -1,0 +1,181 @@
+"""The 1DSfM format and g2o: conventions, round trips, and malformed lines by their number."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import g2o_text, is_onedsfm, onedsfm_files, read_onedsfm, read_rotations
+from sfm_shapefit.geometry import angle_between_deg, normalized
+from tests.scenes import real_scene
+
+IDENTITY = "1 0 0 0 1 0 0 0 1"
+GOOD = f"3 7 {IDENTITY} 1 0 0\n3 12 {IDENTITY} 0 1 0\n7 12 {IDENTITY} 0 0 1\n"
+
+
+def scene(n=6, seed=4):
+    """Bundler cameras: world-to-camera rotations (n, 3, 3), y up, looking along -z, and centres (n, 3)."""
+    rng = np.random.default_rng(seed)
+    return Rotation.random(n, random_state=rng).as_matrix(), rng.standard_normal((n, 3))
+
+
+def egs_text(rotations, centers):
+    """EGs.txt as its manual says: R_i R_j^T, and the direction to camera j in the axes of camera i."""
+    lines = []
+    for i in range(len(centers)):
+        for j in range(i + 1, len(centers)):
+            t = rotations[i] @ (centers[j] - centers[i])
+            row = [*(rotations[i] @ rotations[j].T).ravel(), *(t / np.linalg.norm(t))]
+            lines.append(f"{10 * i} {10 * j} {' '.join(map(repr, map(float, row)))}\n")
+    return "".join(lines)
+
+
+def rots_text(rotations):
+    return "".join(f"{10 * k} {' '.join(map(repr, R.ravel().tolist()))}\n" for k, R in enumerate(rotations))
+
+
+def folder_with(path, **files):
+    path.mkdir(exist_ok=True)
+    for name, text in files.items():
+        (path / f"{name}.txt").write_text(text)
+    return path
+
+
+def test_directions_in_world_axes_point_from_the_second_to_the_first_camera(tmp_path):
+    rotations, centers = scene()
+    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    found = read_onedsfm(folder)
+    known, all_known = read_rotations(folder / "rots.txt", found.names)
+    graph = found.view_graph(known, all_known)
+    i, j = graph.edges.T
+    assert graph.names == ("0", "10", "20", "30", "40", "50")
+    np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
+
+
+def test_camera_axes_become_those_of_colmap(tmp_path):
+    rotations, centers = scene()
+    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    found = read_onedsfm(folder)
+    cam_from_world, _ = read_rotations(folder / "rots.txt", found.names)
+    # Bundler's camera looks along -z and its y is up: in COLMAP's axes both turn round.
+    np.testing.assert_allclose(cam_from_world[:, 2], -rotations[:, 2], atol=1e-12)
+    np.testing.assert_allclose(cam_from_world[:, 1], -rotations[:, 1], atol=1e-12)
+    i, j = found.pairs.T
+    relative = cam_from_world[j] @ cam_from_world[i].swapaxes(1, 2)  # cam_j_from_cam_i
+    np.testing.assert_allclose(found.rotations, relative, atol=1e-12)
+
+
+def test_what_is_written_is_what_was_read(tmp_path):
+    rotations, centers = scene()
+    folder = folder_with(tmp_path / "a", EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    found = read_onedsfm(folder)
+    cam_from_world, known = read_rotations(folder / "rots.txt", found.names)
+    texts = onedsfm_files(found, cam_from_world, np.arange(1, 6), centers[1:])
+    again_folder = folder_with(tmp_path / "b", **{name.removesuffix(".txt"): t for name, t in texts.items()})
+    again = read_onedsfm(again_folder)
+    assert texts["cc.txt"].split() == ["10", "20", "30", "40", "50"]
+    assert again.names == found.names[1:]  # cc.txt leaves the first camera out
+    inside = (found.pairs > 0).all(axis=1)
+    np.testing.assert_array_equal(again.pairs, found.pairs[inside] - 1)
+    np.testing.assert_allclose(again.rotations, found.rotations[inside], atol=1e-14)
+    np.testing.assert_allclose(again.to_second, found.to_second[inside], atol=1e-14)
+    np.testing.assert_allclose(
+        read_rotations(again_folder / "rots.txt", again.names)[0], cam_from_world[1:], atol=1e-14
+    )
+    solution = [line.split() for line in texts["soln.txt"].splitlines()]
+    np.testing.assert_array_equal([[float(x) for x in row[1:]] for row in solution], centers[1:])
+    assert known.all()
+
+
+def test_cameras_without_rotation_have_no_directions(tmp_path):
+    rotations, centers = scene()
+    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations[:4]))
+    found = read_onedsfm(folder)
+    graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
+    assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
+
+
+def test_the_format_is_told_from_bare_graphs(tmp_path):
+    folder = folder_with(tmp_path, EGs=GOOD, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
+    assert is_onedsfm(folder)
+    assert is_onedsfm(folder / "EGs.txt")
+    assert not is_onedsfm(folder / "graph.txt")
+    assert not is_onedsfm(folder / "wide.txt")  # a direction in 12 dimensions
+    assert not is_onedsfm(folder / "nowhere.txt")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "no lines of the form i j R11"),
+        (f"1 2 {IDENTITY} 1 0\n", "line 1: has 13 columns, expected 14"),
+        (f"{GOOD}\n1 2 {IDENTITY} 1 0 x\n", "line 5: 'x' is not a number"),
+        (f"{GOOD}1 2 {IDENTITY} 1 0 inf\n", "line 4: has a number that is not finite"),
+        (f"{GOOD}1 2 1 0 0 0 1 0 0 0 -1 1 0 0\n", "line 4: has no rotation matrix"),
+        (f"{GOOD}1 2 2 0 0 0 1 0 0 0 1 1 0 0\n", "line 4: has no rotation matrix"),
+        (f"{GOOD}1 2 {IDENTITY} 2 0 0\n", "line 4: has no unit direction"),
+        (f"{GOOD}1 1 {IDENTITY} 1 0 0\n", "line 4: joins a camera with itself"),
+        (f"{GOOD}7 3 {IDENTITY} 1 0 0\n", "line 4: repeats an earlier pair"),
+    ],
+)
+def test_malformed_pairs_are_refused_by_line(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        read_onedsfm(folder_with(tmp_path, EGs=text))
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"3 {IDENTITY}\n7 1 2 3\n", "line 2: has 4 columns, expected 10"),
+        (f"3 {IDENTITY}\n7 1 0 0 0 1 0 0 0 2\n", "line 2: has no rotation matrix"),
+        (f"3 {IDENTITY}\n3 {IDENTITY}\n", "line 2: gives an earlier camera a second rotation"),
+        (f"4 {IDENTITY}\n", "a rotation of none of the 3 cameras"),
+    ],
+)
+def test_malformed_rotations_are_refused_by_line(tmp_path, text, words):
+    found = read_onedsfm(folder_with(tmp_path, EGs=GOOD, rots=text))
+    with pytest.raises(InputError, match=words):
+        read_rotations(tmp_path / "rots.txt", found.names)
+
+
+@pytest.mark.parametrize(("text", "words"), [("3\n7 1\n", "line 2: is not one"), ("1\n", "keeps no pair")])
+def test_a_component_that_fits_not_is_refused(tmp_path, text, words):
+    with pytest.raises(InputError, match=words):
+        read_onedsfm(folder_with(tmp_path, EGs=GOOD, cc=text))
+
+
+def test_the_published_scene_has_the_conventions_of_its_manual():
+    source = real_scene("1dsfm-Madrid_Metropolis")
+    found = read_onedsfm(source)
+    assert (len(found.names), len(found.pairs)) == (394, 23_784)
+    stored = np.load(source / "viewgraph.npz")
+    names = [str(k) for k in stored["image_index"].tolist()]
+    assert set(names) == set(found.names)
+    ours = {(found.names[i], found.names[j]): k for k, (i, j) in enumerate(found.pairs.tolist())}
+    rows = [ours[names[i], names[j]] for i, j in stored["edges"].tolist()]
+    np.testing.assert_allclose(found.rotations[rows], stored["R_ji"], atol=1e-5)  # six digits, float32
+    to_second = -np.einsum("eba,eb->ea", stored["R_ji"], stored["t_ji"]).astype(np.float64)
+    assert angle_between_deg(found.to_second[rows], to_second).max() < 1e-3
+
+
+# --- g2o -------------------------------------------------------------------------------------------
+
+
+def test_g2o_has_the_camera_in_the_world(tmp_path):
+    turn = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
+    (line,) = g2o_text(["12"], np.array([[1.0, 2.0, 3.0]]), turn[None]).splitlines()
+    tag, name, *numbers = line.split()
+    assert (tag, name) == ("VERTEX_SE3:QUAT", "12")
+    world_from_cam = [0.0, 0.0, -np.sin(0.15), np.cos(0.15)]
+    np.testing.assert_allclose([float(x) for x in numbers], [1.0, 2.0, 3.0, *world_from_cam], atol=1e-15)
+
+
+def test_g2o_numbers_nodes_that_have_names_and_needs_no_rotations():
+    text = g2o_text(["b.jpg", "a\n.jpg"], np.array([[0.1, 2.0], [3.0, 4.0]]))
+    assert text == "# 0 b.jpg\nVERTEX_XY 0 0.1 2.0\n# 1 a?.jpg\nVERTEX_XY 1 3.0 4.0\n"
+    assert g2o_text(["5"], np.array([[1.0, 2.0, 3.0]])) == "VERTEX_TRACKXYZ 5 1.0 2.0 3.0\n"
+
+
+def test_g2o_has_no_vertices_in_five_dimensions():
+    with pytest.raises(InputError, match="5 dimensions"):
+        g2o_text(["0"], np.zeros((1, 5)))

@@ -1,0 +1,72 @@
+"""A second placement that the rejected pairs agree on: found where there is one, and only there."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.placement import place
+from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.robust.rival import find_rival
+from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def judged(problem, inliers=None, level_deg=0.5):
+    graph = ViewGraph(len(problem.locations), problem.edges, problem.directions)
+    inliers = ~problem.corrupted if inliers is None else inliers
+    return find_rival(graph, np.arange(graph.num_edges), inliers, level_deg)
+
+
+@pytest.mark.parametrize("q", [0.25, 0.4])
+def test_pairs_that_agree_on_a_second_configuration_are_a_rival(q):
+    problem = random_graph_problem(60, 0.5, sigma=0.01, q=q, seed=1, corruption="self-consistent")
+    found = judged(problem)
+    assert len(found.cameras) == 60
+    assert (
+        found.num_pairs > 0.9 * problem.corrupted.sum()
+    )  # noise of 0.6 deg against 3, short baselines of LUD unrefined
+    assert found.num_against == np.sum(~problem.corrupted)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.1])
+@pytest.mark.parametrize("q", [0.2, 0.5])
+def test_random_wrong_pairs_are_no_rival(q, sigma):
+    for problem in (
+        random_graph_problem(60, 0.5, sigma=sigma, q=q, seed=2),
+        box_graph_problem(200, 16.0, sigma=sigma, q=q, seed=2),
+        box_graph_problem(200, 10.0, sigma=sigma, q=q, seed=2),  # here unknowns fit a third of them
+    ):
+        assert judged(problem, level_deg=np.degrees(sigma)) is None
+
+
+def test_pairs_that_just_suffice_to_place_their_cameras_are_no_rival():
+    problem = random_graph_problem(60, 1.0, sigma=0.0, seed=3)
+    few = np.random.default_rng(0).permutation(len(problem.edges))[:106]  # 88 fit whatever was measured
+    inliers = np.ones(len(problem.edges), dtype=bool)
+    inliers[few] = False
+    kept = np.concatenate([few, np.flatnonzero(inliers)[:300]])  # so that they are many enough to matter
+    graph = ViewGraph(60, problem.edges[kept], problem.directions[kept])
+    assert find_rival(graph, np.arange(len(kept)), inliers[kept], 0.5) is None
+
+
+def test_a_few_pairs_that_agree_are_no_rival():
+    problem = random_graph_problem(60, 1.0, sigma=0.01, q=0.12, seed=4, corruption="self-consistent")
+    assert judged(problem) is None
+
+
+def test_directions_to_points_are_not_heard():
+    problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.4, seed=5, corruption="self-consistent")
+    graph = ViewGraph(60, problem.edges, problem.directions)
+    assert find_rival(graph, np.flatnonzero(~problem.corrupted), ~problem.corrupted, 0.5) is None
+
+
+def test_a_placement_with_a_rival_warns_and_names_its_cameras():
+    problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.35, seed=6, corruption="self-consistent")
+    edges = np.concatenate(
+        [[[0, 61]], problem.edges + 1]
+    )  # camera 0 stays out, and the others keep their numbers
+    graph = ViewGraph(62, edges, np.concatenate([[[1.0, 0.0, 0.0]], problem.directions]))
+    placement = place(graph)
+    assert placement.rival is not None
+    assert set(placement.rival.cameras.tolist()) <= set(range(1, 61))
+    assert len(placement.rival.cameras) > 55
+    assert any("agree with one another" in sentence for sentence in quality_warnings(placement))
