@@ -18,7 +18,7 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
-MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
+_MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
 _CLIPS_BELOW = 0.5  # a cycle that leaves more of the gap than this is the last one with a clipped dual
 STEPS_PER_FACTOR = 10
 _LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
@@ -222,7 +222,7 @@ def smoothing(progress: Any, mu: float) -> float:
     share = 1.0
     if progress.clips and progress.gap < progress.objective:
         share = np.sqrt(progress.gap / progress.objective)
-    return float(min(mu, MU_PER_GAP * share * progress.gap))
+    return float(min(mu, _MU_PER_GAP * share * progress.gap))
 
 
 @kernel(inline=True)
@@ -231,7 +231,7 @@ def closed(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
     clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
     if progress.clips and not clips:
         iterate.y[:] = iterate.feasible
-        mu = MU_PER_GAP * progress.gap
+        mu = _MU_PER_GAP * progress.gap
     return Progress(mu, progress.multiplier, progress.objective, progress.gap, clips)
 
 
