@@ -9,7 +9,7 @@ from exact_certificate import objective_bracket, proven_bound
 
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.options import SolverOptions
+from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
@@ -74,3 +74,9 @@ def test_the_bound_of_any_dual_made_feasible_holds_exactly(seed):
     proven, below, above = checked(graph, locations, found.dual, found.dual_bound)
     assert proven >= Fraction(found.dual_bound) - Fraction(ROUNDING)
     assert below - Fraction(ROUNDING) <= Fraction(found.objective) <= above + Fraction(ROUNDING)
+
+
+def test_splitting_asked_for_on_a_tiny_graph_proves_its_answer_too():
+    for seed in range(200):  # 54, 66, 162, 174: accelerated, it leads to locations of 1e10 and more
+        found = solve(problem(seed), SolverOptions(method="admm"))
+        assert found.status is Status.CONVERGED, seed

@@ -4,7 +4,8 @@ Splitting is cheap but proves nothing; the certificate makes its dual feasible a
 iterations, and the gap it then proves is mostly within ten times the error that the splitting estimates for
 itself. So the splitting is asked for a tenth of the gap, and its answer certified. If that misses, it goes on
 where it was. Where it stalls, as on long chains, the sparse Newton solver takes over from the certified
-point, if its factor fits.
+point, if its factor fits. Newton's method converges from near a solution or from its own beginning: if the
+point was of no use, it begins again there.
 """
 
 import enum
@@ -19,12 +20,15 @@ from sfm_shapefit.solver.admm.linear import DEFAULT_MEMORY_BYTES, LaplacianFacto
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
 _SHARE = 0.15  # of the gap, that the splitting is asked for first
 _TIGHTER = 0.3  # of the gap missed, when it is asked again
 _CERTIFICATES = 4
 _NEWTON_STEPS = 30
+_CHEAP_FLOPS = 4e9  # of one factorisation in blocks: Newton's method may take over early, and begin twice
+_PATIENCE = 500  # iterations of the splitting after which it does
 _NEWTON_FLOPS = 2e12  # of one factorisation in blocks: about a minute
 
 
@@ -74,7 +78,8 @@ def solve_hybrid(
     Args:
         graph: a connected, parallel-rigid view graph whose directions do not cancel.
         tol: the certified gap wanted, in units of the objective.
-        max_iterations: limit of iterations of the splitting. Newton steps follow a stall, not this limit.
+        max_iterations: limit of iterations of the splitting. Newton steps follow a stall, or a few hundred
+            iterations where they are cheap, not this limit.
         threads: of the passes over edges and of the factor; the result does not depend on it.
         memory_bytes: what a factor may take.
         prediction: of the factor, if it is there already, to save a second ordering.
@@ -85,12 +90,14 @@ def solve_hybrid(
         UnsolvableError: if the graph is not connected.
     """
     factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
+    patience = min(max_iterations, _PATIENCE) if _is_cheap(factor, graph.dimension) else max_iterations
     splitting = Splitting(graph, factor, threads)
     try:
-        result = _split(splitting, graph, factor, tol, max_iterations, threads, on_iteration)
+        result = _split(splitting, graph, factor, tol, patience, threads, on_iteration)
     finally:
         splitting.close()
-    if result.finish is not Finish.INACCURATE:
+    gave_up = result.finish is Finish.MAX_ITERATIONS and patience < max_iterations
+    if not gave_up and result.finish is not Finish.INACCURATE:
         return result
     del splitting  # its arrays over edges make room for the factor
     return _newton(graph, factor, result, tol, memory_bytes, on_iteration)
@@ -158,12 +165,32 @@ def _newton(
         cancelled = answer is not None and not answer
         return not cancelled
 
-    start = result.locations, result.certificate.dual
-    t, y, count = solve_newton_sparse(graph, tol, _NEWTON_STEPS, report, start=start, plan=plan)
-    certificate = certify(graph, t, y, tol=tol, factor=factor)
-    if certificate.gap < result.certificate.gap:
-        result = replace(result, locations=t - t.mean(axis=0), certificate=certificate)
+    count = 0
+    for start in (result.locations, result.certificate.dual), None:
+        if start is None and not _is_cheap(factor, d):
+            break
+        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, report, start=start, plan=plan)
+        result, count = _better(graph, result, t, y, tol, factor), count + steps
+        if cancelled or result.certificate.gap <= tol:
+            break
     finish = Finish.NEWTON if result.certificate.gap <= tol else Finish.INACCURATE
     if cancelled and finish is Finish.INACCURATE:
         finish = Finish.CANCELLED
     return replace(result, factorisations=count, finish=finish)
+
+
+def _is_cheap(factor: LaplacianFactor, dimension: int) -> bool:
+    """Return whether a factorisation in blocks takes no time to speak of."""
+    return isinstance(factor, CholeskyFactor) and factor.symbolic.flops * dimension**3 <= _CHEAP_FLOPS
+
+
+def _better(
+    graph: ViewGraph, result: HybridResult, t: FloatArray, y: FloatArray, tol: float, factor: LaplacianFactor
+) -> HybridResult:
+    """Return the result with other locations and their certificate, if its gap is smaller."""
+    if not (np.isfinite(t).all() and projected_length(graph, t) > 0.0):
+        return result
+    certificate = certify(graph, t, y, tol=tol, factor=factor)
+    if not certificate.gap < result.certificate.gap:
+        return result
+    return replace(result, locations=t - t.mean(axis=0), certificate=certificate)

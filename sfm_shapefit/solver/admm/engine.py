@@ -21,7 +21,7 @@ method of multipliers" (2011), sections 3.4.1 and 3.4.3.
 """
 
 import enum
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,6 +43,10 @@ _ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other
 _ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which acceleration can pay, and the
 _ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
+_ANDERSON_DIVERGED = 10.0  # times the objective of the first locations: acceleration led astray
+_LEAST_OBJECTIVE = 1e-6  # that a first objective counts as: of exact data it is rounding
+_ASTRAY = 10.0  # times the first objective: acceleration with more history than a tiny problem has dimensions
+_LEAST_OBJECTIVE = 1e-6  # what a first objective counts as at least: of exact data it is rounding
 _STEP_FACTOR = 10.0
 _STALL_WINDOW = 150
 
@@ -128,6 +132,7 @@ class Iteration:
         self.c = c
         self.kappa = kappa
         self._factored = 1.0  # the factor is that of the Laplacian of rho / _factored
+        self._astray = np.inf  # objective from which acceleration has led away from the solution
 
     def run(self, on_iteration: OnIteration | None, resumed: Outcome | None = None) -> Outcome:
         """Iterate from the least-squares locations, or from where a run ended, until a reason to stop.
@@ -147,6 +152,9 @@ class Iteration:
             self._pass(state)
             if _cancelled(on_iteration, k, self.objective(state)):
                 return Outcome(state=state, iterations=k, stop=Stop.CANCELLED)
+            if self._is_astray(state, k):
+                state, best, best_at = self._begin_again(), np.inf, k
+                continue
             error = self._error(state)
             if error <= max(settings.tol * self.objective(state), settings.absolute_tol):
                 return Outcome(state=state, iterations=k, stop=Stop.ACCURATE)
@@ -166,6 +174,20 @@ class Iteration:
     def objective(self, state: State) -> float:
         """Return the objective at the locations of the last pass, relative to kappa."""
         return float(state.sums[OBJECTIVE]) / self.kappa
+
+    def _is_astray(self, state: State, k: int) -> bool:
+        """Return whether the accelerated iteration is far above the objective that it began with."""
+        objective = self.objective(state)
+        if k == 1:
+            self._astray = _ASTRAY * max(objective, _LEAST_OBJECTIVE)
+        return state.anderson is not None and not objective <= self._astray
+
+    def _begin_again(self) -> State:
+        """Return the state of the beginning, and accelerate no more."""
+        self.settings = replace(self.settings, accelerate=False)
+        state = self._start()
+        state.pull = self.passes.pull(state.x, state.t, state.rho)
+        return state
 
     def _start(self) -> State:
         """Return the state at unit lengths, y = v and u = 0, with the least-squares locations of y."""

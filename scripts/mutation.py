@@ -1,0 +1,446 @@
+"""Mutation testing of the solver and the rigidity test: do the tests notice when the code is wrong?
+
+    python scripts/mutation.py --state FOLDER [--groups newton admm] [--per-group 30] [--seed 1] [--again]
+
+The mutants are those of cosmic-ray (`pip install cosmic-ray`; arithmetic, comparisons, `and` and `or`, `not`,
+True and False, numbers, break and continue, exceptions, loops that do not run), and of one operator more that
+deletes a statement or what a function returns. Of each group of modules a random sample of places is drawn,
+and of each place one mutant. Types, docstrings, imports and decorators are left alone.
+
+A fresh compilation of the kernels for each mutant would take days. So the kernels of the solver and of the
+rigidity test run as plain Python, under the tests that are quick enough for it; those of the linear algebra
+below stay compiled. The tests are collected once. For each mutant a fork of the process puts the changed
+code in place of the old one and runs the tests that reach the changed function, the shortest first, until one
+fails. A mutant that takes far more processor time than the tests did counts as found.
+
+Outcomes are kept in FOLDER, and what is there is not run again; with --again, survivors are.
+"""
+
+import argparse
+import ast
+import hashlib
+import importlib
+import inspect
+import json
+import os
+import random
+import resource
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType, FunctionType, ModuleType
+from typing import Any
+
+# One thread in all libraries, before any is loaded: a process with threads must not fork.
+for _name in ("OPENBLAS", "OMP", "MKL", "NUMBA", "RAYON"):
+    os.environ[f"{_name}_NUM_THREADS"] = "1"
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "sfm_shapefit"
+sys.path.insert(0, str(ROOT))
+
+import hypothesis  # noqa: E402
+import pytest  # noqa: E402
+from cosmic_ray import plugins  # noqa: E402
+from cosmic_ray.ast import Visitor, get_ast  # noqa: E402
+from cosmic_ray.mutating import mutate_code  # noqa: E402
+from cosmic_ray.operators.operator import Operator  # noqa: E402
+
+from sfm_shapefit import jit  # noqa: E402
+
+GROUPS = {
+    "rigidity": ["rigidity.py"],
+    "certificate": ["solver/certificate.py"],
+    "newton": ["solver/newton/dense.py", "solver/newton/sparse.py", "solver/newton/steps.py"],
+    "admm": [f"solver/admm/{name}.py" for name in ("anderson", "edges", "engine", "linear", "lud", "shapefit")],
+    "program": ["solver/program.py", "solver/options.py"],
+    "solve": ["solver/solve.py", "solver/hybrid.py"],
+    "angular": ["solver/angular.py"],
+    "bodies": [f"solver/bodies/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")],
+}
+TESTS = [
+    f"tests/test_{name}.py"
+    for name in ("rigidity", "certificate", "exact_certificate", "newton", "admm", "solver", "angular", "bodies")
+]
+INTERPRETED = ("sfm_shapefit.solver", "sfm_shapefit.rigidity")
+LONGEST_TEST_S = 2.0  # of processor time, interpreted and observed: longer ones are left out
+BUDGET_S = 10.0  # of tests per mutant, by their time in the first run
+PATIENCE = 4.0  # times the tests' own time, after which a mutant counts as endless
+
+
+# --- mutants ------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    """One change of one file."""
+
+    path: str
+    operator: str
+    occurrence: int
+    line: int
+    column: int
+
+    @property
+    def name(self) -> str:
+        """Its name in the record."""
+        return f"{self.path}:{self.line}:{self.column} {self.operator} {self.occurrence}"
+
+
+class Delete(Operator):
+    """Delete a statement that has an effect, or the value that a function returns."""
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield the place of a statement that can go without breaking the syntax."""
+        if _is_deletable(node):
+            yield node.start_pos, node.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """Return what takes its place."""
+        del index
+        text = "return None" if node.type == "return_stmt" else "pass"
+        statement = get_ast(f"{text}\n").children[0].children[0]
+        (statement if not hasattr(statement, "children") else statement.get_first_leaf()).prefix = (
+            node.get_first_leaf().prefix
+        )
+        return statement
+
+    @classmethod
+    def examples(cls) -> tuple[Any, ...]:
+        """Return none: cosmic-ray's own tests use them."""
+        return ()
+
+
+def _is_deletable(node: Any) -> bool:
+    if node.parent is None or node.parent.type != "simple_stmt":
+        return False
+    if node.type in ("return_stmt", "raise_stmt"):
+        return node.get_first_leaf() is not node.get_last_leaf()
+    if node.type == "expr_stmt":  # plain names would only raise NameError
+        return node.children[0].type != "name" or node.children[1].type == "operator" and (
+            node.children[1].value not in ("=", ":")
+        )
+    return node.type in ("atom_expr", "power")
+
+
+def _operators() -> dict[str, Operator]:
+    """Return the operators that need no settings, by name."""
+    unused = ("RemoveDecorator", "VariableReplacer", "VariableInserter")
+    names = [n for n in sorted(plugins.operator_names()) if not n.endswith(unused)]
+    found: dict[str, Operator] = {n.partition("/")[2]: plugins.get_operator(n)() for n in names}
+    return {**found, "Delete": Delete()}
+
+
+class _Positions(Visitor):  # type: ignore[misc]
+    """Lists where an operator can act."""
+
+    def __init__(self, operator: Operator) -> None:
+        self.operator = operator
+        self.found: list[tuple[int, int]] = []
+
+    def visit(self, node: Any) -> Any:
+        """Note the node's positions."""
+        self.found += [start for start, _ in self.operator.mutation_positions(node)]
+        return node
+
+
+def mutants_of(path: str) -> list[list[Mutant]]:
+    """Return the mutants of a file, together those of one place and one kind."""
+    source = (PACKAGE / path).read_text()
+    quiet = _quiet_spans(ast.parse(source))
+    tree = get_ast(source)
+    places: dict[tuple[str, int, int], list[Mutant]] = {}
+    for name, operator in _operators().items():
+        positions = _Positions(operator)
+        positions.walk(tree)
+        kind = name.partition("_")[0]
+        for occurrence, (line, column) in enumerate(positions.found):
+            if not any(first <= (line, column) < last for first, last in quiet):
+                mutant = Mutant(path, name, occurrence, line, column)
+                places.setdefault((kind, line, column), []).append(mutant)
+    return list(places.values())
+
+
+def _quiet_spans(tree: ast.Module) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    """Return where nothing is to be changed: types, decorators, imports."""
+    quiet: list[ast.AST] = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            quiet += node.decorator_list
+        if isinstance(node, ast.FunctionDef):
+            quiet += [node.returns] if node.returns else []
+        if isinstance(node, ast.arg | ast.AnnAssign) and node.annotation:
+            quiet.append(node.annotation)
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            quiet.append(node)
+    return [((n.lineno, n.col_offset), (n.end_lineno, n.end_col_offset)) for n in quiet]  # type: ignore[attr-defined]
+
+
+def sample(group: str, count: int, seed: int) -> list[Mutant]:
+    """Return one random mutant of each of `count` random places."""
+    rng = random.Random(f"{seed} {group}")
+    places = [place for path in GROUPS[group] for place in mutants_of(path)]
+    return [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
+
+
+# --- plain Python in place of kernels, and changed code in place of the old -----------------------
+
+
+def interpret_kernels() -> None:
+    """Let the kernels of the mutated packages be plain functions; call before they are imported."""
+    compiled = jit.kernel
+
+    def kernel(**options: bool) -> Callable[[Any], Any]:
+        def decorate(function: Any) -> Any:
+            return function if function.__module__.startswith(INTERPRETED) else compiled(**options)(function)
+
+        return decorate
+
+    jit.kernel = kernel
+
+
+def module_of(path: str) -> ModuleType:
+    """Return the module of a file of the package."""
+    return importlib.import_module("sfm_shapefit." + path.removesuffix(".py").replace("/", "."))
+
+
+def put_in_place(path: str, source: str) -> None:
+    """Give the loaded module of a file the code of another source, wherever its functions are known."""
+    module = module_of(path)
+    fresh = {key: module.__dict__.get(key) for key in ("__name__", "__file__", "__package__")}
+    exec(compile(source, str(module.__file__), "exec"), fresh)
+    for name, new in fresh.items():
+        old = module.__dict__.get(name)
+        if name.startswith("__") or getattr(new, "__module__", module.__name__) != module.__name__:
+            continue
+        if inspect.isclass(new):
+            for attribute, method in vars(new).items():
+                _transplant(vars(old).get(attribute), method)
+        elif callable(new) and hasattr(new, "__module__"):
+            _transplant(old, new)
+        elif isinstance(new, int | float | tuple | dict | str):
+            _rebind(name, old, new)
+
+
+def _transplant(old: Any, new: Any) -> None:
+    """Put the code of one function into another."""
+    for part in ("fget", "__func__"):
+        old, new = getattr(old, part, old), getattr(new, part, new)
+    if hasattr(old, "cache_clear"):
+        old.cache_clear()
+    old, new = inspect.unwrap(old) if callable(old) else old, inspect.unwrap(new) if callable(new) else new
+    if isinstance(old, FunctionType) and isinstance(new, FunctionType):
+        if old.__code__.co_freevars == new.__code__.co_freevars:
+            old.__code__ = new.__code__
+        old.__defaults__, old.__kwdefaults__ = new.__defaults__, new.__kwdefaults__
+
+
+def _rebind(name: str, old: Any, new: Any) -> None:
+    """Give a constant its new value in all modules that have it."""
+    if type(old) is type(new) and old == new:
+        return
+    for key, module in list(sys.modules.items()):
+        if key.startswith(("sfm_shapefit", "test_")) and module.__dict__.get(name) is old:
+            setattr(module, name, new)
+
+
+# --- which tests reach what ---------------------------------------------------------------------
+
+
+def functions_of(path: str) -> list[tuple[int, int, int, str]]:
+    """Return (first line of its code, first line, last line, name) of each function of a file."""
+    tree = ast.parse((PACKAGE / path).read_text())
+    return [
+        (min([n.lineno, *(d.lineno for d in n.decorator_list)]), n.lineno, n.end_lineno or n.lineno, n.name)
+        for n in ast.walk(tree)
+        if isinstance(n, ast.FunctionDef)
+    ]
+
+
+def places_reached_by(mutant: Mutant) -> set[str]:
+    """Return the functions of which one must run for a test to notice: that around, else all of the file."""
+    functions = functions_of(mutant.path)
+    around = [f for f in functions if f[0] <= mutant.line <= f[2]]
+    chosen = [max(around)] if around else functions
+    return {f"{mutant.path}:{name}" for *_, name in chosen}
+
+
+class _Observer:
+    """Notes which functions of the mutated packages run."""
+
+    def __init__(self) -> None:
+        self.codes: set[Any] = set()
+
+    def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
+        if event == "call":
+            self.codes.add(frame.f_code)
+
+    def places(self) -> list[str]:
+        """Return them as FILE:FUNCTION."""
+        prefix = str(PACKAGE) + "/"
+        codes = [code for code in self.codes if code.co_filename.startswith(prefix)]
+        return sorted({f"{code.co_filename.removeprefix(prefix)}:{code.co_name}" for code in codes})
+
+
+# --- running ------------------------------------------------------------------------------------
+
+
+class TooSlow(BaseException):
+    """A test takes too long for this; no Exception, so that hypothesis lets it pass."""
+
+
+class Runner:
+    """Takes the place of pytest's loop over the tests."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args = args
+        self.failed = False
+        self.state: Path = args.state
+        self.state.mkdir(parents=True, exist_ok=True)
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Note a failure."""
+        self.failed |= report.failed or (report.skipped and report.when != "call")
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """Time the tests, then run the mutants."""
+        baseline = self._baseline(session.items)
+        usable = {key: row for key, row in baseline.items() if row["passed"]}
+        print(f"{len(usable)} of {len(session.items)} tests are quick enough and pass uncompiled", flush=True)
+        items = {item.nodeid: item for item in session.items}
+        for group in self.args.groups:
+            self._run_group(group, items, usable)
+        return True
+
+    def _baseline(self, items: list[Any]) -> dict[str, Any]:
+        record = self.state / "tests.json"
+        known = json.loads(record.read_text()) if record.exists() else {}
+        for item in items:
+            key = hashlib.sha256(inspect.getsource(item.function).encode()).hexdigest()[:12]
+            if known.get(item.nodeid, {}).get("key") != key:
+                known[item.nodeid] = {"key": key, **self._observed(item)}
+                record.write_text(json.dumps(known, indent=0))
+        return {item.nodeid: known[item.nodeid] for item in items}
+
+    def _observed(self, item: Any) -> dict[str, Any]:
+        """Run one test with an observer."""
+        observer, self.failed = _Observer(), False
+
+        def too_slow(*_: Any) -> None:
+            raise TooSlow
+
+        signal.signal(signal.SIGVTALRM, too_slow)
+        signal.setitimer(signal.ITIMER_VIRTUAL, LONGEST_TEST_S)
+        start = time.process_time()
+        sys.setprofile(observer)
+        try:
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=None)
+        except TooSlow:
+            self.failed = True
+        finally:
+            sys.setprofile(None)
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        seconds = time.process_time() - start
+        print(f"{seconds:6.2f} s {'-' if self.failed else '+'} {item.nodeid}", flush=True)
+        return {"seconds": seconds, "passed": not self.failed, "places": observer.places()}
+
+    def _run_group(self, group: str, items: dict[str, Any], usable: dict[str, Any]) -> None:
+        record = self.state / f"{group}.json"
+        known = json.loads(record.read_text()) if record.exists() else {}
+        mutants = sample(group, self.args.per_group, self.args.seed)
+        for mutant in mutants:
+            outcome = known.get(mutant.name)
+            if outcome is None or (self.args.again and outcome[0] == "survived"):
+                known[mutant.name] = outcome = self._outcome(mutant, items, usable)
+                record.write_text(json.dumps(known, indent=0))
+                print(f"{outcome[0]:9}{mutant.name}  {outcome[1]}", flush=True)
+        outcomes = [known[mutant.name][0] for mutant in mutants]
+        survived = outcomes.count("survived")
+        print(f"{group}: {len(outcomes) - survived} of {len(outcomes)} found, {outcomes.count('endless')} by time")
+        for mutant in mutants:
+            if known[mutant.name][0] == "survived":
+                print(f"\n{mutant.name}\n{known[mutant.name][2]}", flush=True)
+
+    def _outcome(self, mutant: Mutant, items: dict[str, Any], usable: dict[str, Any]) -> list[str]:
+        """Return (found, endless or survived; by which test; the changed line) of a mutant."""
+        source = (PACKAGE / mutant.path).read_text()
+        changed = mutate_code(source, _operators()[mutant.operator], mutant.occurrence)
+        places = places_reached_by(mutant)
+        reaching = [key for key in usable if places.intersection(usable[key]["places"])]
+        chosen, seconds = [], 0.0
+        for key in sorted(reaching, key=lambda k: float(usable[k]["seconds"])):
+            if seconds + usable[key]["seconds"] <= BUDGET_S:
+                chosen.append(items[key])
+                seconds += usable[key]["seconds"]
+        verdict, by = self._forked(mutant.path, changed, chosen, seconds)
+        return [verdict, by, _difference(source, changed)]
+
+    def _forked(self, path: str, source: str, chosen: list[Any], seconds: float) -> tuple[str, str]:
+        read, write = os.pipe()
+        child = os.fork()
+        if child == 0:
+            limit = int(PATIENCE * seconds) + 5
+            resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+            silent = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(silent, 1)
+            os.dup2(silent, 2)
+            os.write(write, self._first_failure(path, source, chosen).encode())
+            os._exit(0)
+        os.close(write)
+        _, status = os.waitpid(child, 0)
+        with os.fdopen(read) as pipe:
+            by = pipe.read()
+        if os.WIFSIGNALED(status):
+            return ("endless" if os.WTERMSIG(status) in (signal.SIGXCPU, signal.SIGKILL) else "crashed"), ""
+        return ("survived", f"{len(chosen)} tests") if by == "" else ("found", by)
+
+    def _first_failure(self, path: str, source: str, chosen: list[Any]) -> str:
+        """In the fork: return the first test that fails, or an empty string."""
+        try:
+            put_in_place(path, source)
+        except Exception as error:
+            return f"import: {error!r}"
+        for item in chosen:
+            self.failed = False
+            item.ihook.pytest_runtest_protocol(item=item, nextitem=None)
+            if self.failed:
+                return str(item.nodeid)
+        return ""
+
+
+def _difference(before: str, after: str) -> str:
+    """Return the lines that differ."""
+    old, new = before.splitlines(), after.splitlines()
+    if len(old) != len(new):
+        return "(several lines)"
+    return "\n".join(f"- {a.strip()}\n+ {b.strip()}" for a, b in zip(old, new, strict=True) if a != b)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--state", type=Path, required=True, help="folder of the outcomes")
+    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
+    parser.add_argument("--per-group", type=int, default=30, help="mutants of each group")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--again", action="store_true", help="run recorded survivors again")
+    parser.add_argument("--list", action="store_true", help="only count the places, by group")
+    args = parser.parse_args()
+    if args.list:
+        for group in args.groups:
+            print(group, sum(len(mutants_of(path)) for path in GROUPS[group]))
+        return 0
+    interpret_kernels()
+    phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)  # a failure need not be made small
+    hypothesis.settings.register_profile(
+        "mutation", phases=phases, derandomize=True, database=None, deadline=None
+    )
+    hypothesis.settings.load_profile("mutation")
+    options = ["-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore", "-m", "not slow"]
+    os.chdir(ROOT)
+    return int(pytest.main([*options, *TESTS], plugins=[Runner(args)]))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
