@@ -7,7 +7,6 @@ import os
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
-from sfm_shapefit.gauge import Scale
 from sfm_shapefit.robust.options import Filter, Objective
 from sfm_shapefit.solver.options import Method
 
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.robust.options import PlacementOptions
 
 Points = Literal["auto", "never", "always"]
+Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 
 FIX_SOLVED = "solved"

@@ -1,11 +1,11 @@
 """End to end from a database: `map` with bundle adjustment beside pycolmap's global and incremental mapping.
 
 All start from the same verified matches and intrinsics. The mappers of pycolmap run on a copy of the
-database, with 15 and with 30 as the least number of matches of a pair, and the better one counts; `map` chooses by
-itself. They refine focal lengths; `map` keeps those of the database. Errors are those of the largest model
-against the truth after robust alignment; since `map` leaves out cameras it does not trust, the peers' errors
-are also given on the cameras that `map` placed. One thread each, one run each in a fresh process; `map` has
-its numba kernels loaded by a run on the bundled ring before.
+database, with 15 and with 30 as the least number of matches of a pair, and the better one counts; `map`
+chooses by itself. They refine focal lengths; `map` keeps those of the database. Errors are those of the
+largest model against the truth after robust alignment; since `map` leaves out cameras it does not trust, the
+peers' errors are also given on the cameras that `map` placed. One thread each, one run each in a fresh
+process; `map` has its numba kernels loaded by a run on the bundled ring before.
 """
 
 import argparse
@@ -115,7 +115,7 @@ def _inputs(scene: str, data: Path, folder: Path) -> tuple[Path, Path]:
 def measure(mapper: str, database: Path, truth: Path, min_matches: int) -> Outcome:
     """Run one mapper once, and compare its largest model with the truth."""
     import sfm_shapefit
-    from sfm_shapefit.colmap.adjustment import quiet_stderr
+    from sfm_shapefit.colmap.quiet import quiet_stderr
 
     if mapper == "map":
         _map(ROOT / "data_synthetic" / "ring8" / "database.db")  # compiles or loads the kernels
@@ -175,8 +175,8 @@ def section(measured: dict[str, list[Outcome]], about: str) -> str:
             "## map: from a database to an adjusted model",
             about,
             f"The limit is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers at its "
-            f"better setting. The ring: {RING['num_images']} images, {RING['wrong_match_fraction']:.0%} of the "
-            "matches wrong, truth in its own units.",
+            f"better setting. The ring: {RING['num_images']} images, {RING['wrong_match_fraction']:.0%} of "
+            "the matches wrong, truth in its own units.",
             legend(QUANTITIES),
             table(header, rows),
         ]

@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -60,7 +61,14 @@ def map_database(
         images = read_images(path)
         unposed = read_model(images.reconstruction)
     with run.timed("relative rotations"):
-        relative = relative_rotations(path, unposed, LEAST_MATCHES, options.relative, options.num_threads())
+        relative = relative_rotations(
+            path,
+            unposed,
+            LEAST_MATCHES,
+            options.relative,
+            options.num_threads(),
+            partial(run.progress, "relative rotations"),
+        )
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.components(unposed.num_images, relative, reasons):
         try:

@@ -73,7 +73,7 @@ def locate(
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = placed(joint, rigid, evidence, options)
+            placement = placed(joint, rigid, evidence, options, clock)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rigid_gauge(
                 model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -80,8 +81,8 @@ def solve(
     start = time.perf_counter()
     _refuse_undetermined(graph)
     choice = choose_method(graph, options)
-    watch = _Watch(on_iteration)
     limit = options.max_iterations or _LIMITS[choice.method]
+    watch = _Watch(on_iteration, limit)
     run = choice.run(graph, options, limit, watch if on_iteration else None)
     if not (np.isfinite(run.locations).all() and projected_length(graph, run.locations) > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
@@ -165,15 +166,16 @@ def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnI
 
 
 class _Watch:
-    """Passes iterations on to the user's callback, and remembers whether it cancelled."""
+    """Passes iterations on to the user's callback, with their limit, and remembers whether it cancelled."""
 
-    def __init__(self, on_iteration: OnIteration | None) -> None:
+    def __init__(self, on_iteration: OnIteration | None, limit: int) -> None:
         self._on_iteration = on_iteration
+        self._limit = limit
         self.cancelled = False
 
     def __call__(self, info: IterationInfo) -> bool:
         if self._on_iteration is not None:
-            answer = self._on_iteration(info)
+            answer = self._on_iteration(replace(info, limit=self._limit))
             self.cancelled = answer is not None and not answer
         return not self.cancelled
 
