@@ -2,12 +2,13 @@
 
     python examples/hloc_outputs.py IMAGES pairs.txt features.h5 matches.h5 OUT [FOCAL_LENGTH_PX]
 
-hloc writes, per image, `features.h5[name]["keypoints"]`, and, per pair, `matches.h5[pair]["matches0"]`: for each
-keypoint of the first image the index of its match in the second, or -1. These go into a COLMAP database, where
-COLMAP verifies them; `map_database` does the rest: rotations averaged, cameras placed, bundle adjusted. OUT then
-holds database.db and models/0, models/1, ... with a report.html each.
+hloc writes, per image, `features.h5[name]["keypoints"]`, and, per pair, `matches.h5[pair]["matches0"]`: for
+each keypoint of the first image the index of its match in the second, or -1. These go into a COLMAP database,
+where COLMAP verifies them; `map_database` averages rotations and places the cameras, and pycolmap adjusts the
+largest model. OUT then holds database.db, models/0, models/1, ... with a report.html each, and the adjusted
+sparse/0.
 
-If hloc has made a database.db already (its reconstruction and triangulation steps do), none of this is needed:
+If hloc has made a database.db already, as its reconstruction does, none of this is needed:
 
     sfm-shapefit map database.db OUT --bundle-adjust
 
@@ -40,7 +41,11 @@ def write_database(
     names = sorted({name for pair in pairs for name in pair})
     pycolmap.Database.open(database).close()  # makes the tables
     pycolmap.import_images(database, images, pycolmap.CameraMode.SINGLE, names)
-    with pycolmap.Database.open(database) as opened, h5py.File(features) as found, h5py.File(matches) as matched:
+    with (
+        pycolmap.Database.open(database) as opened,
+        h5py.File(features) as found,
+        h5py.File(matches) as matched,
+    ):
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         for name in names:
             keypoints = found[name]["keypoints"][:] + 0.5  # COLMAP's first pixel has its centre at 0.5
@@ -80,8 +85,12 @@ def main(
         set_focal_length(database, focal_length_px)
     pycolmap.verify_matches(database, pairs_file)
 
-    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(bundle_adjust=True))
+    found = sfm_shapefit.map_database(database)
     sfm_shapefit.write_map_result(found, out / "models")
+    adjusted = pycolmap.Reconstruction(found.models[0].located.reconstruction)
+    pycolmap.bundle_adjustment(adjusted)  # refines focal length and distortion too
+    (out / "sparse" / "0").mkdir(parents=True)
+    adjusted.write(out / "sparse" / "0")
     for warning in found.warnings:
         print(f"warning: {warning}")
     print(f"{found.num_placed} of {found.num_images} cameras; see {out / 'models/0/report.html'}")

@@ -68,7 +68,8 @@ def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycol
     pycolmap.bundle_adjustment(adjusted)
     (out / "sparse" / "0").mkdir(parents=True)
     adjusted.write(out / "sparse" / "0")
-    print(f"{adjusted.num_reg_images()} cameras, {adjusted.num_points3D()} points; see {out / 'located/report.html'}")
+    report = out / "located" / "report.html"
+    print(f"{adjusted.num_reg_images()} cameras, {adjusted.num_points3D()} points; see {report}")
     return adjusted
 
 

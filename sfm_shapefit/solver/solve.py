@@ -38,14 +38,6 @@ _DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination save
 _LARGEST_NEWTON_FLOPS = 4e9  # of one block factorisation: from here on splitting is faster to the same gap
 
 
-class Choice(NamedTuple):
-    """A method and the reason for it."""
-
-    method: str
-    run: Callable[..., "Run"]
-    reason: str
-
-
 class Run(NamedTuple):
     """What a solver returns; the certificate decides what it is worth."""
 
@@ -54,6 +46,14 @@ class Run(NamedTuple):
     iterations: int
     note: str = ""
     """How it ended, where that is not plain from the certificate."""
+
+
+class Choice(NamedTuple):
+    """A method and the reason for it."""
+
+    method: str
+    run: Callable[..., Run]
+    reason: str
 
 
 @one_blas_thread()  # more would split, and round, the sums of long vectors differently
