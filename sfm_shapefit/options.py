@@ -27,7 +27,7 @@ _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocateOptions:
-    """Settings of `locate`."""
+    """Settings of `locate`, whose docstring has them as a table; what each does stands under its field."""
 
     directions: Source = "auto"
     """Where directions come from: the database's inlier matches, its stored relative poses, or the

@@ -1,10 +1,13 @@
 """The examples run as a reader would run them, and what is shipped is complete."""
 
+import dataclasses
+import inspect
 import itertools
 import os
 import re
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -102,3 +105,87 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
             keypoints.append(database.read_keypoints(image_id)[:, :2])
     np.testing.assert_allclose(*keypoints, atol=1e-3)
     assert_near_truth(tmp_path / "out/sparse/0", drawn)
+
+
+# --- what is shipped -------------------------------------------------------------------------------------
+
+
+def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    package = ROOT / "sfm_shapefit"
+    sources = {
+        str(path.relative_to(ROOT))
+        for path in package.rglob("*")
+        if path.is_file() and path.suffix not in {".pyc", ".nbi", ".nbc"}
+    }
+    assert "sfm_shapefit/py.typed" in names
+    assert "sfm_shapefit/schemas/output.schema.json" in names
+    assert sources <= names
+    assert all(name.startswith(("sfm_shapefit/", "sfm_shapefit-")) for name in names)
+
+
+@pytest.mark.parametrize("name", sfm_shapefit.__all__)
+def test_every_public_name_says_what_it_is_and_what_it_takes(name):
+    public = getattr(sfm_shapefit, name)
+    text = inspect.getdoc(public)
+    assert text
+    assert not text.startswith(f"{name}(")  # what a dataclass says that has no words of its own
+    if inspect.isfunction(public):
+        for argument in inspect.signature(public).parameters:
+            assert re.search(rf"^ {{4}}(\w+, )*{argument}(, \w+)*: ", text, flags=re.MULTILINE), argument
+
+
+def test_help_of_locate_lists_every_option_with_its_default():
+    text = inspect.getdoc(sfm_shapefit.locate)
+    listed = dict(re.findall(r"^ {4}([a-z_]+) {2,}('[^']*'|\S+) {2,}\S", text, flags=re.MULTILINE))
+    del listed["option"]  # the head of the table
+    assert listed == {
+        item.name: repr(item.default) for item in dataclasses.fields(sfm_shapefit.LocateOptions)
+    }
+
+
+def user_seconds(code: str) -> float:
+    """Return the processor time of a fresh Python that runs some code: least of three, for others run too."""
+    times = []
+    for _ in range(3):
+        end = "import resource as r; print(r.getrusage(r.RUSAGE_SELF).ru_utime)"
+        done = subprocess.run(
+            [sys.executable, "-c", f"{code}\n{end}"], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        times.append(float(done.stdout.split()[-1]))
+    return min(times)
+
+
+def test_the_package_is_imported_in_less_than_four_tenths_of_a_second():
+    assert user_seconds("import sfm_shapefit") < 0.4
+
+
+def test_the_help_of_the_command_takes_less_than_three_tenths_of_a_second():
+    code = "from sfm_shapefit.cli import app\napp(['--help'], standalone_mode=False)"
+    assert user_seconds(code) < 0.3
+
+
+@pytest.mark.slow
+def test_the_api_reference_builds_without_a_warning(tmp_path):
+    pytest.importorskip("pdoc")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "scripts/api_reference.py", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")
+    assert all(f'id="{name}"' in page for name in sfm_shapefit.__all__)

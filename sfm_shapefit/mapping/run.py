@@ -51,6 +51,10 @@ def map_database(
         options: settings; defaults if None.
         progress: called as stages advance.
 
+    Returns:
+        `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
+        how they were chosen; `left_out`, the reason for each image in no model; `warnings`.
+
     Raises:
         InputError: if the database cannot be used; the message says what to do.
         UnsolvableError: if no component of three images or more can be placed.

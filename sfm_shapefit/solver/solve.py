@@ -62,6 +62,10 @@ def solve(
 ) -> SolverResult:
     """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
 
+        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
+        result = solve(graph)
+        result.locations, result.gap, result.unique
+
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
         options: solver settings; defaults if None.
