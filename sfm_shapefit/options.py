@@ -61,6 +61,9 @@ class LocateOptions:
     """Cameras that stay exactly where the input has them, while the others are placed around them: a text
     file with one image name per line, or "solved": every image that observes a 3D point of the input, for new
     images in a solved model. With two or more the scale is theirs, with one only the origin."""
+    refine_with_priors: bool = False
+    """Let the position priors that set the scale also pull the cameras, each by its standard deviation;
+    priors that are far off have no part."""
     min_inliers: int = 15
     """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
     min_inlier_ratio: float = 0.5
@@ -101,6 +104,8 @@ class LocateOptions:
             raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
         if self.refine_rotations and self.directions == "relative-poses":
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
+        if self.refine_with_priors and self.scale not in ("auto", "prior"):
+            raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
         self.for_placement()

@@ -250,14 +250,23 @@ def _checked_edges(num_cameras: int, edges: IntArray, dimension: int) -> IntArra
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
     checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    bad = ((checked < 0) | (checked >= num_cameras)).any(axis=1) | (checked[:, 0] == checked[:, 1])
-    if bad.any():
-        index = int(np.argmax(bad))
+    index = _first_bad_edge(num_cameras, checked)
+    if index < len(checked):
         raise InputError(
             f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different cameras "
             f"of 0..{num_cameras - 1}"
         )
     return checked
+
+
+@kernel()
+def _first_bad_edge(num_cameras: int, edges: IntArray) -> int:
+    """Return the first pair that leaves the cameras or joins one with itself; the number of pairs if none."""
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        if i == j or min(i, j) < 0 or max(i, j) >= num_cameras:
+            return e
+    return len(edges)
 
 
 def _compact(label: IntArray) -> IntArray:

@@ -40,10 +40,13 @@ def test_the_glb_holds_cameras_points_and_a_kind_of_line_per_verdict(folder):
 
 
 def test_in_the_glb_y_is_up_and_the_cameras_are_around_the_origin(folder):
+    scene, _ = made_scene()
     cameras = trimesh.load(folder / "scene.glb").geometry["cameras"]
-    apexes = cameras.vertices[::5] if len(cameras.vertices) == 5 * 24 else cameras.vertices
-    assert np.ptp(apexes[:, 1]) < 1.5 < np.ptp(apexes[:, 0])  # the ring lies level: y varies by its noise
-    assert np.linalg.norm(np.median(apexes, axis=0)) < 1.0
+    apexes = np.asarray(cameras.vertices)[: 5 * 24 : 5]
+    placed = scene.cameras.centers[scene.cameras.placed]
+    height = (placed - np.median(placed, axis=0)) @ scene.axes[2]
+    np.testing.assert_allclose(apexes[:, 1], height, atol=1e-5)  # float32 of 10
+    np.testing.assert_allclose(np.median(apexes, axis=0), 0.0, atol=1e-5)
 
 
 def test_the_ply_is_in_the_axes_of_the_model_and_coloured_by_trust(folder):
@@ -68,6 +71,10 @@ def test_the_ply_has_a_ribbon_for_each_pair_of_placed_cameras(folder):
     wrong = int(np.sum(drawn & (classes == PairClass.CONTRADICTS)))
     reds = (mesh.visual.vertex_colors[:, :3] == PAIR_COLORS[PairClass.CONTRADICTS]).all(axis=1)
     assert int(reds[5 * 24 :].sum()) == 4 * wrong
+    ribbons = np.asarray(mesh.vertices)[5 * 24 : -len(scene.points.positions)].reshape(-1, 4, 3).mean(axis=1)
+    middles = scene.cameras.centers[ends[drawn & (classes == PairClass.CONTRADICTS)]].mean(axis=1)
+    found = ribbons[reds[5 * 24 : -len(scene.points.positions) : 4]]
+    np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 
 def test_trust_is_red_at_0_green_at_1_and_grey_where_unknown():

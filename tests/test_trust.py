@@ -113,7 +113,7 @@ def test_pairs_that_nothing_checks_are_no_evidence():
 def test_without_evidence_a_camera_is_trusted_as_pairs_of_the_scene_are_right():
     trust = judged(40, 6, 0.3, 1.0)  # about 0.7 of the votes agree: 2/3 of that
     assert trust[5] == pytest.approx(0.47, abs=0.06)
-    assert np.median(trust) == 1.0
+    assert np.median(trust) > 0.99
 
 
 def test_one_pair_of_thousands_of_matches_does_not_outvote_the_others():

@@ -105,6 +105,7 @@ def _located(scene: Path, out: Path, flags: tuple[str, ...], environment: dict[s
         str(scene / "sparse" / "0"),
         str(out),
         "-q",
+        "--no-report",  # whose page shows how long each stage took
     ]
     subprocess.run(
         [*command, *flags],

@@ -10,6 +10,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import types
 from pathlib import Path
 
 from abuse.verdicts import MODEL_FILES
@@ -50,11 +51,9 @@ def run(args: argparse.Namespace) -> int:
 def _fuzz(args: argparse.Namespace) -> None:
     """Become libFuzzer; never returns."""
     import atheris
-
-    with atheris.instrument_imports(include=["sfm_shapefit.colmap.check"]):
-        from sfm_shapefit.colmap import check
     import pycolmap
 
+    from sfm_shapefit.colmap import check
     from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS
     from sfm_shapefit.colmap.quiet import quiet_log
     from sfm_shapefit.errors import InputError
@@ -62,6 +61,11 @@ def _fuzz(args: argparse.Namespace) -> None:
     folder = args.base / "sparse" / "0"
     sound = {name: (folder / f"{name}.bin").read_bytes() for name in MODEL_FILES}
     check.check_model_files(folder)
+
+    for owner in (check, check._BinaryFile):  # plain functions only: numba cannot compile instrumented ones
+        for name, function in list(vars(owner).items()):
+            if isinstance(function, types.FunctionType):
+                setattr(owner, name, atheris.instrument_func(function))
 
     def one_input(data: bytes) -> None:
         if not data:

@@ -60,7 +60,9 @@ def build_seed(
             old = frame.rig_from_world
             assert old is not None  # a posed image's frame has a pose
             rotation = old.rotation
-            translation = -(rotation.matrix() @ (centers[index] - model.frame_offsets[index]))
+            is_reference = not model.frame_offsets[index].any() and image.is_ref_in_frame()
+            turn = model.rotations[index] if is_reference else rotation.matrix()
+            translation = -(turn @ (centers[index] - model.frame_offsets[index]))
             frame.rig_from_world = pycolmap.Rigid3d(rotation, translation)
             settled.add(image.frame_id)
         xy = _keypoints_of(keypoints, index)

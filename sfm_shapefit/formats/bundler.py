@@ -33,6 +33,8 @@ _LEAST_SIZE = 2
 
 def is_bundler(file: Path) -> bool:
     """Return whether a file begins as Bundler's do."""
+    if not file.is_file():  # a pipe would be read for ever
+        return False
     try:
         with file.open("rb") as stream:
             return stream.read(13) == b"# Bundle file"

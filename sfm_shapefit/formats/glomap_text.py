@@ -24,6 +24,8 @@ _UNIT_TOLERANCE = 1e-3
 
 def is_relative_poses(source: Path | str) -> bool:
     """Return whether a path is a text file whose first line is one of GLOMAP's: 9 words, a quaternion."""
+    if not Path(source).is_file():  # a pipe would be read for ever
+        return False
     try:
         with Path(source).open(encoding="utf-8") as stream:
             first = next((words for line in stream if (words := line.split("#", 1)[0].split())), [])

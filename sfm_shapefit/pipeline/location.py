@@ -20,6 +20,7 @@ from sfm_shapefit.pipeline.measurement import (
     shared_errors,
     with_points,
 )
+from sfm_shapefit.pipeline.pulling import pulled
 from sfm_shapefit.pipeline.rigid_bodies import placed, rigid_gauge, rigid_parts
 from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
@@ -78,6 +79,7 @@ def locate(
         scale                           'auto'      input, unit, prior, distance or rig
         known_distance                  None        (name, name, distance) in the output's units
         fix                             ''          file of names that stay where they are, or 'solved'
+        refine_with_priors              False       position priors pull the cameras, robustly
         min_inliers                     15          inlier matches that a pair needs
         min_inlier_ratio                0.5         share of its matches that must agree with the rotations
         inlier_threshold_px             2.0         largest Sampson error of an inlier
@@ -112,6 +114,9 @@ def locate(
             gauge = rigid_gauge(
                 model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)
             )
+            if known is not None and options.refine_with_priors:
+                placement, gauge = pulled(placement, gauge, known, joint.covariance, evidence)
+                kept = trusted(placement, options.min_trust)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
         seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)

@@ -23,7 +23,11 @@ _NOT_SOLVED = "free: its directions determine no placement"
 
 
 def camera_rows(
-    placement: Placement, centers: FloatArray, scale: float, further: Sequence[Placement] = ()
+    placement: Placement,
+    centers: FloatArray,
+    scale: float,
+    further: Sequence[Placement] = (),
+    axes: FloatArray | None = None,
 ) -> list[CameraRow]:
     """Return one row per camera of a placed graph.
 
@@ -33,6 +37,7 @@ def camera_rows(
             because they are not trusted.
         scale: the output's units in one unit of the solver.
         further: the other pieces that are solved; the rows of their cameras say where they stand.
+        axes: (d, d) rotation from the input's axes to the output's; the same if None.
     """
     graph = placement.graph
     homes = _home_pieces(placement)
@@ -45,18 +50,20 @@ def camera_rows(
         for camera, degree in enumerate(degrees.tolist())
     ]
     for camera, row in zip(
-        placement.cameras.tolist(), own_camera_rows(placement, centers, scale), strict=True
+        placement.cameras.tolist(), own_camera_rows(placement, centers, scale, axes), strict=True
     ):
         rows[camera] = replace(row, degree=rows[camera].degree)
     return rows
 
 
-def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+def own_camera_rows(
+    placement: Placement, centers: FloatArray, scale: float, axes: FloatArray | None = None
+) -> list[CameraRow]:
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_cameras)
-    sigmas = scale * assessment.sigmas
+    sigmas = scale * (assessment.sigmas if axes is None else _turned_sigmas(assessment.covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -74,6 +81,15 @@ def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> 
             )
         )
     return rows
+
+
+def _turned_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return standard deviations (n, d) along other axes, infinite where nothing holds a node."""
+    held = ~np.isinf(covariances).any(axis=(1, 2))
+    sigmas = np.full(covariances.shape[:2], np.inf)
+    turned = axes @ covariances[held] @ axes.T
+    sigmas[held] = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
+    return sigmas
 
 
 def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:

@@ -91,7 +91,9 @@ class LocateResult:
         image_ids = self.model.image_ids[self.placement.cameras]
         centers = _centers_of(self.reconstruction, image_ids, self.kept)
         solved_pieces = [piece.placement for piece in self.further]
-        rows = camera_rows(self.placement, centers, self.gauge.similarity.scale, solved_pieces)
+        rows = camera_rows(
+            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
+        )
         for camera, reason in without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
         for camera, center in self._carried().items():
@@ -117,8 +119,9 @@ class LocateResult:
         support = self.directions.num_inliers[self.directions.usable()]
         usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
         names = self.model.names
+        axes = self.gauge.axes
         return [
-            next(usable)
+            _turned(next(usable), axes)
             if status is DirectionStatus.USABLE
             else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
             for (i, j), status, support in zip(
@@ -128,6 +131,11 @@ class LocateResult:
                 strict=True,
             )
         ]
+
+
+def _turned(row: PairRow, axes: FloatArray | None) -> PairRow:
+    """Return a pair's row with its direction in the output's axes."""
+    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -144,7 +144,9 @@ def judge_cameras(
     body = body[labels]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
-    trust = np.minimum(agreement / usual, 1.0) * hold
+    # Where most cameras have no agreement at all, any agreement is more than usual.
+    relative = agreement / usual if usual > 0.0 else (agreement > 0.0).astype(np.float64)
+    trust = np.minimum(relative, 1.0) * hold
     few = conditioning.num_pairs <= FEW_PAIRS
     reasons = [""] * num_cameras
     for k in np.flatnonzero(trust < _LOW).tolist():

@@ -81,10 +81,15 @@ class Assessment:
     """k sentences that say why a trust is low; empty where it is not."""
     loose_groups: tuple[LooseGroup, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
-    sigmas: FloatArray
-    """(n, d) standard deviation of each location in the units of `locations`, with centroid and scale
-    of the cameras held fixed; infinite for nodes outside the largest rigid piece of the inlier pairs; NaN,
-    all of them, where the graph is too large for its factor."""
+    covariances: FloatArray
+    """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
+    cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
+    NaN, all of them, where the graph is too large for its factor."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(n, d) standard deviation of each location along the axes."""
+        return _standard_deviations(self.covariances)
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""
@@ -138,8 +143,9 @@ def assess(
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if errors is None else errors / scale
     propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
-    sigmas, leverages = propagated(graph, locations, inliers, information, k, errors)
-    sigmas = scale * sigmas
+    covariances, leverages = propagated(graph, locations, inliers, information, k, errors)
+    covariances = scale**2 * covariances
+    sigmas = _standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
     rigid = None if bodies is None else bodies.body_of
     judged = judge_cameras(
@@ -154,7 +160,7 @@ def assess(
         trust=judged.trust,
         reasons=judged.reasons,
         loose_groups=conditioning.groups,
-        sigmas=sigmas,
+        covariances=covariances,
     )
 
 
@@ -236,6 +242,17 @@ def _with_excess(errors: FloatArray, excess: float) -> FloatArray:
     return errors + excess * np.random.default_rng(0).standard_normal(errors.shape)
 
 
+def _standard_deviations(covariances: FloatArray) -> FloatArray:
+    """Return the roots of the diagonals, (n, d)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
+
+
+def _unheld(locations: FloatArray) -> FloatArray:
+    """Return the covariances (n, d, d) of locations that nothing holds."""
+    n, d = locations.shape
+    return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
+
+
 def _propagated(
     graph: ViewGraph,
     locations: FloatArray,
@@ -244,19 +261,19 @@ def _propagated(
     num_cameras: int,
     errors: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations (n, d) and the leverages (m,).
+    """Return the covariances (n, d, d) and the leverages (m,).
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
     """
-    sigmas = np.full(locations.shape, np.inf)
+    covariances = _unheld(locations)
     leverages = np.where(inliers, np.nan, 0.0)
     pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], graph.dimension)
     rows = np.flatnonzero(inliers)[pieces == 0]
     held, edges = np.unique(graph.edges[rows], return_inverse=True)
     cameras = int(np.sum(held < num_cameras))
     if cameras < _SMALLEST_RIGID:
-        return sigmas, leverages
-    unknown = np.full(locations.shape, np.nan), np.where(inliers, np.nan, 0.0)
+        return covariances, leverages
+    unknown = np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
     try:
         samples = None if errors is None else errors[rows]
         found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
@@ -266,9 +283,9 @@ def _propagated(
         return unknown
     extent = np.ptp(locations[held], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
-    sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
+    covariances[held[~is_loose]] = found.covariances[~is_loose]
     leverages[rows] = found.leverages
-    return sigmas, leverages
+    return covariances, leverages
 
 
 def _propagated_over(
@@ -281,19 +298,19 @@ def _propagated_over(
     num_cameras: int,
     errors: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations (n, d) and the leverages (m,) of rigid bodies, their scale held.
+    """Return the covariances (n, d, d) and the leverages (m,) of rigid bodies, their scale held.
 
     Only the bodies that the inlier pairs tie at these locations have any: those around the one that is held,
     or most cameras.
     """
-    sigmas = np.full(locations.shape, np.inf)
+    covariances = _unheld(locations)
     leverages = np.where(inliers, np.nan, 0.0)
     cameras = np.bincount(bodies.body_of[:num_cameras], minlength=bodies.num_bodies)
     tied = largest_tied(graph.edges[inliers], bodies, cameras, locations, around=held)
     inside = np.isin(bodies.body_of, tied)
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
-        return sigmas, leverages
+        return covariances, leverages
     nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
     share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
     samples = None if errors is None else errors[rows]
@@ -305,9 +322,9 @@ def _propagated_over(
     except UnsolvableError:
         found = None
     if found is None:
-        return np.full(locations.shape, np.nan), leverages
+        return np.full_like(covariances, np.nan), leverages
     extent = np.ptp(locations[nodes], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
-    sigmas[nodes] = np.where(is_loose[:, None], np.inf, found.sigmas)
+    covariances[nodes[~is_loose]] = found.covariances[~is_loose]
     leverages[rows] = found.leverages
-    return sigmas, leverages
+    return covariances, leverages

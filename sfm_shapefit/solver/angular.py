@@ -169,6 +169,22 @@ def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels:
     return _cost(graph, information, _unit(locations))
 
 
+class AngularTerms:
+    """The terms of the directions at given levels, for a refinement that adds others to them."""
+
+    def __init__(self, graph: ViewGraph, metric: Metric, levels: FloatArray) -> None:
+        self.graph = graph
+        self._information = _information(graph, _spread(graph, metric), levels[metric.classes])
+
+    def cost(self, locations: FloatArray) -> float:
+        """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
+        return _cost(self.graph, self._information, locations)
+
+    def linearised(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
+        return _linearised(self.graph, self._information, locations)
+
+
 def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
     """Return which pairs fit the locations, (m,): those of chi2 below k^2.
 

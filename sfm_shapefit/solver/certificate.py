@@ -34,6 +34,7 @@ pairs with ||y_e|| < w_e are parallel rigid.) The conditions are the null space 
 and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells whether it is regular.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -45,11 +46,11 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorise
 from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, routine_addresses, work_integers
-from sfm_shapefit.laplacian.operators import adjacency, apply_incidence_transposed
+from sfm_shapefit.laplacian.operators import Workers, adjacency, apply_incidence_transposed
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
 from sfm_shapefit.solver.admm.linear import IterativeSolver, LaplacianFactor, laplacian_factor
-from sfm_shapefit.solver.program import along, differences, objective, scale_functional
+from sfm_shapefit.solver.program import along, differences, objective
 from sfm_shapefit.viewgraph import ViewGraph
 
 _ROUNDS = 5  # of clipping; later ones gain nothing that the dual itself would not lose
@@ -60,8 +61,11 @@ _ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that i
 _ON_SURFACE = 0.99  # ||y_e|| / w_e from which a pair counts as on the surface
 _REPAIRS = 4  # each repair shrinks the equality residual to the rounding of the previous one
 _CG_STEPS = 500  # 10 to 60 on all but long chains
+_EDGE_BLOCKS, _LARGE = 4, 200_000  # pairs from which the passes over them run by blocks, on several threads
 _SEED = 1
-_EXACT = 1e-12  # an equality residual that needs no repair: it moves the bound by no more than this
+_EXACT_PER_GAP = 1e-5  # an equality residual that needs no repair, per gap: the bound moves by 100 times it
+_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of it
+_ENOUGH = 0.8  # rounds end at this share of the gap asked for: the exact repair may cost the rest
 _UNREPAIRED = 1e-9  # an equality residual, relative to the largest degree, that no bound may rest on
 _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
@@ -100,8 +104,10 @@ def certify(
     locations: FloatArray,
     dual: FloatArray,
     *,
+    tol: float = 0.0,
     uniqueness: bool = False,
     factor: LaplacianFactor | None = None,
+    threads: int = 1,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -109,32 +115,34 @@ def certify(
         graph: a connected view graph.
         locations: (n, d) camera centres, in any scale, with L(T) > 0.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
+        tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorisation.
         factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
             graph; it serves as preconditioner and cannot make the bound wrong.
+        threads: of a repair; the bound does not depend on it.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
         UnsolvableError: if the dual must be repaired and the graph is not connected.
     """
-    value = _checked_objective(graph, locations, dual)
-    n, w = graph.num_cameras, graph.weights
-    c = scale_functional(graph)
-    degree = np.bincount(graph.edges.ravel(), weights=np.repeat(w, 2), minlength=n).max()
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
-
+    value = _checked_objective(graph, locations, t, dual)
+    n, d, w = graph.num_cameras, graph.dimension, graph.weights
     y = np.array(dual, dtype=np.float64, order="C")
-    worst = _project(graph.directions, w, y)
-    total = apply_incidence_transposed(graph.edges, y, n)
-    if _largest(total - _multiplier(total, c, t) * c) > _EXACT * degree:
-        metric = _metric(graph, t)
-        precondition = _preconditioner(graph, metric.stiffness, factor)
-        _clip_in_rounds(metric, precondition, y, c, t, value)
-        worst = _restore_exactly(metric, precondition, y, c, t, _EXACT * float(degree))
+    c, total, degrees = np.zeros((n, d)), np.zeros((n, d)), np.zeros(n)
+    worst = _project(graph.edges, graph.directions, w, y, c, total, degrees)
+    degree = float(degrees.max())
+    multiplier = _multiplier(total, c, t)
+    if _largest(total - multiplier * c) > degree * _exact(value - multiplier / max(1.0, worst)):
+        repair = _repair(graph, t, y, factor, threads)
+        gap = _clip_in_rounds(repair, c, t, value, _ENOUGH * tol)
+        allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
+        worst = _restore_exactly(repair, c, t, degree * allowed)
         total = apply_incidence_transposed(graph.edges, y, n)
     scale = 1.0 / max(1.0, worst)
-    y *= scale
-    total *= scale
+    if scale < 1.0:
+        y *= scale
+        total *= scale
     bound = float(np.sum(total * c) / np.sum(c * c))
     # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
     if not (bound > 0.0 and _largest(total - bound * c) <= _UNREPAIRED * degree):
@@ -143,7 +151,7 @@ def certify(
         objective=value,
         dual_bound=bound,
         dual=frozen(y),
-        equality_residual=_largest(total - bound * c) / float(degree),
+        equality_residual=_largest(total - bound * c) / degree,
         unique=_is_unique(graph, t, y) if uniqueness else None,
     )
 
@@ -158,6 +166,11 @@ def _largest(vectors: FloatArray) -> float:
     return float(np.sqrt(np.einsum("ij,ij->i", vectors, vectors).max()))
 
 
+def _exact(gap: float) -> float:
+    """Return the equality residual that does not count beside a gap, per largest weighted degree."""
+    return min(max(_EXACT_PER_GAP * gap, _LEAST_EXACT), _LARGEST_EXACT)
+
+
 class _Metric(NamedTuple):
     """The change of the dual that a repair makes, S D h, as the kernels take it."""
 
@@ -166,81 +179,106 @@ class _Metric(NamedTuple):
     w: FloatArray
     stiffness: FloatArray
     """(m,) H_e."""
-    u: FloatArray
-    """(m, d) sqrt(_ALONG_SURFACE) times the unit vector of y_e on the surface of its ball, else 0."""
+    y: FloatArray
+    """(m, d) the dual that is repaired, in place."""
+    normal: FloatArray
+    """(m,) sqrt(_ALONG_SURFACE) / ||y_e|| on the surface of a ball, else 0: what makes u_e of y_e."""
     axes: tuple[int, ...]
     """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls the loops over it."""
 
 
-def _metric(graph: ViewGraph, t: FloatArray) -> _Metric:
+class _Repair(NamedTuple):
+    """A metric, the preconditioner of its Laplacian, and what the products with it need."""
+
+    metric: _Metric
+    precondition: Preconditioner
+    workers: Workers
+    parts: FloatArray
+    """(blocks, n, d) scratch: the sums of each block of pairs."""
+
+    def product(self, x: FloatArray) -> FloatArray:
+        """Return D^T S D x; the blocks, and so the sums, are the same for any number of threads."""
+        blocks = len(self.parts)
+        cuts = [len(self.metric.w) * k // blocks for k in range(blocks + 1)]
+
+        def job(k: int) -> Callable[[], object]:
+            return lambda: _apply(self.metric, cuts[k], cuts[k + 1], x, self.parts[k])
+
+        self.workers.run([job(k) for k in range(blocks)])
+        total: FloatArray = self.parts.sum(axis=0)
+        return total
+
+
+def _repair(
+    graph: ViewGraph, t: FloatArray, y: FloatArray, factor: LaplacianFactor | None, threads: int
+) -> _Repair:
     """Return the metric of the residuals at t, with no pair on the surface of its ball so far."""
     edges, v = np.ascontiguousarray(graph.edges), np.ascontiguousarray(graph.directions)
-    return _Metric(
-        edges, v, graph.weights, _stiffness(graph, t), np.zeros_like(v), tuple(range(graph.dimension))
-    )
+    stiffness = _stiffness(graph, t)
+    normal, axes = np.zeros(graph.num_edges), tuple(range(graph.dimension))
+    metric = _Metric(edges, v, graph.weights, stiffness, y, normal, axes)
+    blocks = _EDGE_BLOCKS if graph.num_edges >= _LARGE else 1
+    precondition = _preconditioner(graph, stiffness, factor, threads)
+    return _Repair(metric, precondition, Workers(threads), np.empty((blocks, *t.shape)))
 
 
-def _clip_in_rounds(
-    metric: _Metric,
-    precondition: Preconditioner,
-    y: FloatArray,
-    c: FloatArray,
-    t: FloatArray,
-    value: float,
-) -> None:
-    """Clip y, in place, and restore the equality roughly, in turns, until its excess costs little.
+def _clip_in_rounds(repair: _Repair, c: FloatArray, t: FloatArray, value: float, enough: float) -> float:
+    """Clip y and restore the equality roughly, in turns, until its excess costs little.
 
     Args:
         value: the objective at t, to tell how far the bound is.
+        enough: a gap at which it ends in any case.
+
+    Returns:
+        About the gap that the dual proves.
     """
+    gap = value
     for _ in range(_ROUNDS):
-        _clip(metric, y)
-        worst = _restore(metric, precondition, y, _violation(metric, y, c, t)[1], _ROUND_REDUCTION)
-        multiplier = _multiplier(apply_incidence_transposed(metric.edges, y, len(c)), c, t)
-        if (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier):
+        _clip(repair.metric)
+        worst = _restore(repair, _violation(repair.metric, c, t)[1], _ROUND_REDUCTION)
+        multiplier = _violation(repair.metric, c, t)[0]
+        gap = value - multiplier / max(1.0, worst)
+        if gap <= enough or (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier):
             break
+    return gap
 
 
-def _restore_exactly(
-    metric: _Metric,
-    precondition: Preconditioner,
-    y: FloatArray,
-    c: FloatArray,
-    t: FloatArray,
-    allowed: float,
-) -> float:
-    """Move y, in place, to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e."""
+def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: float) -> float:
+    """Move y to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e.
+
+    The metric is H_e P_e here: what is still to be moved costs little, and the conjugate gradients need half
+    of the steps.
+    """
+    repair.metric.normal[:] = 0.0
     fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
     worst = 1.0
     for _ in range(_REPAIRS):
-        violation = _violation(metric, y, c, t)[1]
+        violation = _violation(repair.metric, c, t)[1]
         reduction = fine / max(float(np.linalg.norm(violation)), fine)
-        worst = _restore(metric, precondition, y, violation, reduction)
-        if _largest(_violation(metric, y, c, t)[1]) <= allowed:
+        worst = _restore(repair, violation, reduction)
+        if _largest(_violation(repair.metric, c, t)[1]) <= allowed:
             break
     return worst
 
 
-def _violation(metric: _Metric, y: FloatArray, c: FloatArray, t: FloatArray) -> tuple[float, FloatArray]:
+def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, FloatArray]:
     """Return lambda and D^T y - lambda c, (n, d)."""
-    total = apply_incidence_transposed(metric.edges, y, len(c))
+    total = apply_incidence_transposed(metric.edges, metric.y, len(c))
     multiplier = _multiplier(total, c, t)
     return multiplier, total - multiplier * c
 
 
-def _restore(
-    metric: _Metric, precondition: Preconditioner, y: FloatArray, violation: FloatArray, tol: float
-) -> float:
+def _restore(repair: _Repair, violation: FloatArray, tol: float) -> float:
     """Move y by S D h so that `violation` shrinks to `tol` times itself; return max_e ||y_e|| / w_e."""
     h = conjugate_gradients(
-        lambda x: _apply(metric, x, np.empty_like(x)),
-        precondition,
+        repair.product,
+        repair.precondition,
         violation,
         tol=min(tol, 0.5),
         max_iterations=_CG_STEPS,
         coupled=True,
     ).x
-    return float(_move(metric, h, y))
+    return float(_move(repair.metric, h))
 
 
 def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -255,7 +293,7 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 
 def _preconditioner(
-    graph: ViewGraph, stiffness: FloatArray, factor: LaplacianFactor | None
+    graph: ViewGraph, stiffness: FloatArray, factor: LaplacianFactor | None, threads: int
 ) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
     components = int(graph.components().max()) + 1
@@ -263,7 +301,7 @@ def _preconditioner(
         raise UnsolvableError(
             f"the graph falls into {components} connected components; certify each one separately"
         )
-    factor = laplacian_factor(graph) if factor is None else factor
+    factor = laplacian_factor(graph, threads=threads) if factor is None else factor
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32
@@ -287,24 +325,35 @@ def _residuals(edges: Any, v: Any, t: Any, out: Any) -> None:
 
 
 @kernel(exact=True)
-def _project(v: Any, w: Any, y: Any) -> float:
-    """Remove the part of y along v; return max_e ||y_e|| / w_e."""
+def _project(edges: Any, v: Any, w: Any, y: Any, c: Any, total: Any, degrees: Any) -> float:
+    """Remove the part of y along v; add D^T (w v), D^T y and the sums of w at the cameras.
+
+    Returns:
+        max_e ||y_e|| / w_e.
+    """
     worst = 0.0
     for e in range(len(w)):
+        i, j = edges[e, 0], edges[e, 1]
         s = square = 0.0
         for k in range(v.shape[1]):
             s += y[e, k] * v[e, k]
         for k in range(v.shape[1]):
             y[e, k] -= s * v[e, k]
             square += y[e, k] ** 2
+            c[i, k] += w[e] * v[e, k]
+            c[j, k] -= w[e] * v[e, k]
+            total[i, k] += y[e, k]
+            total[j, k] -= y[e, k]
+        degrees[i] += w[e]
+        degrees[j] += w[e]
         worst = max(worst, np.sqrt(square) / w[e])
     return worst
 
 
 @kernel(exact=True)
-def _clip(metric: Any, y: Any) -> None:
-    """Shorten y_e to its ball, and write u_e where it is on the surface."""
-    w, u = metric.w, metric.u
+def _clip(metric: Any) -> None:
+    """Shorten y_e to its ball, and write what makes u_e of it where it is on the surface."""
+    w, y = metric.w, metric.y
     share = np.sqrt(_ALONG_SURFACE)
     for e in range(len(w)):
         square = 0.0
@@ -312,35 +361,34 @@ def _clip(metric: Any, y: Any) -> None:
             square += y[e, k] ** 2
         norm = np.sqrt(square)
         keep = w[e] / norm if norm > w[e] else 1.0
-        normal = share / norm if norm > _ON_SURFACE * w[e] else 0.0
+        metric.normal[e] = share / (keep * norm) if norm > _ON_SURFACE * w[e] else 0.0
         for k in range(len(metric.axes)):
-            u[e, k] = normal * y[e, k]
             y[e, k] *= keep
 
 
 @kernel(exact=True)
-def _apply(metric: Any, x: Any, out: Any) -> Any:
-    """Write D^T S D x into `out` and return it."""
-    edges, v, u, stiffness = metric.edges, metric.v, metric.u, metric.stiffness
+def _apply(metric: Any, first: int, last: int, x: Any, out: Any) -> None:
+    """Write D^T S D x of the pairs from `first` to `last` into `out`."""
+    edges, v, y, stiffness = metric.edges, metric.v, metric.y, metric.stiffness
     out[:] = 0.0
-    for e in range(len(edges)):
+    for e in range(first, last):
         i, j = edges[e, 0], edges[e, 1]
         s = q = 0.0
         for k in range(len(metric.axes)):
             difference = x[i, k] - x[j, k]
             s += difference * v[e, k]
-            q += difference * u[e, k]  # u is orthogonal to v
+            q += difference * y[e, k]  # y is orthogonal to v
+        q *= metric.normal[e] ** 2
         for k in range(len(metric.axes)):
-            z = stiffness[e] * ((x[i, k] - x[j, k]) - s * v[e, k] - q * u[e, k])
+            z = stiffness[e] * ((x[i, k] - x[j, k]) - s * v[e, k] - q * y[e, k])
             out[i, k] += z
             out[j, k] -= z
-    return out
 
 
 @kernel(exact=True)
-def _move(metric: Any, h: Any, y: Any) -> float:
+def _move(metric: Any, h: Any) -> float:
     """Replace y by y - S D h, orthogonal to v to rounding; return max_e ||y_e|| / w_e."""
-    edges, v, u, stiffness = metric.edges, metric.v, metric.u, metric.stiffness
+    edges, v, y, stiffness = metric.edges, metric.v, metric.y, metric.stiffness
     worst = 0.0
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
@@ -348,9 +396,10 @@ def _move(metric: Any, h: Any, y: Any) -> float:
         for k in range(len(metric.axes)):
             difference = h[i, k] - h[j, k]
             s += difference * v[e, k]
-            q += difference * u[e, k]
+            q += difference * y[e, k]
+        q *= metric.normal[e] ** 2
         for k in range(len(metric.axes)):
-            y[e, k] -= stiffness[e] * ((h[i, k] - h[j, k]) - s * v[e, k] - q * u[e, k])
+            y[e, k] -= stiffness[e] * ((h[i, k] - h[j, k]) - s * v[e, k] - q * y[e, k])
             yv += y[e, k] * v[e, k]
         for k in range(len(metric.axes)):
             y[e, k] -= yv * v[e, k]
@@ -454,8 +503,8 @@ def _least_pivot(
     return least
 
 
-def _checked_objective(graph: ViewGraph, locations: FloatArray, dual: FloatArray) -> float:
-    """Return the objective at the locations, or raise InputError."""
+def _checked_objective(graph: ViewGraph, locations: FloatArray, t: FloatArray, dual: FloatArray) -> float:
+    """Return the objective at the locations, t when centred, or raise InputError."""
     shapes = (graph.num_cameras, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(
@@ -464,7 +513,7 @@ def _checked_objective(graph: ViewGraph, locations: FloatArray, dual: FloatArray
         )
     if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
         raise InputError("locations and dual must be finite to be certified")
-    value = objective(graph, locations - locations.mean(axis=0))
+    value = objective(graph, t)
     if not value < np.inf:
         raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
     return value

@@ -87,7 +87,7 @@ def solve_hybrid(
     factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
     splitting = Splitting(graph, factor, threads)
     try:
-        result = _split(splitting, graph, factor, tol, max_iterations, on_iteration)
+        result = _split(splitting, graph, factor, tol, max_iterations, threads, on_iteration)
     finally:
         splitting.close()
     if result.finish is not Finish.INACCURATE:
@@ -102,13 +102,14 @@ def _split(
     factor: LaplacianFactor,
     tol: float,
     max_iterations: int,
+    threads: int,
     on_iteration: OnIteration | None,
 ) -> HybridResult:
     """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
     target = _SHARE * tol
     for _ in range(_CERTIFICATES):
         step = splitting.run(0.0, target, max_iterations, on_iteration)
-        certificate = certify(graph, step.locations, step.dual, factor=factor)
+        certificate = certify(graph, step.locations, step.dual, tol=tol, factor=factor, threads=threads)
         finish = _verdict(certificate, step.stop, tol)
         result = HybridResult(
             locations=step.locations,
@@ -159,7 +160,7 @@ def _newton(
 
     start = result.locations, result.certificate.dual
     t, y, count = solve_newton_sparse(graph, tol, _NEWTON_STEPS, report, start=start, plan=plan)
-    certificate = certify(graph, t, y, factor=factor)
+    certificate = certify(graph, t, y, tol=tol, factor=factor)
     if certificate.gap < result.certificate.gap:
         result = replace(result, locations=t - t.mean(axis=0), certificate=certificate)
     finish = Finish.NEWTON if result.certificate.gap <= tol else Finish.INACCURATE

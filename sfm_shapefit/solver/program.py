@@ -58,7 +58,9 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
 def scale_functional(graph: ViewGraph) -> FloatArray:
     """Return c = D^T (w v), so that L(T) = <c, T>, shape (n, d)."""
-    return adjoint(graph.weights[:, None] * graph.directions, graph.edges, graph.num_cameras)
+    total = np.zeros((graph.num_cameras, graph.dimension))
+    _add_scale(graph.edges, graph.directions, graph.weights, total)
+    return total
 
 
 def residual_sum(graph: ViewGraph, t: FloatArray) -> float:
@@ -97,6 +99,14 @@ def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
         for k in range(y.shape[1]):
             out[edges[e, 0], k] += y[e, k]
             out[edges[e, 1], k] -= y[e, k]
+
+
+@kernel(exact=True)
+def _add_scale(edges: Any, v: Any, w: Any, out: Any) -> None:
+    for e in range(len(edges)):
+        for k in range(v.shape[1]):
+            out[edges[e, 0], k] += w[e] * v[e, k]
+            out[edges[e, 1], k] -= w[e] * v[e, k]
 
 
 @kernel(exact=True)

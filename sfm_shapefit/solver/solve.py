@@ -91,7 +91,14 @@ def solve(
     if not (np.isfinite(run.locations).all() and projected_length(graph, run.locations) > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
     locations = normalized_locations(graph, run.locations)
-    certificate = certify(graph, locations, run.dual, uniqueness=options.uniqueness)
+    certificate = certify(
+        graph,
+        locations,
+        run.dual,
+        tol=options.tol,
+        uniqueness=options.uniqueness,
+        threads=options.threads,
+    )
     return SolverResult(
         locations=frozen(locations),
         status=_status(certificate, options.tol, run.iterations >= limit, watch.cancelled),

@@ -15,7 +15,7 @@ Then ask for what you need, and compare with the truth:
         scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
         workspace = workspace_of(scene, WorkspaceOptions(model="rotations"))
         found = locate(workspace / "sparse/0").reconstruction
-        assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05, min_placed=0.9)
+        assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05, min_placed=0.8)
 
 
     def test_exact_directions_give_exact_locations(random_graph):

@@ -19,7 +19,6 @@ from sfm_shapefit.solver.bodies.certificate import certify_bodies
 from sfm_shapefit.solver.bodies.reduced import ReducedFactor, System, factor_pinned
 from sfm_shapefit.solver.newton.steps import (
     EDGE_WORK,
-    MU_PER_GAP,
     REFINEMENTS,
     SOLVE_WORK,
     STALL,
@@ -32,6 +31,7 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
+    closed,
     dot,
     extend_step,
     linearise,
@@ -39,6 +39,7 @@ from sfm_shapefit.solver.newton.steps import (
     pays,
     set_gradient,
     set_residuals,
+    smoothing,
     start_from,
     take,
 )
@@ -112,7 +113,7 @@ def _solve(
     start = None if system is None else system.solve(np.zeros(bodies.num_unknowns), 1.0)[1]
     if start is None or not start_from(problem, bodies.expand(start), iterate):
         raise UnsolvableError("the directions do not determine the bodies; check which of them hang free")
-    progress = measure(problem, iterate, 1.0, 0.0)
+    progress = measure(problem, iterate)
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
         before = progress.gap
@@ -133,28 +134,28 @@ def _cycle(
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
     first = progress.gap
-    mu = min(progress.mu, MU_PER_GAP * first)
+    mu = smoothing(progress, progress.mu)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
-        return progress
+        return closed(iterate, progress, mu, first)
     edge_work = EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.factor.panels.size
     work = factor.factor.symbolic.flops * factor.factor.block**3 + 0.5 * edge_work
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
-        mu = min(mu, MU_PER_GAP * previous)
+        mu = smoothing(progress, mu)
         target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress.multiplier, target)
+        progress = take(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return progress
+    return closed(iterate, progress, progress.mu, first)
 
 
 def _propose(

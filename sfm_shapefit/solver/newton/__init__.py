@@ -20,16 +20,22 @@ What makes it fast and safe:
 - *Lifting.* M is singular along translations, and nearly so along T where the data are nearly exact. Neither
   direction occurs in dT, for it would change the centroid or <c, T>. So multiples of 1 1^T and c c^T
   are added to M: dT and lambda+ stay what they are, and the matrix is well conditioned.
-- *The better of two dual steps.* y moves towards y+ as far as the ball allows, or y+ is divided by its
-  excess max ||y+_e|| / w_e. Both keep the equality; the larger lambda is taken. Near the optimum y+ leaves
-  the ball by a hair, and scaling costs a hair where stopping short costs half of the step.
+- *Two duals.* y+ fulfils the equality, and divided by its excess max ||y+_e|| / w_e the ball too; the
+  best bound proven so is kept. But the excess is that of one pair, and scaling sets all others back. So the
+  steps go on from y+ clipped to its balls pair by pair: they need no equality, the next y+ fulfils it anew.
+  With noise that saves a quarter of the factorisations. In the plane, where the program is nearly linear,
+  clipped duals can make M singular: after a cycle that leaves more than half of the gap the steps go on from
+  the feasible dual, moved towards y+ as far as the ball allows or replaced by y+ / excess, whichever has
+  the larger lambda.
 - *Steps with an old matrix.* After a step the conditions are evaluated anew and solved again with the
   factor in hand: g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, rho' and S from the factorisation. That costs a
   few passes over the edges. It goes on while the last step gained more per unit of work than the
   cycle since the factorisation did on average, and nearly halves the number of factorisations.
 
 Source: Andersen, Christiansen, Conn, Overton, "An efficient primal-dual interior-point method for
-minimizing a sum of Euclidean norms", SIAM J. Sci. Comput. 22 (2000), for the symmetrised step.
+minimizing a sum of Euclidean norms", SIAM J. Sci. Comput. 22 (2000), for the symmetrised step. Hintermueller,
+Stadler, "An infeasible primal-dual algorithm for total bounded variation-based inf-convolution-type image
+restoration", SIAM J. Sci. Comput. 28 (2006), for going on from a projected dual.
 """
 
 from sfm_shapefit.solver.newton.dense import solve_newton_dense

@@ -16,7 +16,6 @@ from sfm_shapefit.laplacian.dense import (
     work_integers,
 )
 from sfm_shapefit.solver.newton.steps import (
-    MU_PER_GAP,
     REFINEMENTS,
     STALL,
     STEPS_PER_FACTOR,
@@ -24,6 +23,7 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
+    closed,
     dot,
     extend_step,
     is_cancelled,
@@ -32,6 +32,7 @@ from sfm_shapefit.solver.newton.steps import (
     pays,
     set_gradient,
     set_residuals,
+    smoothing,
     start_from,
     take,
 )
@@ -98,7 +99,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not _start(problem, iterate, model, factor):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure(problem, iterate, 1.0, 0.0)
+        progress = measure(problem, iterate)
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -162,25 +163,25 @@ def _cycle(
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
     first = progress.gap
-    mu = min(progress.mu, MU_PER_GAP * first)
+    mu = smoothing(progress, progress.mu)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
     if _factorise(problem, model, factor) != 0:
-        return Progress(mu, progress.multiplier, progress.objective, first)
+        return closed(iterate, progress, mu, first)
     order = float(problem.c.size)
     step_work = _EDGE_WORK * len(problem.w) + _SOLVE_WORK * order**2
     work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
-        mu = min(mu, MU_PER_GAP * previous)
+        mu = smoothing(progress, mu)
         target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress.multiplier, target)
+        progress = take(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return Progress(progress.mu, progress.multiplier, progress.objective, progress.gap)
+    return closed(iterate, progress, progress.mu, first)
 
 
 @kernel()

@@ -23,7 +23,6 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorisation
 from sfm_shapefit.solver.newton.steps import (
     EDGE_WORK,
-    MU_PER_GAP,
     REFINEMENTS,
     SOLVE_WORK,
     STALL,
@@ -36,6 +35,7 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
+    closed,
     dot,
     extend_step,
     is_cancelled,
@@ -44,6 +44,7 @@ from sfm_shapefit.solver.newton.steps import (
     pays,
     set_gradient,
     set_residuals,
+    smoothing,
     start_from,
     take,
 )
@@ -91,7 +92,7 @@ def solve_newton_sparse(
         system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
         if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure(problem, iterate, 1.0, 0.0)
+        progress = measure(problem, iterate)
     else:
         progress = _begin_at(problem, *start, iterate)
     count, stalled = 0, 0
@@ -110,9 +111,8 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     centred = locations - locations.mean(axis=0)
     iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
     set_residuals(problem, iterate.t, iterate.r)
-    iterate.y[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
-    progress = measure(problem, iterate, 1.0, 0.0)
-    return progress._replace(multiplier=progress.objective - progress.gap)
+    iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
+    return measure(problem, iterate)
 
 
 class System(NamedTuple):
@@ -147,28 +147,28 @@ def _cycle(
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
     first = progress.gap
-    mu = min(progress.mu, MU_PER_GAP * first)
+    mu = smoothing(progress, progress.mu)
     set_residuals(problem, iterate.t, iterate.r)
     linearise(problem, iterate, mu, model)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
-        return progress
+        return closed(iterate, progress, mu, first)
     edge_work = EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.panels.size
     work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
-        mu = min(mu, MU_PER_GAP * previous)
+        mu = smoothing(progress, mu)
         target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress.multiplier, target)
+        progress = take(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return progress
+    return closed(iterate, progress, progress.mu, first)
 
 
 def _propose(

@@ -18,7 +18,8 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
-MU_PER_GAP = 0.1  # smoothing relative to the gap; .07 to .3 need the same number of factorisations
+_MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
+_CLIPS_BELOW = 0.5  # a cycle that leaves more of the gap than this is the last one with a clipped dual
 STEPS_PER_FACTOR = 10
 _LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
 REFINEMENTS = 3
@@ -59,9 +60,11 @@ class Iterate(NamedTuple):
     t: FloatArray
     """(n, d) locations, <c, T> = kappa."""
     y: FloatArray
-    """(m, d - 1) feasible dual."""
+    """(m, d - 1) dual in its balls, at which M is taken: the last y+ clipped, or the feasible one."""
     r: FloatArray
     """(m, d - 1) residuals B_e^T (t_i - t_j)."""
+    feasible: FloatArray
+    """(m, d - 1) the dual of the best bound so far; it fulfils the equality too."""
 
 
 class Model(NamedTuple):
@@ -99,11 +102,13 @@ class Progress(NamedTuple):
 
     mu: float
     multiplier: float
-    """lambda."""
+    """lambda of the feasible dual."""
     objective: float
     """R(T) / kappa."""
     gap: float
-    """sum_e (w_e ||r_e|| - <y_e, r_e>) / kappa: every term is positive, so it does not cancel."""
+    """sum_e (w_e ||r_e|| - <y_e, r_e>) / kappa, y feasible: every term is positive, so it does not cancel."""
+    clips: bool = True
+    """Whether the next steps go on from the clipped dual."""
 
 
 def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
@@ -121,7 +126,8 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
         return np.empty((m, d - 1))
 
     basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
-    set_basis(graph.directions, basis, tilt)
+    model = Model(np.empty((m, d - 1, d - 1)), np.ones(m), nodes())
+    set_up(graph.directions, graph.weights, basis, tilt, model.s)
     problem = Problem(
         graph.edges.astype(np.uint32),
         graph.directions,
@@ -135,9 +141,8 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
     )
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-    model = Model(graph.weights[:, None, None] * np.eye(d - 1), np.ones(m), nodes())
     step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
-    return problem, Iterate(nodes(), edges(), edges()), model, step
+    return problem, Iterate(nodes(), edges(), edges(), edges()), model, step
 
 
 def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
@@ -149,8 +154,11 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
 
 
 @kernel()
-def set_basis(v: Any, basis: Any, tilt: Any) -> None:
-    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column."""
+def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
+    """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column.
+
+    And S_e = w_e, which makes M the projected Laplacian.
+    """
     for e in range(len(v)):
         sign = np.copysign(1.0, v[e, 0])
         inverse = 1.0 / (1.0 + abs(v[e, 0]))
@@ -158,7 +166,9 @@ def set_basis(v: Any, basis: Any, tilt: Any) -> None:
         for q in range(v.shape[1] - 1):
             basis[e, 0, q] = -sign * v[e, q + 1]
             for k in range(1, v.shape[1]):
-                basis[e, k, q] = (1.0 if k == q + 1 else 0.0) - inverse * v[e, k] * v[e, q + 1]
+                unit = 1.0 if k == q + 1 else 0.0
+                basis[e, k, q] = unit - inverse * v[e, k] * v[e, q + 1]
+                s[e, k - 1, q] = unit * w[e]
 
 
 @kernel(inline=True)
@@ -177,7 +187,7 @@ def start_from(problem: Any, a: Any, iterate: Any) -> bool:
         for e in range(len(problem.w)):
             scale = problem.w[e] / worst if worst > 0.0 else 0.0
             for k in range(len(problem.transverse)):
-                iterate.y[e, k] = scale * iterate.r[e, k]
+                iterate.y[e, k] = iterate.feasible[e, k] = scale * iterate.r[e, k]
     return bool(length > 0.0)
 
 
@@ -186,22 +196,43 @@ def answer(
 ) -> tuple[FloatArray, FloatArray]:
     """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
     if progress.objective <= tol:
-        iterate.y[:] = 0.0
-    return iterate.t, np.einsum("ekq,eq->ek", problem.basis, iterate.y)
+        iterate.feasible[:] = 0.0
+    return iterate.t, np.einsum("ekq,eq->ek", problem.basis, iterate.feasible)
 
 
 @kernel(inline=True)
-def measure(problem: Any, iterate: Any, mu: float, multiplier: float) -> Progress:
-    """Return the scalars at the iterate."""
+def measure(problem: Any, iterate: Any) -> Progress:
+    """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
     for e in range(len(problem.w)):
         rr = yr = 0.0
         for k in range(len(problem.transverse)):
             rr += iterate.r[e, k] * iterate.r[e, k]
-            yr += iterate.r[e, k] * iterate.y[e, k]
+            yr += iterate.r[e, k] * iterate.feasible[e, k]
         objective += problem.w[e] * np.sqrt(rr)
         bound += yr
-    return Progress(mu, multiplier, objective / problem.kappa, (objective - bound) / problem.kappa)
+    return Progress(
+        1.0, bound / problem.kappa, objective / problem.kappa, (objective - bound) / problem.kappa, True
+    )
+
+
+@kernel(inline=True)
+def smoothing(progress: Any, mu: float) -> float:
+    """Return mu for the next step: it shrinks with the gap, with a clipped dual a little faster."""
+    share = 1.0
+    if progress.clips and progress.gap < progress.objective:
+        share = np.sqrt(progress.gap / progress.objective)
+    return float(min(mu, _MU_PER_GAP * share * progress.gap))
+
+
+@kernel(inline=True)
+def closed(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
+    """Return the scalars after a cycle that began with the gap `first`; clipping ends if it gained little."""
+    clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
+    if progress.clips and not clips:
+        iterate.y[:] = iterate.feasible
+        mu = _MU_PER_GAP * progress.gap
+    return Progress(mu, progress.multiplier, progress.objective, progress.gap, clips)
 
 
 @kernel(inline=True)
@@ -311,20 +342,25 @@ def set_residuals(problem: Any, t: Any, r: Any) -> None:
 
 
 @kernel(inline=True)
-def take(problem: Any, iterate: Any, step: Any, mu: float, multiplier: float, target: float) -> Progress:
+def take(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Progress:
     """Move along the step as far as it helps; return the scalars there."""
-    alpha = 1.0
+    alpha, multiplier = 1.0, progress.multiplier
     while alpha > 0.0 and increase(problem, iterate, step, mu, alpha) > 0.0:
         alpha = 0.5 * alpha if alpha > 0.5**_HALVINGS else 0.0
     excess = np.sqrt(largest_dual(problem, step))
-    beta = min(1.0, _TO_BOUNDARY / speed_of_exit(problem, iterate, step)) if excess > 1.0 else 1.0
-    keep, gain, reached = 1.0 - beta, beta, multiplier + beta * (target - multiplier)
-    if excess > 1.0:
-        scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0)))
-        if scale * target > reached:
-            keep, gain, reached = 0.0, scale, scale * target
+    scale = 1.0 / (excess * (1.0 + _MARGIN * (excess - 1.0))) if excess > 1.0 else 1.0
+    keep, gain, reached = 0.0, scale, scale * target
+    if excess > 1.0 and (reached <= multiplier or not progress.clips):
+        beta = min(1.0, _TO_BOUNDARY / speed_of_exit(problem, iterate, step))
+        if multiplier + beta * (target - multiplier) > reached:
+            keep, gain, reached = 1.0 - beta, beta, multiplier + beta * (target - multiplier)
+    if progress.clips and reached <= multiplier:
+        keep, gain, reached = 1.0, 0.0, multiplier
     objective, bound = move(problem, iterate, step, alpha, keep, gain)
-    return Progress(mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa)
+    if not progress.clips:
+        iterate.y[:] = iterate.feasible
+    gap = (objective - bound) / problem.kappa
+    return Progress(mu, reached, objective / problem.kappa, gap, progress.clips)
 
 
 @kernel(inline=True)
@@ -356,12 +392,12 @@ def largest_dual(problem: Any, step: Any) -> float:
 
 @kernel(inline=True)
 def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
-    """Return 1 / the longest step from y towards y+ inside the ball, given the ratios of `largest_dual`."""
+    """Return 1 / the longest step from the feasible dual to y+ in the ball, given `largest_dual`'s ratios."""
     ratios = step.ratios
     for e in range(len(problem.w)):
         dd = yd = yy = 0.0
         for k in range(len(problem.transverse)):
-            y, towards = iterate.y[e, k], step.y[e, k] - iterate.y[e, k]
+            y, towards = iterate.feasible[e, k], step.y[e, k] - iterate.feasible[e, k]
             dd += towards * towards
             yd += towards * y
             yy += y * y
@@ -391,18 +427,26 @@ def largest(x: Any) -> float:
 def move(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
-    """T += alpha dT, r += alpha dr, y = keep y + gain y+; return sum_e w_e ||r_e|| and sum_e <y_e, r_e>."""
+    """T += alpha dT, r += alpha dr, y = y+ clipped to its balls, feasible = keep feasible + gain y+.
+
+    Returns:
+        sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
+    """
     iterate.t[:] += alpha * step.t
     residual = bound = 0.0
     for e in range(len(problem.w)):
-        rr = yr = 0.0
+        rr = yr = pp = 0.0
         for k in range(len(problem.transverse)):
-            r = iterate.r[e, k] + alpha * step.r[e, k]
-            y = keep * iterate.y[e, k] + gain * step.y[e, k]
+            r, towards = iterate.r[e, k] + alpha * step.r[e, k], step.y[e, k]
+            y = keep * iterate.feasible[e, k] + gain * towards
             iterate.r[e, k] = r
-            iterate.y[e, k] = y
+            iterate.feasible[e, k] = y
             rr += r * r
             yr += y * r
+            pp += towards * towards
+        inside = problem.w[e] / max(np.sqrt(pp), problem.w[e])
+        for k in range(len(problem.transverse)):
+            iterate.y[e, k] = inside * step.y[e, k]
         residual += problem.w[e] * np.sqrt(rr)
         bound += yr
     return residual, bound

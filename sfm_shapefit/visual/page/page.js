@@ -322,13 +322,16 @@
       else showTooltip(pairTitle(found[1]), pairFacts(found[1]));
     });
     target.on("plotly_unhover", hideTooltip);
-    target.on("plotly_click", (event) => {
-      const found = find(event);
-      if (found && found[0] !== "text") select(found[0], found[1], target !== plot, true);
-    });
+    if (target !== plot) {
+      target.on("plotly_click", (event) => {
+        const found = find(event);
+        if (found && found[0] !== "text") select(found[0], found[1], true, true);
+      });
+    }
     target.addEventListener("mouseleave", hideTooltip);
   };
-  // Plotly sees a click in 3D only if the button is still down when it draws next, and misses quick ones.
+  // Plotly tells of a click in 3D while it draws, if the button is still down then: it misses quick clicks, and
+  // drawing the choice from within would start over without end. So the pointer itself is watched.
   const listenToPresses = () => {
     let [under, pressed] = [null, null];
     plot.on("plotly_hover", (event) => { under = customOf(event); });
