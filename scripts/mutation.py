@@ -119,9 +119,9 @@ def _is_deletable(node: Any) -> bool:
     if node.type in ("return_stmt", "raise_stmt"):
         return node.get_first_leaf() is not node.get_last_leaf()
     if node.type == "expr_stmt":  # plain names would only raise NameError
-        return node.children[0].type != "name" or node.children[1].type == "operator" and (
+        return node.children[0].type != "name" or (node.children[1].type == "operator" and (
             node.children[1].value not in ("=", ":")
-        )
+        ))
     return node.type in ("atom_expr", "power")
 
 

@@ -6,7 +6,7 @@ whole model onto their axes.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -20,7 +20,8 @@ from sfm_shapefit.geometry import (
     rotation_angles_deg,
 )
 
-Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
+if TYPE_CHECKING:
+    from sfm_shapefit.options import Scale
 
 _CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
 _ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
@@ -38,7 +39,7 @@ class Gauge:
 
     similarity: Similarity
     """Scale and shift in the input's axes; its rotation is the identity."""
-    scale: Scale | Literal["fixed"]
+    scale: "Scale | Literal['fixed']"
     """The choice that was carried out."""
     statement: str
     """What scale, origin and axes the output has, for the report."""

@@ -7,7 +7,6 @@ import os
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
-from sfm_shapefit.gauge import Scale
 from sfm_shapefit.robust.options import Filter, Objective
 from sfm_shapefit.solver.options import Method
 
@@ -17,6 +16,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.robust.options import PlacementOptions
 
 Points = Literal["auto", "never", "always"]
+Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 
 FIX_SOLVED = "solved"
@@ -27,7 +27,7 @@ _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time o
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LocateOptions:
-    """Settings of `locate`."""
+    """Settings of `locate`, whose docstring has them as a table; what each does stands under its field."""
 
     directions: Source = "auto"
     """Where directions come from: the database's inlier matches, its stored relative poses, or the

@@ -19,7 +19,7 @@ from sfm_shapefit.robust.options import Filter, PlacementOptions
 from sfm_shapefit.robust.rival import Rival, find_rival
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Assessment, assess
-from sfm_shapefit.solver.options import IterationInfo, SolverResult
+from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -111,6 +111,7 @@ def place(
     covariance: FloatArray | None = None,
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
+    on_iteration: OnIteration | None = None,
 ) -> Placement:
     """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
 
@@ -120,6 +121,7 @@ def place(
         covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
         evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
         num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
+        on_iteration: called after each iteration of the solve, on graphs where that costs little.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
@@ -134,7 +136,7 @@ def place(
         for piece in ordered_pieces(considered, num_cameras)
     ]
     refuse_without_triangle(considered, pieces, num_cameras)
-    return _place_piece(graph, (dropped, pieces), 0, options, covariance, evidence, num_cameras)
+    return _place_piece(graph, (dropped, pieces), 0, options, covariance, evidence, num_cameras, on_iteration)
 
 
 def place_further(
@@ -213,6 +215,7 @@ def _place_piece(
     covariance: FloatArray | None,
     evidence: Evidence | None,
     num_cameras: int,
+    on_iteration: OnIteration | None = None,
 ) -> Placement:
     """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`.
 
@@ -225,10 +228,15 @@ def _place_piece(
     classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
     heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
     history: list[IterationInfo] = []
-    watch = history.append if piece.num_edges <= _MOST_WATCHED else None
-    solved = (
-        solve(piece, options, watch) if options.solves_shapefit else solve_baseline(piece, options.objective)
-    )
+
+    def watch(info: IterationInfo) -> bool | None:
+        history.append(info)
+        return None if on_iteration is None else on_iteration(info)
+
+    if options.solves_shapefit:
+        solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
+    else:
+        solved = solve_baseline(piece, options.objective)
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
     assessment = assess(piece, finished.locations, known, heard, placed, unheld=finished.put_back)

@@ -13,9 +13,10 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import LocateOptions, locate, output
-from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust, quiet_stderr
+from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.quiet import pycolmap_heard, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
 from sfm_shapefit.colmap.structure import (
     StructureOptions,
@@ -521,17 +522,18 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
 
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
     seed, graph = seeded(ring_model(noise_px=0.5)[0])
-    bundle_adjust(seed, graph, options=AdjustmentOptions(quiet=quiet))
+    with pycolmap_heard(not quiet):
+        bundle_adjust(seed, graph)
     said = capfd.readouterr()
     assert said.out == ""
     assert ("not positive definite" in said.err) != quiet
 
 
-def test_stderr_is_quiet_only_inside_the_block_and_only_if_enabled(capfd):
+def test_stderr_is_quiet_only_inside_the_block_and_only_if_nobody_listens(capfd):
     with contextlib.suppress(KeyError), quiet_stderr():
         os.write(2, b"lost")
         raise KeyError
-    with quiet_stderr(enabled=False):
+    with pycolmap_heard(), quiet_stderr():
         os.write(2, b"seen ")
     os.write(2, b"after")
     assert capfd.readouterr().err == "seen after"

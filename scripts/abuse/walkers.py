@@ -54,7 +54,8 @@ def _fuzz(args: argparse.Namespace) -> None:
     import pycolmap
 
     from sfm_shapefit.colmap import check
-    from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, quiet_pycolmap
+    from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS
+    from sfm_shapefit.colmap.quiet import quiet_log
     from sfm_shapefit.errors import InputError
 
     folder = args.base / "sparse" / "0"
@@ -73,7 +74,7 @@ def _fuzz(args: argparse.Namespace) -> None:
         (folder / f"{name}.bin").write_bytes(data[1:])
         try:
             check.check_model_files(folder)
-            with quiet_pycolmap():
+            with quiet_log():
                 pycolmap.Reconstruction(folder)
         except (InputError, *PYCOLMAP_ERRORS):
             pass

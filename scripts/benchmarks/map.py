@@ -115,7 +115,7 @@ def _inputs(scene: str, data: Path, folder: Path) -> tuple[Path, Path]:
 def measure(mapper: str, database: Path, truth: Path, min_matches: int) -> Outcome:
     """Run one mapper once, and compare its largest model with the truth."""
     import sfm_shapefit
-    from sfm_shapefit.colmap.adjustment import quiet_stderr
+    from sfm_shapefit.colmap.quiet import quiet_stderr
 
     if mapper == "map":
         _map(ROOT / "data_synthetic" / "ring8" / "database.db")  # compiles or loads the kernels

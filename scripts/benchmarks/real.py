@@ -363,7 +363,7 @@ def _timed_locate(model: Path, options: "LocateOptions") -> "tuple[LocateResult,
 
 def _positions_s(found: "LocateResult") -> float:
     """Return the seconds until the positions were known."""
-    later = ("structure", "bundle adjustment")
+    later = ("structure", "triangulation", "bundle adjustment")
     return sum(seconds for stage, seconds in found.timings_s.items() if stage not in later)
 
 

@@ -21,7 +21,7 @@ from benchmarks.glomap import copy_database, quiet
 from benchmarks.record import environment, table, write_section
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.adjustment import quiet_stderr
+from sfm_shapefit.colmap.quiet import quiet_stderr
 from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.synthetic import RigScene, SceneOptions, WorkspaceOptions, make_rig_drive

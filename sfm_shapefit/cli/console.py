@@ -101,8 +101,15 @@ def printable(text: str) -> str:
 
 
 @contextmanager
-def shown_progress(enabled: bool) -> "Iterator[Progress | None]":
-    """Show stages on stderr if it is a terminal. Written to a copy of it, which nobody silences."""
+def shown_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
+    """Show stages on stderr: as bars if it is a terminal, or, verbose, a line where each begins.
+
+    Bars are written to a copy of stderr, which nobody silences. They do not go with the messages that
+    pycolmap writes between them, so there are none if those are wanted.
+    """
+    if verbose:
+        yield _say_stage
+        return
     if not (enabled and sys.stderr.isatty()):
         yield None
         return
@@ -120,10 +127,18 @@ def shown_progress(enabled: bool) -> "Iterator[Progress | None]":
         def advance(stage: str, done: int, total: int) -> None:
             if stage not in tasks:
                 tasks[stage] = display.add_task(stage, total=total)
-            if total > 1 or display.tasks[tasks[stage]].total == 1:
+            shown = display.tasks[tasks[stage]]
+            if total > 1 or shown.total == 1:
                 display.update(tasks[stage], completed=done, total=total)
+            elif done == total:  # the stage is over, perhaps sooner than its limit
+                display.update(tasks[stage], total=shown.completed)
 
         yield advance
+
+
+def _say_stage(stage: str, done: int, total: int) -> None:
+    if (done, total) == (0, 1):
+        _say(stage)
 
 
 def print_table(title: str, rows: Rows) -> None:

@@ -6,6 +6,7 @@ import textwrap
 import tomllib
 from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
@@ -32,6 +33,10 @@ Database = Annotated[
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Verbose = Annotated[
+    bool,
+    typer.Option("--verbose", "-v", help="Let pycolmap's messages through, and list seconds per stage."),
+]
 Report = Annotated[
     bool, typer.Option("--report/--no-report", help="Write report.html: one page that works offline.")
 ]
@@ -78,6 +83,7 @@ def _flags(options_type: type) -> list[inspect.Parameter]:
     return parameters
 
 
+@cache
 def _field_documentation(options_type: type) -> dict[str, str]:
     """Return the sentence under each field of a dataclass and of those it inherits from."""
     found: dict[str, str] = {}

@@ -28,6 +28,13 @@ def objective_line(solve: "SolverResult") -> str:
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
 
 
+def time_line(timings_s: dict[str, float], detailed: bool = True) -> str:
+    """Say how long the command took, and, in detail, each stage."""
+    total = f"{sum(timings_s.values()):.1f} s"
+    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
+    return f"{total} ({stages})" if detailed else total
+
+
 def pictures_line(report: bool, scene: bool) -> str:
     """Name the pictures that were written, to follow the names of other files."""
     return ", report.html" * report + ", scene.glb, scene.ply" * scene

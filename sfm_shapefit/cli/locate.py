@@ -19,11 +19,12 @@ from sfm_shapefit.cli.flags import (
     Quiet,
     Report,
     Scene,
+    Verbose,
     one_path,
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line, time_line
 from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
@@ -53,6 +54,7 @@ def locate_command(
     scene: Scene = False,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     **given: Any,
 ) -> None:
     """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
@@ -65,23 +67,24 @@ def locate_command(
         names = Path(options.fix) if options.fix else None
         protect = [path for path in (source, database, priors, names, config) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.colmap.quiet import pycolmap_heard
             from sfm_shapefit.pipeline import locate
             from sfm_shapefit.report import dumps
             from sfm_shapefit.results import summary, write_result
 
             catch_termination()
-            with shown_progress(not quiet) as progress:
+            with shown_progress(not quiet, verbose) as progress, pycolmap_heard(verbose):
                 found = locate(source, database, options, progress, priors)
                 write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
     with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(summary(found)))  # noqa: T201
         elif not quiet:
-            table = _locate_table(found, target, pictures_line(report, scene))
+            table = _locate_table(found, target, pictures_line(report, scene), verbose=verbose)
             print_table(f"{len(found.model.names)} images of {source}", table)
 
 
-def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
+def _locate_table(found: "LocateResult", out: Path, pictures: str, *, verbose: bool) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
     from sfm_shapefit.results import summary
 
@@ -101,7 +104,7 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
         ("points", _points_line(facts)),
         *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
-        ("time", f"{sum(found.timings_s.values()):.1f} s"),
+        ("time", time_line(found.timings_s, verbose)),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
 

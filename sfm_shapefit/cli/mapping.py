@@ -16,10 +16,12 @@ from sfm_shapefit.cli.flags import (
     Quiet,
     Report,
     Scene,
+    Verbose,
     one_path,
     options_from,
     takes,
 )
+from sfm_shapefit.cli.lines import time_line
 from sfm_shapefit.mapping.options import MapOptions
 
 if TYPE_CHECKING:
@@ -42,6 +44,7 @@ def map_command(
     config: Config = None,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
     **given: Any,
 ) -> None:
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
@@ -53,12 +56,13 @@ def map_command(
         options = options_from(MapOptions, given, config)
         protect = [path for path in (source, config) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.colmap.quiet import pycolmap_heard
             from sfm_shapefit.mapping.results import map_summary, write_map_result
             from sfm_shapefit.mapping.run import map_database
             from sfm_shapefit.report import dumps
 
             catch_termination()
-            with shown_progress(not quiet) as progress:
+            with shown_progress(not quiet, verbose) as progress, pycolmap_heard(verbose):
                 found = map_database(source, options, progress)
                 write_map_result(
                     found, target, overwrite=overwrite, protect=protect, report=report, scene=scene
@@ -67,10 +71,10 @@ def map_command(
         if as_json:
             print(dumps(map_summary(found)))  # noqa: T201
         elif not quiet:
-            print_table(f"{found.num_images} images of {source}", _map_table(found, target))
+            print_table(f"{found.num_images} images of {source}", _map_table(found, target, verbose=verbose))
 
 
-def _map_table(found: "MapResult", out: Path) -> Rows:
+def _map_table(found: "MapResult", out: Path, *, verbose: bool) -> Rows:
     """Return what each model has, what was left out, and where it is."""
     rows: Rows = [("pairs", f"{found.num_pairs} with a relative rotation")]
     for number, model in enumerate(found.models):
@@ -87,6 +91,6 @@ def _map_table(found: "MapResult", out: Path) -> Rows:
         *rows,
         *([("in no model", shortened(left_out, "see map.json"))] if left_out else []),
         *[("warning", warning) for warning in found.warnings],
-        ("time", f"{sum(found.timings_s.values()):.1f} s"),
+        ("time", time_line(found.timings_s, verbose)),
         ("written to", f"{out}: models {', '.join(str(k) for k in range(len(found.models)))}, map.json"),
     ]

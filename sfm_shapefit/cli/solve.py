@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened
+from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
 from sfm_shapefit.cli.flags import (
     Json,
     OutArgument,
@@ -18,7 +18,7 @@ from sfm_shapefit.cli.flags import (
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line
+from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line, time_line
 from sfm_shapefit.robust.options import PlacementOptions
 
 if TYPE_CHECKING:
@@ -83,13 +83,15 @@ def solve_command(
             from sfm_shapefit.results import graph_summary, write_graph_result
 
             catch_termination()
-            found = solve_graph_file(
-                source,
-                options,
-                rotations=rotations,
-                max_rotation_error_deg=max_rotation_error,
-                reverse=reverse,
-            )
+            with shown_progress(not quiet) as progress:
+                found = solve_graph_file(
+                    source,
+                    options,
+                    rotations=rotations,
+                    max_rotation_error_deg=max_rotation_error,
+                    reverse=reverse,
+                    progress=progress,
+                )
             write_graph_result(
                 found,
                 target,
@@ -133,7 +135,7 @@ def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
         ("objective", objective_line(placement.solve)),
         ("locations", placement.finish.statement()),
         *[("warning", warning) for warning in quality_warnings(placement)],
-        ("time", _time_line(found.timings_s)),
+        ("time", time_line(found.timings_s)),
         ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
 
@@ -143,8 +145,3 @@ def _residuals_line(found: dict[str, float]) -> str:
     quantiles = [f"{found[f'quantile_{q}']:.3g}" for q in (25, 50, 75, 90)]
     beyond = [f"{found[f'share_beyond_{angle}']:.1%} beyond {angle}" for angle in (1, 2, 5, 10, 30, 90)]
     return f"25/50/75/90 % of the pairs within {' / '.join(quantiles)} deg\n{', '.join(beyond)} deg"
-
-
-def _time_line(timings_s: dict[str, float]) -> str:
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
-    return f"{sum(timings_s.values()):.1f} s ({stages})"

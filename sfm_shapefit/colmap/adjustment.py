@@ -20,16 +20,14 @@ One thread is the default because the sums of several are added in changing orde
 their last digits from run to run.
 """
 
-import os
-import sys
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
 from sfm_shapefit.colmap.structure import StructureOptions, TrackSource, filtered, triangulate
 from sfm_shapefit.errors import UnsolvableError
 
@@ -60,8 +58,6 @@ class AdjustmentOptions:
     """How many of the three rounds to run; the first alone makes a draft."""
     num_threads: int = 1
     """Threads of the solver. With 1 the result is bit-identical from run to run; with more only nearly."""
-    quiet: bool = True
-    """Keep the messages of pycolmap and Ceres off stderr; see `quiet_stderr`."""
 
     def __post_init__(self) -> None:
         if self.rounds > len(_ROUNDS):
@@ -143,40 +139,6 @@ def bundle_adjust(
     )
 
 
-@contextmanager
-def quiet_stderr(enabled: bool = True) -> Iterator[None]:
-    """Send file descriptor 2 to nowhere while the block runs.
-
-    pycolmap resets its log level in every bundle adjustment, and Ceres has no level of its own; only the
-    descriptor silences them. That holds for the whole process: messages of other threads are lost too, so a
-    progress display must write to a duplicate of descriptor 2. Errors still arrive as exceptions.
-
-    Args:
-        enabled: False does nothing, for debugging.
-    """
-    if not enabled:
-        yield
-        return
-    with_flush = sys.stderr is not None
-    if with_flush:
-        sys.stderr.flush()
-    try:
-        saved = os.dup(2)
-    except OSError:  # there is no stderr to keep quiet
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 2)
-        yield
-    finally:
-        if with_flush:
-            sys.stderr.flush()
-        os.dup2(saved, 2)
-        os.close(saved)
-        os.close(nowhere)
-
-
 def _solve(
     reconstruction: pycolmap.Reconstruction,
     loss_scale_px: float,
@@ -191,7 +153,7 @@ def _solve(
         config.set_constant_rig_from_world_pose(frame_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     settings = _settings(loss_scale_px, options)
-    with quiet_stderr(options.quiet):
+    with quiet_stderr():
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(settings, config, reconstruction)
         summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
     if not summary.is_solution_usable():
@@ -205,7 +167,7 @@ def _solve(
 def _settings(loss_scale_px: float, options: AdjustmentOptions) -> pycolmap.BundleAdjustmentOptions:
     """Return pycolmap's options for one round."""
     settings = pycolmap.BundleAdjustmentOptions()
-    settings.print_summary = False
+    settings.print_summary = is_heard()
     settings.refine_focal_length = options.refine_intrinsics
     settings.refine_extra_params = options.refine_intrinsics
     settings.refine_principal_point = False

@@ -9,11 +9,6 @@ global mapper does; cameras outside that component have no rotation.
 Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in GLOMAP.
 """
 
-import ctypes
-import os
-import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Literal
 
 import numpy as np
@@ -21,7 +16,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import quiet_stderr
+from sfm_shapefit.colmap.quiet import quiet_output
 from sfm_shapefit.errors import InputError, UnsolvableError
 
 Loss = Literal["geman-mcclure", "half-norm"]
@@ -79,7 +74,7 @@ def average_rotations(
     options.weight_type = _LOSSES[loss]
     if weights is not None and count_matches:
         options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
-    with quiet_stderr(), _quiet_stdout():
+    with quiet_output():
         for again in (False, True):
             options.filter_unregistered = again
             if not pycolmap.run_rotation_averaging(options, graph, model, []):
@@ -120,29 +115,3 @@ def _unposed_model(num_images: int) -> pycolmap.Reconstruction:
         image = pycolmap.Image(name=str(image_id), camera_id=_CAMERA_ID, image_id=image_id)
         model.add_image_with_trivial_frame(image)
     return model
-
-
-@contextmanager
-def _quiet_stdout() -> Iterator[None]:
-    """Send file descriptor 1 to nowhere: CHOLMOD prints its warnings there, into the C library's buffer."""
-    flush = getattr(ctypes.CDLL(None), "fflush", None) if os.name == "posix" else None
-    if flush is None:
-        yield
-        return
-    if sys.stdout is not None:
-        sys.stdout.flush()
-    flush(None)
-    try:
-        saved = os.dup(1)
-    except OSError:  # there is no stdout
-        yield
-        return
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    try:
-        os.dup2(nowhere, 1)
-        yield
-    finally:
-        flush(None)
-        os.dup2(saved, 1)
-        os.close(saved)
-        os.close(nowhere)

@@ -12,7 +12,6 @@ Source of the conventions: https://colmap.github.io/format.html and `colmap/scen
 """
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -26,6 +25,7 @@ from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.colmap.check import check_model_files, model_suffix
 from sfm_shapefit.colmap.foreign import reconstruction_of
 from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
@@ -37,7 +37,6 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
 _LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
-_QUIET = 3  # glog's FATAL
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalised coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
@@ -109,7 +108,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         label, reconstruction = str(folder), _load(folder)
         is_checked = model_suffix(folder) == ".bin"
     try:
-        with quiet_pycolmap():
+        with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
             return _posed_model(label, reconstruction)
     except PYCOLMAP_ERRORS as error:
@@ -185,17 +184,6 @@ def track_matches(
             yield batch
 
 
-@contextmanager
-def quiet_pycolmap() -> Iterator[None]:
-    """Keep pycolmap's log of a reading call off stderr; its errors arrive as exceptions."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = _QUIET
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
-
-
 # --- reading ---------------------------------------------------------------------------------------
 
 
@@ -203,7 +191,7 @@ def _load(folder: Path) -> pycolmap.Reconstruction:
     """Check the files of a model and only then let pycolmap read them."""
     check_model_files(folder)
     try:
-        with quiet_pycolmap():
+        with quiet_log():
             return pycolmap.Reconstruction(folder)
     except PYCOLMAP_ERRORS as error:
         raise InputError(

@@ -22,7 +22,8 @@ from scipy.sparse.csgraph import connected_components
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.matches import MatchBatch
-from sfm_shapefit.colmap.model import quiet_pycolmap, read_model
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.colmap.workspace import compact_database, image_name, rigid, write_model
 from sfm_shapefit.output import atomic_folder
 from sfm_shapefit.synthetic.options import WorkspaceOptions
@@ -154,7 +155,7 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
     verification.min_num_inliers = scene.options.min_matches
     verification.compute_relative_pose = relative_poses
     verification.ransac.random_seed = scene.options.seed
-    with quiet_pycolmap():
+    with quiet_log():
         pycolmap.extract_features(
             database,
             workspace / "images",

@@ -16,6 +16,7 @@ lengths are known, that is the mark of a false pair. Pairs within 5 degrees of t
     lego100       650 of 1312, 0.63    606 of 755, 0.33
 """
 
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,10 +26,10 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import quiet_stderr
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.colmap.quiet import quiet_stderr
 
 RelativeSource = Literal["matches", "stored"]
 
@@ -60,7 +61,12 @@ class RelativeRotations:
 
 
 def relative_rotations(
-    path: Path, model: PosedModel, min_matches: int, source: RelativeSource = "matches", threads: int = 1
+    path: Path,
+    model: PosedModel,
+    min_matches: int,
+    source: RelativeSource = "matches",
+    threads: int = 1,
+    advance: Callable[[int, int], None] | None = None,
 ) -> RelativeRotations:
     """Return the relative rotation of every pair with enough matches that has one.
 
@@ -70,6 +76,7 @@ def relative_rotations(
         min_matches: pairs with fewer inlier matches are left out.
         source: estimated from the matches, or as stored; then pairs without a stored pose are left out.
         threads: of the estimates; the answer does not depend on it.
+        advance: called with the pairs that are done and their number.
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.
@@ -85,14 +92,15 @@ def relative_rotations(
                 sound=np.ones(int(enough.sum()), dtype=np.bool_),
             )
         with ThreadPoolExecutor(threads) as pool, quiet_stderr():
-            rows = [
-                row
-                for batch in database.iter_matches(min_matches)
-                for row in pool.map(
-                    _Estimate(model, _pixels(database, batch), batch), range(len(batch.pairs))
-                )
-                if row is not None and row[2] >= min_matches
-            ]
+            rows, before = [], 0
+            for batch in database.iter_matches(min_matches):
+                estimate = _Estimate(model, _pixels(database, batch), batch)
+                for k, row in enumerate(pool.map(estimate, range(len(batch.pairs)))):
+                    if advance is not None:
+                        advance(before + k + 1, database.num_pairs)
+                    if row is not None and row[2] >= min_matches:
+                        rows.append(row)
+                before += len(batch.pairs)
     return RelativeRotations(
         pairs=np.array([row[0] for row in rows], dtype=np.int64).reshape(-1, 2),
         rotations=np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3, 3),

@@ -17,7 +17,7 @@ primitives are pycolmap's.
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,6 +32,10 @@ from sfm_shapefit.errors import InputError
 TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
 
+Advance = Callable[[int, int], None]
+"""Called with the work done so far and the work in all."""
+
+_TRACKS_A_REPORT = 1000
 _RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
 _IMAGES_OF_A_CHECKED_TRACK = 3
 _CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
@@ -100,7 +104,10 @@ def correspondence_graph(
 
 
 def triangulate(
-    seed: pycolmap.Reconstruction, tracks: TrackSource, options: StructureOptions | None = None
+    seed: pycolmap.Reconstruction,
+    tracks: TrackSource,
+    options: StructureOptions | None = None,
+    advance: Advance | None = None,
 ) -> pycolmap.Reconstruction:
     """Return a copy of `seed` whose 3D points are triangulated at its poses; old points are dropped.
 
@@ -108,6 +115,7 @@ def triangulate(
         seed: the placed images. For tracks of another model, its points2D must be that model's.
         tracks: a graph from `correspondence_graph`, or the reconstruction whose own tracks serve.
         options: filters; the defaults if None.
+        advance: called with the images, or tracks, that are done and their number.
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
@@ -119,9 +127,9 @@ def triangulate(
     options = options or StructureOptions()
     structure = without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
-        _triangulate_matches(structure, tracks, options)
+        _triangulate_matches(structure, tracks, options, advance or _unheard)
     else:
-        _triangulate_tracks(structure, tracks, options)
+        _triangulate_tracks(structure, tracks, options, advance or _unheard)
     _filter(structure, options)
     return structure
 
@@ -182,8 +190,15 @@ def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> No
     manager.filter_points3D_with_short_tracks(options.min_track_length)
 
 
+def _unheard(_done: int, _total: int) -> None:
+    """Report to nobody."""
+
+
 def _triangulate_matches(
-    structure: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph, options: StructureOptions
+    structure: pycolmap.Reconstruction,
+    graph: pycolmap.CorrespondenceGraph,
+    options: StructureOptions,
+    advance: Advance,
 ) -> None:
     """Add to our own `structure` the points of all matches, tracks completed and merged."""
     error_px = options.max_reprojection_error_px
@@ -196,15 +211,20 @@ def _triangulate_matches(
     settings.merge_max_reproj_error = error_px
     manager = pycolmap.ObservationManager(structure, graph)
     triangulator = pycolmap.IncrementalTriangulator(graph, structure, manager)
-    for image_id in sorted(structure.reg_image_ids()):
+    registered = sorted(structure.reg_image_ids())
+    for done, image_id in enumerate(registered, start=1):
         triangulator.triangulate_image(settings, image_id)
+        advance(done, len(registered))
     triangulator.complete_all_tracks(settings)
     triangulator.merge_all_tracks(settings)
     triangulator.retriangulate(settings)
 
 
 def _triangulate_tracks(
-    structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, options: StructureOptions
+    structure: pycolmap.Reconstruction,
+    source: pycolmap.Reconstruction,
+    options: StructureOptions,
+    advance: Advance,
 ) -> None:
     """Add to our own `structure` the points of another model, each triangulated from its own track."""
     settings = pycolmap.EstimateTriangulationOptions()
@@ -216,7 +236,10 @@ def _triangulate_tracks(
     poses = [structure.image(i).cam_from_world() for i in registered]
     cameras = [structure.camera(structure.image(i).camera_id) for i in registered]
     observations = _Observations.of(structure, source, registered)
-    for first, last in zip(*observations.tracks_of(options.min_track_length), strict=True):
+    firsts, lasts = observations.tracks_of(options.min_track_length)
+    for done, (first, last) in enumerate(zip(firsts, lasts, strict=True), start=1):
+        if done % _TRACKS_A_REPORT == 0:
+            advance(done, len(firsts))
         images = observations.images[first:last].tolist()
         found = pycolmap.estimate_triangulation(
             observations.xy[first:last], [poses[i] for i in images], [cameras[i] for i in images], settings

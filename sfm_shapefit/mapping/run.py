@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -50,6 +51,10 @@ def map_database(
         options: settings; defaults if None.
         progress: called as stages advance.
 
+    Returns:
+        `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
+        how they were chosen; `left_out`, the reason for each image in no model; `warnings`.
+
     Raises:
         InputError: if the database cannot be used; the message says what to do.
         UnsolvableError: if no component of three images or more can be placed.
@@ -60,7 +65,14 @@ def map_database(
         images = read_images(path)
         unposed = read_model(images.reconstruction)
     with run.timed("relative rotations"):
-        relative = relative_rotations(path, unposed, LEAST_MATCHES, options.relative, options.num_threads())
+        relative = relative_rotations(
+            path,
+            unposed,
+            LEAST_MATCHES,
+            options.relative,
+            options.num_threads(),
+            partial(run.progress, "relative rotations"),
+        )
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.components(unposed.num_images, relative, reasons):
         try:

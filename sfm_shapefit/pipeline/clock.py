@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 
+from sfm_shapefit.solver.options import IterationInfo
+
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the work done so far and the work in all."""
 
@@ -34,3 +36,7 @@ class Clock:
     def advance(self, done: int, total: int) -> None:
         """Report progress inside the current stage."""
         self.progress(self.stage, done, total)
+
+    def iteration(self, info: IterationInfo) -> None:
+        """Report an iteration of the solver: of at most so many, for fewer may do."""
+        self.progress(self.stage, info.iteration, max(info.limit, info.iteration))

@@ -22,6 +22,10 @@ def evaluate(
         reconstruction, reference: reconstructions or model folders; cameras are matched by name.
         thresholds: position errors, in the reference's units, at which recall is wanted too.
 
+    Returns:
+        `position` and `rotation_deg`, each with median, mean, rms and max, in the reference's units and in
+        degrees; `recalls`, `rows()` per camera, names of `missing` ones, and warnings.
+
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """

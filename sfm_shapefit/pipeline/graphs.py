@@ -18,7 +18,7 @@ from sfm_shapefit.formats import (
     read_relative_poses,
     read_rotations,
 )
-from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.placement import place, place_further
 from sfm_shapefit.results import GraphResult
 from sfm_shapefit.robust.options import PlacementOptions
@@ -45,6 +45,7 @@ def solve_graph_file(
     rotations: Path | str | None = None,
     max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
     reverse: bool = False,
+    progress: Progress | None = None,
 ) -> GraphResult:
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
 
@@ -56,13 +57,14 @@ def solve_graph_file(
         max_rotation_error_deg: pairs of a 1DSfM source whose relative rotation contradicts those of the
             cameras by more are left out, as `locate` leaves out such relative poses.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
+        progress: called as stages advance.
 
     Raises:
         InputError: if a file is malformed; the message names the line.
         UnsolvableError: if the directions determine nothing.
     """
     options = options or PlacementOptions()
-    clock = Clock()
+    clock = Clock(progress) if progress else Clock()
     found, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
@@ -81,7 +83,7 @@ def solve_graph_file(
         if reverse:
             graph = ViewGraph(graph.num_cameras, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
-        placement = place(graph, options)
+        placement = place(graph, options, on_iteration=clock.iteration)
     with clock("further pieces"):
         further = tuple(place_further(placement, options))
     return GraphResult(

@@ -36,6 +36,10 @@ def inspect(
         theory: also compute the constants of the recovery theorems at the model's centres.
         progress: called as stages advance.
 
+    Returns:
+        Where directions come from and what becomes of the pairs; `diagnosis` with components, rigid pieces,
+        hinges, weak cameras, the share of wrong pairs and the plan of the solve. `as_dict()` has all of it.
+
     Raises:
         InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
             is diagnosed; `diagnosis.obstacle` says why.

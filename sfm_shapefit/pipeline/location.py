@@ -41,19 +41,54 @@ def locate(
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
+        rotations = pycolmap.Reconstruction("sparse/0")
+        found = sfm_shapefit.locate(rotations, "database.db")
+        pycolmap.bundle_adjustment(found.reconstruction)        # a new model; the input is untouched
+        sfm_shapefit.write_result(found, "out")                 # the model, tables, and report.html
+
     Args:
-        reconstruction: a pycolmap.Reconstruction or a model folder; neither is changed, and its camera
-            centres never place a camera.
+        reconstruction: a pycolmap.Reconstruction or a model folder, or a model file of Bundler, openMVG or
+            OpenSfM; nothing of it is changed, and its camera centres never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings; defaults if None.
-        progress: called as stages advance.
+        progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
+
+    Returns:
+        `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
+        `cameras` and `pairs`, a row each with trust, standard deviation, residual and verdict; `solve`, the
+        optimum with its certificate; `warnings`, a sentence each; `gauge`, `further` pieces, `timings_s`.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
         UnsolvableError: if no pair has a usable direction, or the directions determine nothing.
+
+    The options, fields of `LocateOptions`; each is a flag of `sfm-shapefit locate` too:
+
+        option                          default     what it decides
+        directions                      'auto'      from matches, relative-poses (stored), or tracks
+        solver                          'auto'      newton, admm or conic; by size and predicted fill
+        objective                       'auto'      shapefit and lud refined, the better kept; or one of
+                                                    shapefit, lud, least-squares, linf
+        filter                          'none'      1dsfm or triangles: pairs dropped before the solve
+        refine                          True        refine the start robustly in angles
+        points                          'auto'      3D points as extra nodes: never, always
+        tol                             1e-08       certified gap at which the solve has converged
+        scale                           'auto'      input, unit, prior, distance or rig
+        known_distance                  None        (name, name, distance) in the output's units
+        fix                             ''          file of names that stay where they are, or 'solved'
+        refine_with_priors              False       position priors pull the cameras, robustly
+        min_inliers                     15          inlier matches that a pair needs
+        min_inlier_ratio                0.5         share of its matches that must agree with the rotations
+        inlier_threshold_px             2.0         largest Sampson error of an inlier
+        refine_rotations                False       for rotations from averaging, not from adjustment
+        max_reprojection_error_px       4.0         filter of observations of points
+        min_triangulation_angle_deg     1.5         filter of points
+        bundle_adjust                   False       adjust poses and points; intrinsics stay
+        min_trust                       0.6         cameras of less trust are left out; 0 keeps all
+        threads                         0           one per core; the answer does not depend on it
 
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
@@ -74,7 +109,7 @@ def locate(
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = placed(joint, rigid, evidence, options)
+            placement = placed(joint, rigid, evidence, options, clock)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rigid_gauge(
                 model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)

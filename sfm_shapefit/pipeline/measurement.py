@@ -48,7 +48,7 @@ def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock
             options.for_directions(),
         )
     parts: list[PairDirections] = []
-    for batch in source.batches():
+    for batch in source.counted(source.batches(), clock.advance):
         focal_lengths = model.focal_lengths_px[batch.pairs].min(axis=1)
         parts.append(
             estimate_directions(
@@ -61,7 +61,6 @@ def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock
                 threads=options.num_threads(),
             )
         )
-        clock.advance(sum(len(part.pairs) for part in parts), source.total)
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"

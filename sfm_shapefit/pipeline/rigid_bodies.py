@@ -18,6 +18,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.solver.bodies import largest_tied
@@ -98,14 +99,17 @@ def rigs_statement(model: PosedModel, joint: JointGraph) -> str:
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
-def placed(joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions) -> Placement:
+def placed(
+    joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions, clock: Clock
+) -> Placement:
     """Place the view graph, over bodies where there are any.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with bodies only if they are wanted always, or if cameras hang loose without them.
     """
     if rigid.bodies is None:
-        return place(joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras)
+        settings, k = options.for_placement(), joint.num_cameras
+        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration)
     first = None
     if options.points != "always":
         try:

@@ -49,8 +49,9 @@ def seeded_model(
     located = kept, gauge.similarity.apply(placement.locations[kept])
     with clock("structure"):
         seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
-        if not options.bundle_adjust:  # which triangulates at the seed's poses itself
-            seeded = triangulate(seed, tracks, options.for_structure())
+    if not options.bundle_adjust:  # which triangulates at the seed's poses itself
+        with clock("triangulation"):
+            seeded = triangulate(seed, tracks, options.for_structure(), clock.advance)
     if options.bundle_adjust:
         with clock("bundle adjustment"):
             still = () if fixed is None else source.model.frame_ids[fixed].tolist()
@@ -105,7 +106,7 @@ def _seed_and_tracks(
     seed = build_seed(model, placed, all_centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
-    batches = _counted(_without_pairs(source.batches(among), placement.rejected_pairs), source.total, advance)
+    batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
     return seed, correspondence_graph(seed, model.image_ids, batches)
 
 
@@ -125,14 +126,3 @@ def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterato
             rays_i=batch.rays_i[kept],
             rays_j=batch.rays_j[kept],
         )
-
-
-def _counted(
-    batches: Iterator[MatchBatch], total: int, advance: Callable[[int, int], None]
-) -> Iterator[MatchBatch]:
-    """Report progress while batches are consumed."""
-    done = 0
-    for batch in batches:
-        yield batch
-        done += len(batch.pairs)
-        advance(done, total)

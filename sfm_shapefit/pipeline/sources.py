@@ -1,6 +1,6 @@
 """Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,10 +34,18 @@ class MatchSource:
             return track_matches(self.model, 1)
         return self.database.iter_matches(1, among=among)
 
-    @property
-    def total(self) -> int:
-        """The work in all, for a progress bar: pairs of a database, or images."""
-        return self.model.num_images if self.database is None else self.database.num_pairs
+    def counted(
+        self, batches: Iterator[MatchBatch], advance: Callable[[int, int], None]
+    ) -> Iterator[MatchBatch]:
+        """Report progress while batches are consumed: pairs of a database, or images of a model."""
+        total = self.model.num_images if self.database is None else self.database.num_pairs
+        done = 0
+        for batch in batches:
+            yield batch
+            if len(batch.pairs):
+                done = int(batch.pairs[-1, 0]) + 1 if self.database is None else done + len(batch.pairs)
+            advance(min(done, total), total)
+        advance(total, total)
 
 
 @contextmanager

@@ -6,9 +6,10 @@ Pure data, no numerics, so that the command line, the tests and the benchmark ca
 import enum
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-from sfm_shapefit.arrays import FloatArray
+if TYPE_CHECKING:  # numpy is not cheap
+    from sfm_shapefit.arrays import FloatArray
 
 Method = Literal["auto", "newton", "admm", "conic"]
 
@@ -35,6 +36,8 @@ class IterationInfo:
     """Objective at the iterate, in the scale of `SolverResult.objective`."""
     dual_bound: float | None
     """A rigorous lower bound if the method has one at every iterate, else None."""
+    limit: int = 0
+    """Iterations after which the solver stops at the latest; 0 where that is not known."""
 
 
 OnIteration = Callable[[IterationInfo], bool | None]
@@ -73,14 +76,14 @@ class SolverOptions:
 class SolverResult:
     """A solve's answer together with the evidence that it is one."""
 
-    locations: FloatArray
+    locations: "FloatArray"
     """(n, d) camera centres with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
     status: Status
     objective: float
     """R(T) / L(T) of the paper at `locations`: a length-weighted mean tangent of the angular errors."""
     dual_bound: float
     """Value of the feasible dual point `dual`: no locations have an objective below it."""
-    dual: FloatArray
+    dual: "FloatArray"
     """(m, d) y_e, orthogonal to v_e, ||y_e|| <= w_e; at every camera the sum of signed y_e equals
     dual_bound times the sum of signed w_e v_e."""
     equality_residual: float

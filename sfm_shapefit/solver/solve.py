@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -37,14 +38,6 @@ _DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination save
 _LARGEST_NEWTON_FLOPS = 4e9  # of one block factorisation: from here on splitting is faster to the same gap
 
 
-class Choice(NamedTuple):
-    """A method and the reason for it."""
-
-    method: str
-    run: Callable[..., "Run"]
-    reason: str
-
-
 class Run(NamedTuple):
     """What a solver returns; the certificate decides what it is worth."""
 
@@ -55,11 +48,23 @@ class Run(NamedTuple):
     """How it ended, where that is not plain from the certificate."""
 
 
+class Choice(NamedTuple):
+    """A method and the reason for it."""
+
+    method: str
+    run: Callable[..., Run]
+    reason: str
+
+
 @one_blas_thread()  # more would split, and round, the sums of long vectors differently
 def solve(
     graph: ViewGraph, options: SolverOptions | None = None, on_iteration: OnIteration | None = None
 ) -> SolverResult:
     """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
+
+        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
+        result = solve(graph)
+        result.locations, result.gap, result.unique
 
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
@@ -80,8 +85,8 @@ def solve(
     start = time.perf_counter()
     _refuse_undetermined(graph)
     choice = choose_method(graph, options)
-    watch = _Watch(on_iteration)
     limit = options.max_iterations or _LIMITS[choice.method]
+    watch = _Watch(on_iteration, limit)
     run = choice.run(graph, options, limit, watch if on_iteration else None)
     if not (np.isfinite(run.locations).all() and projected_length(graph, run.locations) > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
@@ -172,15 +177,16 @@ def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnI
 
 
 class _Watch:
-    """Passes iterations on to the user's callback, and remembers whether it cancelled."""
+    """Passes iterations on to the user's callback, with their limit, and remembers whether it cancelled."""
 
-    def __init__(self, on_iteration: OnIteration | None) -> None:
+    def __init__(self, on_iteration: OnIteration | None, limit: int) -> None:
         self._on_iteration = on_iteration
+        self._limit = limit
         self.cancelled = False
 
     def __call__(self, info: IterationInfo) -> bool:
         if self._on_iteration is not None:
-            answer = self._on_iteration(info)
+            answer = self._on_iteration(replace(info, limit=self._limit))
             self.cancelled = answer is not None and not answer
         return not self.cancelled
 

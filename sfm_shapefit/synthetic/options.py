@@ -3,12 +3,12 @@
 Pure data, and cheap to import: the command line makes its flags of them.
 """
 
+import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
-import numpy as np
-
-from sfm_shapefit.arrays import FloatArray
+if TYPE_CHECKING:  # numpy is not cheap
+    from sfm_shapefit.arrays import FloatArray
 
 Shape = Literal["ring", "facade", "drive", "cloud", "courtyard"]
 ModelContent = Literal["full", "rotations"]
@@ -56,17 +56,19 @@ class SceneOptions:
             if getattr(self, name) < least:
                 raise ValueError(f"SceneOptions.{name} must be >= {least}, got {getattr(self, name)}")
         for name in ("pixel_noise_px", "rotation_noise_deg"):
-            if not 0.0 <= getattr(self, name) < np.inf:
+            if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"SceneOptions.{name} must be finite and >= 0, got {getattr(self, name)}")
         for name in ("wrong_match_fraction", "corrupted_pair_fraction"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"SceneOptions.{name} must lie in [0, 1], got {getattr(self, name)}")
-        if not 0.0 < self.focal_length_px < np.inf:
+        if not 0.0 < self.focal_length_px < math.inf:
             raise ValueError(f"SceneOptions.focal_length_px must be positive, got {self.focal_length_px}")
 
     @property
-    def calibration(self) -> FloatArray:
+    def calibration(self) -> "FloatArray":
         """The (3, 3) calibration matrix K of every image."""
+        import numpy as np
+
         f, x, y = self.focal_length_px, self.image_width / 2.0, self.image_height / 2.0
         return np.array([[f, 0.0, x], [0.0, f, y], [0.0, 0.0, 1.0]])
 

@@ -1,0 +1,109 @@
+"""Where pycolmap's own messages go: nowhere, unless the caller wants to hear them.
+
+pycolmap logs through glog, resets its level in every bundle adjustment, and links Ceres and CHOLMOD, which
+have no level at all. So three things are silenced, each only as long as a call that needs it:
+
+    quiet_log       glog's level                     calls that read
+    quiet_stderr    file descriptor 2                bundle adjustment, estimation
+    quiet_output    file descriptors 1 and 2         rotation averaging: CHOLMOD writes to stdout
+
+The one switch for all is `pycolmap_heard`; it holds for the code that runs inside it, and not for other
+threads. Errors arrive as exceptions either way.
+"""
+
+import ctypes
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+
+import pycolmap
+
+_QUIET = 3  # glog's FATAL
+_heard = ContextVar("pycolmap_heard", default=False)
+
+
+@contextmanager
+def pycolmap_heard(enabled: bool = True) -> Iterator[None]:
+    """Let pycolmap's messages through while the block runs, or, with False, silence them as by default."""
+    token = _heard.set(enabled)
+    try:
+        yield
+    finally:
+        _heard.reset(token)
+
+
+def is_heard() -> bool:
+    """Return whether pycolmap's messages are let through."""
+    return _heard.get()
+
+
+@contextmanager
+def quiet_log() -> Iterator[None]:
+    """Keep pycolmap's log off stderr while the block runs."""
+    if _heard.get():
+        yield
+        return
+    level = pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = _QUIET
+    try:
+        yield
+    finally:
+        pycolmap.logging.minloglevel = level
+
+
+@contextmanager
+def quiet_stderr() -> Iterator[None]:
+    """Send file descriptor 2 to nowhere while the block runs.
+
+    That holds for the whole process: messages of other threads are lost too, so a progress display must write
+    to a duplicate of descriptor 2.
+    """
+    if _heard.get():
+        yield
+        return
+    if sys.stderr is not None:
+        sys.stderr.flush()
+    with _to_nowhere(2):
+        try:
+            yield
+        finally:
+            if sys.stderr is not None:
+                sys.stderr.flush()
+
+
+@contextmanager
+def quiet_output() -> Iterator[None]:
+    """Send file descriptors 1 and 2 to nowhere; the C library's buffer of stdout is emptied around it."""
+    flush = getattr(ctypes.CDLL(None), "fflush", None) if os.name == "posix" else None
+    with quiet_stderr():
+        if flush is None or _heard.get():
+            yield
+            return
+        if sys.stdout is not None:
+            sys.stdout.flush()
+        flush(None)
+        with _to_nowhere(1):
+            try:
+                yield
+            finally:
+                flush(None)
+
+
+@contextmanager
+def _to_nowhere(descriptor: int) -> Iterator[None]:
+    """Point a file descriptor to nowhere; one that does not exist stays so."""
+    try:
+        saved = os.dup(descriptor)
+    except OSError:
+        yield
+        return
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, descriptor)
+        yield
+    finally:
+        os.dup2(saved, descriptor)
+        os.close(saved)
+        os.close(nowhere)

@@ -1,0 +1,191 @@
+"""The examples run as a reader would run them, and what is shipped is complete."""
+
+import dataclasses
+import inspect
+import itertools
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.colmap.photographs import write_rendered_workspace
+from sfm_shapefit.synthetic import make_rendered_scene
+from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
+from tests.scenes import ROOT
+
+FOCAL_LENGTH_PX = 350.0
+
+
+def run_example(name: str, *arguments) -> str:
+    """Run an example as a program, in a process of its own; return what it prints."""
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory) -> Path:
+    """Eight photographs of a row of houses, what COLMAP finds in them, and the true model."""
+    options = SceneOptions(
+        shape="facade",
+        num_images=8,
+        image_width=400,
+        image_height=300,
+        focal_length_px=FOCAL_LENGTH_PX,
+        max_keypoints_per_image=600,
+    )
+    folder = tmp_path_factory.mktemp("drawn") / "workspace"
+    write_rendered_workspace(make_rendered_scene(options), folder, WorkspaceOptions(relative_poses=True))
+    return folder
+
+
+def assert_near_truth(model: Path | pycolmap.Reconstruction, workspace: Path) -> None:
+    """Cameras stand 10 m before the houses, where a pixel is 29 mm: a pixel for the median camera. The lens'
+    distortion is not told to the examples, so it is bundle adjustment that finds it."""
+    errors = sfm_shapefit.evaluate(model, workspace / "sparse/0")
+    assert len(errors.names) == 8
+    assert errors.position.median < 0.029
+    assert errors.rotation_deg.median < 0.2
+
+
+@pytest.mark.slow
+def test_the_pycolmap_pipeline_places_the_cameras_of_drawn_images(drawn, tmp_path):
+    said = run_example("pycolmap_pipeline.py", drawn / "images", tmp_path / "out", FOCAL_LENGTH_PX)
+    assert re.search(r"^8 cameras, \d{3,} points", said, flags=re.MULTILINE)
+    assert_near_truth(tmp_path / "out/sparse/0", drawn)
+    assert (tmp_path / "out/located/report.html").stat().st_size > 0
+
+
+@pytest.mark.slow
+def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
+    h5py = pytest.importorskip("h5py")
+    with (
+        pycolmap.Database.open(drawn / "database.db") as database,
+        h5py.File(tmp_path / "features.h5", "w") as features,
+        h5py.File(tmp_path / "matches.h5", "w") as matches,
+    ):
+        names = {image.image_id: image.name for image in database.read_all_images()}
+        counts = {}
+        for image_id, name in names.items():
+            keypoints = database.read_keypoints(image_id)[:, :2] - 0.5  # hloc's first pixel is at 0
+            features[f"{name}/keypoints"] = keypoints.astype(np.float32)
+            counts[image_id] = len(keypoints)
+        lines = []
+        for i, j in itertools.combinations(names, 2):
+            if not database.exists_matches(i, j):
+                continue
+            pairs = database.read_matches(i, j)
+            # hloc keeps every second pair here in the order that the list does not have.
+            first, second, pairs = (j, i, pairs[:, ::-1]) if (i + j) % 2 else (i, j, pairs)
+            found = np.full(counts[first], -1)
+            found[pairs[:, 0]] = pairs[:, 1]
+            matches[f"{names[first]}/{names[second]}/matches0"] = found.astype(np.int16)
+            lines.append(f"{names[i]} {names[j]}\n")
+    (tmp_path / "pairs.txt").write_text("".join(lines))
+    paths = [tmp_path / name for name in ("pairs.txt", "features.h5", "matches.h5", "out")]
+    said = run_example("hloc_outputs.py", drawn / "images", *paths, FOCAL_LENGTH_PX)
+    assert "8 of 8 cameras" in said
+    keypoints = []
+    for path in (drawn, tmp_path / "out"):
+        with pycolmap.Database.open(path / "database.db") as database:
+            image_id = database.read_image_with_name("0001.jpg").image_id
+            keypoints.append(database.read_keypoints(image_id)[:, :2])
+    np.testing.assert_allclose(*keypoints, atol=1e-3)
+    assert_near_truth(tmp_path / "out/sparse/0", drawn)
+
+
+# --- what is shipped -------------------------------------------------------------------------------------
+
+
+def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    package = ROOT / "sfm_shapefit"
+    sources = {
+        str(path.relative_to(ROOT))
+        for path in package.rglob("*")
+        if path.is_file() and path.suffix not in {".pyc", ".nbi", ".nbc"}
+    }
+    assert "sfm_shapefit/py.typed" in names
+    assert "sfm_shapefit/schemas/output.schema.json" in names
+    assert sources <= names
+    assert all(name.startswith(("sfm_shapefit/", "sfm_shapefit-")) for name in names)
+
+
+@pytest.mark.parametrize("name", sfm_shapefit.__all__)
+def test_every_public_name_says_what_it_is_and_what_it_takes(name):
+    public = getattr(sfm_shapefit, name)
+    text = inspect.getdoc(public)
+    assert text
+    assert not text.startswith(f"{name}(")  # what a dataclass says that has no words of its own
+    if inspect.isfunction(public):
+        for argument in inspect.signature(public).parameters:
+            assert re.search(rf"^ {{4}}(\w+, )*{argument}(, \w+)*: ", text, flags=re.MULTILINE), argument
+
+
+def test_help_of_locate_lists_every_option_with_its_default():
+    text = inspect.getdoc(sfm_shapefit.locate)
+    listed = dict(re.findall(r"^ {4}([a-z_]+) {2,}('[^']*'|\S+) {2,}\S", text, flags=re.MULTILINE))
+    del listed["option"]  # the head of the table
+    assert listed == {
+        item.name: repr(item.default) for item in dataclasses.fields(sfm_shapefit.LocateOptions)
+    }
+
+
+def user_seconds(code: str) -> float:
+    """Return the processor time of a fresh Python that runs some code: least of three, for others run too."""
+    times = []
+    for _ in range(3):
+        end = "import resource as r; print(r.getrusage(r.RUSAGE_SELF).ru_utime)"
+        done = subprocess.run(
+            [sys.executable, "-c", f"{code}\n{end}"], cwd=ROOT, capture_output=True, text=True, check=True
+        )
+        times.append(float(done.stdout.split()[-1]))
+    return min(times)
+
+
+def test_the_package_is_imported_in_less_than_four_tenths_of_a_second():
+    assert user_seconds("import sfm_shapefit") < 0.4
+
+
+def test_the_help_of_the_command_takes_less_than_three_tenths_of_a_second():
+    code = "from sfm_shapefit.cli import app\napp(['--help'], standalone_mode=False)"
+    assert user_seconds(code) < 0.3
+
+
+@pytest.mark.slow
+def test_the_api_reference_builds_without_a_warning(tmp_path):
+    pytest.importorskip("pdoc")
+    done = subprocess.run(
+        [sys.executable, "-W", "error", "scripts/api_reference.py", str(tmp_path)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")
+    assert all(f'id="{name}"' in page for name in sfm_shapefit.__all__)
