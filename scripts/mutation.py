@@ -1,15 +1,15 @@
 """Mutation testing of the solver and the rigidity test: do the tests notice when the code is wrong?
 
-    python scripts/mutation.py --state FOLDER [--groups newton admm] [--per-group 30] [--seed 1] [--again]
+    python scripts/mutation.py --state FOLDER --group newton [--per-group 30] [--seed 1] [--again]
 
 The mutants are those of cosmic-ray (`pip install cosmic-ray`; arithmetic, comparisons, `and` and `or`, `not`,
 True and False, numbers, break and continue, exceptions, loops that do not run), and of one operator more that
 deletes a statement or what a function returns. Of each group of modules a random sample of places is drawn,
 and of each place one mutant. Types, docstrings, imports and decorators are left alone.
 
-A fresh compilation of the kernels for each mutant would take days. So the kernels of the solver and of the
-rigidity test run as plain Python, under the tests that are quick enough for it; those of the linear algebra
-below stay compiled. The tests are collected once. For each mutant a fork of the process puts the changed
+A fresh compilation of the kernels for each mutant would take days. So the kernels of the group run as plain
+Python, under those of the group's tests that are quick enough for it; all others stay compiled. The tests
+are collected once. For each mutant a fork of the process puts the changed
 code in place of the old one and runs the tests that reach the changed function, the shortest first, until one
 fails. A mutant that takes far more processor time than the tests did counts as found.
 
@@ -60,13 +60,18 @@ GROUPS = {
     "angular": ["solver/angular.py"],
     "bodies": [f"solver/bodies/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")],
 }
-TESTS = [
-    f"tests/test_{name}.py"
-    for name in ("rigidity", "certificate", "exact_certificate", "newton", "admm", "solver", "angular", "bodies")
-]
-INTERPRETED = ("sfm_shapefit.solver", "sfm_shapefit.rigidity")
-LONGEST_TEST_S = 2.0  # of processor time, interpreted and observed: longer ones are left out
-BUDGET_S = 10.0  # of tests per mutant, by their time in the first run
+TESTS = {
+    "rigidity": ["rigidity"],
+    "certificate": ["certificate", "exact_certificate", "solver"],
+    "newton": ["newton", "exact_certificate", "solver"],
+    "admm": ["admm", "exact_certificate"],
+    "program": ["solver", "newton"],
+    "solve": ["solver", "exact_certificate", "admm"],
+    "angular": ["angular"],
+    "bodies": ["bodies"],
+}
+LONGEST_TEST_S = 1.5  # of processor time, interpreted and observed: longer ones are left out
+BUDGET_S = 8.0  # of tests per mutant, by their time in the first run
 PATIENCE = 4.0  # times the tests' own time, after which a mutant counts as endless
 
 
@@ -188,13 +193,14 @@ def sample(group: str, count: int, seed: int) -> list[Mutant]:
 # --- plain Python in place of kernels, and changed code in place of the old -----------------------
 
 
-def interpret_kernels() -> None:
-    """Let the kernels of the mutated packages be plain functions; call before they are imported."""
+def interpret_kernels(group: str) -> None:
+    """Let the kernels of a group be plain functions; call before they are imported."""
     compiled = jit.kernel
+    names = {_module_name(path) for path in GROUPS[group]}
 
     def kernel(**options: bool) -> Callable[[Any], Any]:
         def decorate(function: Any) -> Any:
-            return function if function.__module__.startswith(INTERPRETED) else compiled(**options)(function)
+            return function if function.__module__ in names else compiled(**options)(function)
 
         return decorate
 
@@ -203,7 +209,11 @@ def interpret_kernels() -> None:
 
 def module_of(path: str) -> ModuleType:
     """Return the module of a file of the package."""
-    return importlib.import_module("sfm_shapefit." + path.removesuffix(".py").replace("/", "."))
+    return importlib.import_module(_module_name(path))
+
+
+def _module_name(path: str) -> str:
+    return "sfm_shapefit." + path.removesuffix(".py").replace("/", ".")
 
 
 def put_in_place(path: str, source: str) -> None:
@@ -310,12 +320,11 @@ class Runner:
         usable = {key: row for key, row in baseline.items() if row["passed"]}
         print(f"{len(usable)} of {len(session.items)} tests are quick enough and pass uncompiled", flush=True)
         items = {item.nodeid: item for item in session.items}
-        for group in self.args.groups:
-            self._run_group(group, items, usable)
+        self._run_group(self.args.group, items, usable)
         return True
 
     def _baseline(self, items: list[Any]) -> dict[str, Any]:
-        record = self.state / "tests.json"
+        record = self.state / f"tests_{self.args.group}.json"
         known = json.loads(record.read_text()) if record.exists() else {}
         for item in items:
             key = hashlib.sha256(inspect.getsource(item.function).encode()).hexdigest()[:12]
@@ -421,25 +430,21 @@ def _difference(before: str, after: str) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--state", type=Path, required=True, help="folder of the outcomes")
-    parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
+    parser.add_argument("--group", choices=GROUPS, required=True)
     parser.add_argument("--per-group", type=int, default=30, help="mutants of each group")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="run recorded survivors again")
-    parser.add_argument("--list", action="store_true", help="only count the places, by group")
     args = parser.parse_args()
-    if args.list:
-        for group in args.groups:
-            print(group, sum(len(mutants_of(path)) for path in GROUPS[group]))
-        return 0
-    interpret_kernels()
+    interpret_kernels(args.group)
     phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)  # a failure need not be made small
     hypothesis.settings.register_profile(
         "mutation", phases=phases, derandomize=True, database=None, deadline=None
     )
     hypothesis.settings.load_profile("mutation")
     options = ["-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore", "-m", "not slow"]
+    tests = [f"tests/test_{name}.py" for name in TESTS[args.group]]
     os.chdir(ROOT)
-    return int(pytest.main([*options, *TESTS], plugins=[Runner(args)]))
+    return int(pytest.main([*options, *tests], plugins=[Runner(args)]))
 
 
 if __name__ == "__main__":
