@@ -12,9 +12,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit import output
+from sfm_shapefit import LocateOptions, locate, output
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
-from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import pycolmap_heard, quiet_stderr
@@ -552,14 +551,11 @@ def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name,
     folder = SHARED_DATA / name
     if not folder.exists():
         pytest.skip(f"{folder} is not there")
-    model = read_model(folder / "sparse" / "0")
+    found = locate(folder / "sparse" / "0", options=LocateOptions(bundle_adjust=True)).reconstruction
     truth = pycolmap.Reconstruction(folder / "gt")
-    true_centers = np.array([truth.find_image_with_name(name).projection_center() for name in model.names])
-    everything = np.ones(model.num_images, dtype=bool)
-    with open_database(folder / "database.db", model) as database:
-        seed = build_seed(model, everything, model.centers, database.keypoints)
-        graph = correspondence_graph(seed, model.image_ids, database.iter_matches(15))
-    centers = centers_of(bundle_adjust(seed, graph).reconstruction)
+    names = [found.image(i).name for i in sorted(found.images)]
+    centers = centers_of(found)
+    true_centers = np.array([truth.find_image_with_name(name).projection_center() for name in names])
     error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
     # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
     assert error_m.mean() <= 1.15 * to_reach_m
