@@ -1,49 +1,133 @@
-"""The README's example runs as it stands, and what it names exists."""
+"""What README and docs say runs as it stands: commands one after the other, Python blocks, and every link."""
 
 import os
 import re
+import shlex
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
+import pycolmap
 import pytest
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
-from tests.scenes import ROOT
+from tests.scenes import COURTYARD, RING, ROOT
 
-README = (ROOT / "README.md").read_text(encoding="utf-8")
+README = ROOT / "README.md"
+PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
+COMMAND = re.compile(r"^    sfm-shapefit (.+?)(?:  +#.*)?$", flags=re.MULTILINE)
+BLOCK = re.compile(r"```python\n(.*?)```", flags=re.DOTALL)
 
 
-def test_the_python_example_runs():
-    (example,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", example],
-        cwd=ROOT,
+def commands_of(page: Path) -> list[str]:
+    return COMMAND.findall(page.read_text(encoding="utf-8"))
+
+
+def python(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
+    """Start a Python that finds the package."""
+    return subprocess.Popen(
+        [sys.executable, *arguments],
+        cwd=cwd,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-        check=False,
     )
-    assert done.returncode == 0, done.stderr
-    assert re.search(r"^25 cameras, optimal to \d\.\de-\d+$", done.stdout, flags=re.MULTILINE)
-    assert float(re.search(r"median error (\S+) mm", done.stdout).group(1)) < 5.0
+
+
+# --- Python ------------------------------------------------------------------------------------------------
+
+
+def test_the_readmes_python_example_runs():
+    (example,) = BLOCK.findall(README.read_text(encoding="utf-8"))
+    process = python("-W", "error", "-c", example)
+    said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert re.search(r"^25 cameras, optimal to \d\.\de-\d+$", said, flags=re.MULTILINE)
+    assert float(re.search(r"median error (\S+) mm", said).group(1)) < 5.0
 
 
 @pytest.mark.parametrize(
-    "command", re.findall(r"^    sfm-shapefit (.+?)(?:  +#.*)?$", README, flags=re.MULTILINE)
+    ("page", "number"),
+    [(page, k) for page in PAGES[1:] for k in range(len(BLOCK.findall(page.read_text(encoding="utf-8"))))],
+    ids=lambda value: value.name if isinstance(value, Path) else str(value),
 )
-def test_every_command_of_the_readme_runs(command, tmp_path, monkeypatch):
+def test_every_python_example_of_the_docs_runs(page, number):
+    process = python("-W", "error", "-c", BLOCK.findall(page.read_text(encoding="utf-8"))[number])
+    said, errors = process.communicate()
+    assert process.returncode == 0, errors
+    assert said
+
+
+# --- commands ----------------------------------------------------------------------------------------------
+
+
+def viewed(arguments: list[str], folder: Path) -> None:
+    """Start the viewer, wait until it serves, and end it as a user does."""
+    pytest.importorskip("viser")
+    process = python("-m", "sfm_shapefit.cli", *arguments, cwd=folder)
+    try:
+        assert re.match(r"http://127\.0\.0\.1:\d+ ", process.stdout.readline())
+        process.send_signal(signal.SIGINT)
+        assert process.wait(timeout=60) == 0
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in PAGES if commands_of(page)], ids=lambda page: page.name)
+def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data_synthetic").symlink_to(ROOT / "data_synthetic")
-    if command.startswith("evaluate out"):
-        courtyard = "data_synthetic/courtyard/sparse/0"
-        assert CliRunner().invoke(app, ["locate", courtyard, "out", "-q"]).exit_code == 0
-    result = CliRunner().invoke(app, command.split())
-    assert result.exit_code == 0, result.output
+    # What the pages take as the user's own: measured positions, one far off, and names to be fixed.
+    truth = pycolmap.Reconstruction(COURTYARD / "truth")
+    rows = [(image.name, *image.projection_center()) for image in truth.images.values()]
+    off = {rows[3][0]: 30.0}
+    lines = [f"{name} {x + 100.0 + off.get(name, 0.0)} {y} {z} 0.05\n" for name, x, y, z in rows]
+    (tmp_path / "gps.csv").write_text("".join(lines))
+    ring = sorted(image.name for image in pycolmap.Reconstruction(RING / "sparse/0").images.values())
+    (tmp_path / "names.txt").write_text("\n".join(ring[:4]))
+    for command in commands_of(page):
+        arguments = shlex.split(command)
+        if arguments[0] == "view":
+            viewed(arguments, tmp_path)
+            continue
+        result = CliRunner().invoke(app, arguments)
+        assert result.exit_code == 0, f"{command}\n{result.output}"
 
 
-def test_every_file_that_the_readme_points_to_exists():
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", README) + re.findall(
-        r"^    (scripts/\S+)", README, re.MULTILINE
-    ):
-        assert (ROOT / target).exists(), target
+def test_every_command_of_the_program_stands_in_the_readme():
+    shown = {command.split()[0] for command in commands_of(README)}
+    assert shown == {info.name for info in app.registered_commands}
+
+
+# --- links -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_file_that_a_page_points_to_exists(page):
+    text = page.read_text(encoding="utf-8")
+    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
+        assert (page.parent / target).exists(), target
+    for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text):
+        assert (ROOT / script).exists(), script
+
+
+def test_every_page_of_the_docs_is_pointed_to():
+    targets = {
+        (page.parent / target).resolve()
+        for page in PAGES
+        for target in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text(encoding="utf-8"))
+    }
+    assert set(PAGES[1:]) <= targets
+
+
+def test_the_readme_leads_with_a_light_picture_and_is_read_in_five_minutes():
+    text = README.read_text(encoding="utf-8")
+    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
+    assert (ROOT / picture).stat().st_size < 300_000
+    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up

@@ -1,0 +1,120 @@
+"""What the user sees while a command runs: progress with totals, and pycolmap's messages only if wanted."""
+
+import os
+import re
+import subprocess
+import sys
+from collections import defaultdict
+
+import pytest
+
+from sfm_shapefit import LocateOptions, MapOptions, locate, map_database
+from sfm_shapefit.cli.console import shown_progress
+from tests.scenes import BUNDLED, FACADE, RING, ROOT
+
+
+def stages_of(run) -> dict[str, list[tuple[int, int]]]:
+    """Return what a run reports of each stage."""
+    reported = defaultdict(list)
+    run(lambda stage, done, total: reported[stage].append((done, total)))
+    return reported
+
+
+def assert_counted_up(steps: list[tuple[int, int]], total: int) -> None:
+    """A stage begins with (0, 1), counts up to its total, and ends with (1, 1)."""
+    assert steps[0] == (0, 1)
+    assert steps[-1] == (1, 1)
+    inner = steps[1:-1]
+    assert inner == sorted(inner)
+    assert {step[1] for step in inner} == {total}
+    assert inner[-1] == (total, total)
+
+
+def test_locate_counts_pairs_iterations_and_images():
+    stages = stages_of(lambda progress: locate(RING / "sparse/0", progress=progress))
+    assert list(stages) == [
+        "read",
+        "directions",
+        "solve",
+        "further pieces",
+        "structure",
+        "triangulation",
+        "colours",
+    ]
+    assert_counted_up(stages["directions"], 16)  # verified pairs of the 8 images
+    assert_counted_up(stages["structure"], 16)
+    assert_counted_up(stages["triangulation"], 8)
+    iterations = stages["solve"][1:-1]
+    assert [done for done, _ in iterations] == list(range(1, len(iterations) + 1))
+    assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
+
+
+def test_tracks_of_a_model_are_counted_by_its_images():
+    stages = stages_of(
+        lambda progress: locate(
+            FACADE / "sparse/0", options=LocateOptions(directions="tracks"), progress=progress
+        )
+    )
+    assert_counted_up(stages["directions"], 9)
+
+
+@pytest.mark.slow
+def test_map_counts_the_pairs_whose_rotations_it_estimates():
+    database = BUNDLED / "photographed" / "database.db"
+    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress))
+    steps = stages["relative rotations"]
+    assert steps[:2] == [(0, 1), (1, 57)]
+    assert steps[-2:] == [(57, 57), (1, 1)]
+
+
+def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
+    """A stage that ends before its limit, as a solve does, shows the steps that it took."""
+    code = (
+        "from sfm_shapefit.cli.console import shown_progress\n"
+        "with shown_progress(True) as progress:\n"
+        "    progress('solve', 0, 1)\n"
+        "    for k in range(1, 8):\n"
+        "        progress('solve', k, 100)\n"
+        "    progress('solve', 1, 1)\n"
+    )
+    master, terminal = os.openpty()
+    process = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stderr=terminal)
+    os.close(terminal)
+    shown = b""
+    while True:
+        try:
+            chunk = os.read(master, 4096)
+        except OSError:  # the terminal's other end is closed
+            break
+        shown += chunk
+        if not chunk:
+            break
+    os.close(master)
+    assert process.wait() == 0
+    assert re.findall(rb"(\d+)/(\d+)", shown)[-1] == (b"7", b"7")
+
+
+def test_nothing_is_shown_where_there_is_no_terminal(capfd):
+    with shown_progress(enabled=True) as progress:
+        assert progress is None
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("verbose", [False, True])
+def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, verbose):
+    command = ["locate", RING / "sparse/0", tmp_path / "out", "--bundle-adjust", "--no-report"]
+    done = subprocess.run(
+        [sys.executable, "-m", "sfm_shapefit.cli", *map(str, command), *["--verbose"] * verbose],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    if not verbose:
+        assert done.stderr == ""
+        assert re.search(r"time +│ \d+\.\d s +│", done.stdout)
+        return
+    assert "Bundle adjustment report" in done.stderr
+    assert "sfm-shapefit: directions\n" in done.stderr
+    assert re.search(r"time +│ \d+\.\d s \(read \d+\.\d\d, directions \d+\.\d\d", done.stdout)
+    assert "bundle adjustment" in done.stdout
