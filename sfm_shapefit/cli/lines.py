@@ -6,6 +6,7 @@ from sfm_shapefit.cli.console import Rows, shortened
 from sfm_shapefit.solver.options import Status
 
 if TYPE_CHECKING:
+    from sfm_shapefit.colmap.adjustment import Adjusted
     from sfm_shapefit.solver.options import SolverResult
 
 
@@ -26,6 +27,13 @@ def objective_line(solve: "SolverResult") -> str:
     if solve.status is Status.NOT_SOLVED:
         return f"{solve.objective:.6g}, not certified ({chosen})"
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
+
+
+def adjustment_line(adjusted: "Adjusted") -> str:
+    """Say how bundle adjustment went."""
+    state = "converged" if adjusted.converged else "stopped at its limit"
+    before, after = adjusted.initial_error_px, adjusted.final_error_px
+    return f"{state} after {adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
 
 
 def pictures_line(report: bool, scene: bool) -> str:
