@@ -54,7 +54,9 @@ GROUPS = {
     "rigidity": ["rigidity.py"],
     "certificate": ["solver/certificate.py"],
     "newton": ["solver/newton/dense.py", "solver/newton/sparse.py", "solver/newton/steps.py"],
-    "admm": [f"solver/admm/{name}.py" for name in ("anderson", "edges", "engine", "linear", "lud", "shapefit")],
+    "admm": [
+        f"solver/admm/{name}.py" for name in ("anderson", "edges", "engine", "linear", "lud", "shapefit")
+    ],
     "program": ["solver/program.py", "solver/options.py"],
     "solve": ["solver/solve.py", "solver/hybrid.py"],
     "angular": ["solver/angular.py"],
@@ -107,9 +109,9 @@ class Delete(Operator):
         del index
         text = "return None" if node.type == "return_stmt" else "pass"
         statement = get_ast(f"{text}\n").children[0].children[0]
-        (statement if not hasattr(statement, "children") else statement.get_first_leaf()).prefix = (
-            node.get_first_leaf().prefix
-        )
+        (
+            statement if not hasattr(statement, "children") else statement.get_first_leaf()
+        ).prefix = node.get_first_leaf().prefix
         return statement
 
     @classmethod
@@ -124,9 +126,9 @@ def _is_deletable(node: Any) -> bool:
     if node.type in ("return_stmt", "raise_stmt"):
         return node.get_first_leaf() is not node.get_last_leaf()
     if node.type == "expr_stmt":  # plain names would only raise NameError
-        return node.children[0].type != "name" or (node.children[1].type == "operator" and (
-            node.children[1].value not in ("=", ":")
-        ))
+        return node.children[0].type != "name" or (
+            node.children[1].type == "operator" and (node.children[1].value not in ("=", ":"))
+        )
     return node.type in ("atom_expr", "power")
 
 
@@ -367,7 +369,10 @@ class Runner:
                 print(f"{outcome[0]:9}{mutant.name}  {outcome[1]}", flush=True)
         outcomes = [known[mutant.name][0] for mutant in mutants]
         survived = outcomes.count("survived")
-        print(f"{group}: {len(outcomes) - survived} of {len(outcomes)} found, {outcomes.count('endless')} by time")
+        print(
+            f"{group}: {len(outcomes) - survived} of {len(outcomes)} found, "
+            f"{outcomes.count('endless')} by time"
+        )
         for mutant in mutants:
             if known[mutant.name][0] == "survived":
                 print(f"\n{mutant.name}\n{known[mutant.name][2]}", flush=True)
@@ -441,7 +446,18 @@ def main() -> int:
         "mutation", phases=phases, derandomize=True, database=None, deadline=None
     )
     hypothesis.settings.load_profile("mutation")
-    options = ["-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore", "-m", "not slow"]
+    options = [
+        "-s",
+        "-p",
+        "no:cacheprovider",
+        "-o",
+        "addopts=",
+        "--tb=native",
+        "-W",
+        "ignore",
+        "-m",
+        "not slow",
+    ]
     tests = [f"tests/test_{name}.py" for name in TESTS[args.group]]
     os.chdir(ROOT)
     return int(pytest.main([*options, *tests], plugins=[Runner(args)]))

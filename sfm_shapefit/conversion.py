@@ -76,7 +76,7 @@ def convert(
 def _write_text(text: str, path: Path, *, overwrite: bool) -> None:
     """Write a file whole or not at all."""
     if path.is_dir() or (path.exists() and not overwrite):
-        raise InputError(f"{path} exists already; choose another name or allow overwriting")
+        raise InputError(f"{path} exists already; choose another name, or replace it with --overwrite")
     partial = path.with_name(f".shapefit-{secrets.token_hex(8)}.partial")
     try:
         partial.write_text(text, encoding="utf-8", errors="surrogateescape")

@@ -22,6 +22,9 @@ Source = Literal["auto", "matches", "relative-poses", "tracks"]
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""
 
+MAX_THREADS = 256
+"""Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
+
 _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time of the solve
 
 
@@ -83,7 +86,7 @@ class LocateOptions:
     """Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. See the
     column trust of cameras.csv."""
     threads: int = 0
-    """Threads to use; 0 means one per core. The answer does not depend on it."""
+    """Threads to use, at most 256; 0 means one per core. The answer does not depend on it."""
 
     def __post_init__(self) -> None:
         self._check_types()
@@ -106,8 +109,8 @@ class LocateOptions:
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
-        if self.threads < 0:
-            raise ValueError(f"threads must be 0 or more, got {self.threads}")
+        if not 0 <= self.threads <= MAX_THREADS:
+            raise ValueError(f"threads must lie in [0, {MAX_THREADS}], got {self.threads}")
         self.for_placement()
         self.for_directions()
         self.for_structure()
@@ -189,4 +192,4 @@ class LocateOptions:
 
     def num_threads(self) -> int:
         """Return the number of threads to use."""
-        return self.threads or os.cpu_count() or 1
+        return self.threads or min(os.cpu_count() or 1, MAX_THREADS)

@@ -236,7 +236,7 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
     if not folder.is_dir():
         raise InputError(f"{folder} is a file; give the name of a new folder")
     if not overwrite:
-        raise InputError(f"{folder} exists already; choose another folder or allow overwriting")
+        raise InputError(f"{folder} exists already; choose another folder, or replace it with --overwrite")
     try:
         is_empty = not any(folder.iterdir())
     except OSError as error:

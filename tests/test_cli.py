@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 import shutil
 import signal
 import sqlite3
@@ -89,6 +90,7 @@ def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_pa
     text = run("locate", "--help").stdout
     for field in dataclasses.fields(LocateOptions):
         assert f"--{field.name.replace('_', '-')}" in text
+    assert not re.search(r"\[default:\s*(None)?\]", text)
     result = run("locate", FACADE_MODEL, tmp_path / "out", "--scale", "unit", "--threads", "1", "--json")
     assert json.loads(result.stdout)["options"]["scale"] == "unit"
     assert json.loads(result.stdout)["scale"].startswith("unit")

@@ -662,7 +662,9 @@ def test_an_exception_leaves_nothing_behind_not_even_new_parents(tmp_path, error
 
 def test_an_existing_folder_is_refused_and_kept(tmp_path):
     out = earlier_output(tmp_path / "out")
-    with pytest.raises(InputError, match="exists already; choose another folder or allow overwriting"):
+    with pytest.raises(
+        InputError, match="exists already; choose another folder, or replace it with --overwrite"
+    ):
         check_output(out)
     with pytest.raises(InputError, match="exists already"), atomic_folder(out):
         pytest.fail("the block must not run")

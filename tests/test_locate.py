@@ -321,6 +321,7 @@ def test_options_out_of_range_are_refused_by_name():
         ("bundle_adjust", 1),
         ("tol", 2.0),
         ("threads", -1),
+        ("threads", 257),
         ("scale", "metric"),
         ("min_inlier_ratio", 3.0),
     ):

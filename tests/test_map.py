@@ -80,6 +80,21 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     assert any("1 images are in no model" in warning for warning in found.warnings)
     sfm_shapefit.write_map_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
+    refused = CliRunner().invoke(app, ["report", str(tmp_path / "out")])
+    assert (refused.exit_code, "give one of them, such as" in refused.output) == (3, True)
+
+
+def test_images_in_no_model_are_told_their_own_reason(tmp_path):
+    group = f"(pair_id / {PAIR} > 4) + (pair_id / {PAIR} > 6) + (pair_id / {PAIR} > 7)"
+    cut = f"{group} != {group.replace('/', '%')}"
+    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {cut}")
+    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
+    assert [model.names for model in found.models] == [("0001.jpg", "0002.jpg", "0003.jpg", "0004.jpg")]
+    assert list(found.left_out) == [f"{k:04d}.jpg" for k in (5, 6, 7, 8)]
+    assert {found.left_out[name] for name in ("0005.jpg", "0006.jpg")} == {
+        "joined to 1 other image only; three make a model"
+    }
+    assert {found.left_out[name][:10] for name in ("0007.jpg", "0008.jpg")} == {"no matches"}
 
 
 def test_inlier_matches_are_enough(tmp_path):

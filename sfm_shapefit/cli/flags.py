@@ -75,7 +75,8 @@ def _flags(options_type: type) -> list[inspect.Parameter]:
         flag = f"--{item.name.replace('_', '-')}"
         names = f"{flag}/--no{flag[1:]}" if hints[item.name] is bool else flag
         shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
-        text = f"{documentation[item.name]} [default: {shown}]"
+        default = "" if item.default in (None, "") else f" [default: {shown}]"
+        text = f"{documentation[item.name]}{default}"
         annotation: Any = Annotated[hints[item.name] | None, typer.Option(names, help=text)]
         parameters.append(
             inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)

@@ -6,6 +6,7 @@ from sfm_shapefit.cli.console import Rows, shortened
 from sfm_shapefit.solver.options import Status
 
 if TYPE_CHECKING:
+    from sfm_shapefit.colmap.adjustment import Adjusted
     from sfm_shapefit.solver.options import SolverResult
 
 
@@ -33,6 +34,13 @@ def time_line(timings_s: dict[str, float], detailed: bool = True) -> str:
     total = f"{sum(timings_s.values()):.1f} s"
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
     return f"{total} ({stages})" if detailed else total
+
+
+def adjustment_line(adjusted: "Adjusted") -> str:
+    """Say how bundle adjustment went."""
+    state = "converged" if adjusted.converged else "stopped at its limit"
+    before, after = adjusted.initial_error_px, adjusted.final_error_px
+    return f"{state} after {adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
 
 
 def pictures_line(report: bool, scene: bool) -> str:

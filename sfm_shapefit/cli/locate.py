@@ -24,7 +24,7 @@ from sfm_shapefit.cli.flags import (
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import objective_line, pictures_line, pieces_line, time_line
+from sfm_shapefit.cli.lines import adjustment_line, objective_line, pictures_line, pieces_line, time_line
 from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str, *, verbose: b
         ("centres", found.placement.finish.statement()),
         ("scale", found.gauge.statement),
         ("points", _points_line(facts)),
-        *([("bundle adjustment", _adjustment_line(found))] if found.adjusted else []),
+        *([("bundle adjustment", adjustment_line(found.adjusted))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", time_line(found.timings_s, verbose)),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
@@ -122,17 +122,15 @@ def _pairs_line(facts: dict[str, Any]) -> str:
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
     others = "".join(f", {count} {status.replace('_', ' ')}" for status, count in counts.items())
-    return f"{facts['num_pairs']}: {usable} usable ({contradicting} contradict the solution){others}"
+    filtered = (
+        f", {facts['num_pairs_filtered']} left out by the filter" if facts["num_pairs_filtered"] else ""
+    )
+    return (
+        f"{facts['num_pairs']}: {usable} usable ({contradicting} contradict the solution{filtered}){others}"
+    )
 
 
 def _points_line(facts: dict[str, Any]) -> str:
     if facts["num_points"] == 0:
         return "none"
     return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
-
-
-def _adjustment_line(found: "LocateResult") -> str:
-    assert found.adjusted is not None
-    state = "converged" if found.adjusted.converged else "stopped at its limit"
-    before, after = found.adjusted.initial_error_px, found.adjusted.final_error_px
-    return f"{state} after {found.adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"

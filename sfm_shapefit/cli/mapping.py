@@ -21,7 +21,7 @@ from sfm_shapefit.cli.flags import (
     options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import time_line
+from sfm_shapefit.cli.lines import adjustment_line, time_line
 from sfm_shapefit.mapping.options import MapOptions
 
 if TYPE_CHECKING:
@@ -84,6 +84,7 @@ def _map_table(found: "MapResult", out: Path, *, verbose: bool) -> Rows:
             ("  rotations", model.averaging.statement),
             ("  points", str(located.reconstruction.num_points3D())),
             ("  scale", located.gauge.statement),
+            *([("  bundle adjustment", adjustment_line(located.adjusted))] if located.adjusted else []),
             *[("  warning", warning) for warning in located.warnings],
         ]
     left_out = [f"{name}: {reason}" for name, reason in found.left_out.items()]
@@ -92,5 +93,5 @@ def _map_table(found: "MapResult", out: Path, *, verbose: bool) -> Rows:
         *([("in no model", shortened(left_out, "see map.json"))] if left_out else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", time_line(found.timings_s, verbose)),
-        ("written to", f"{out}: models {', '.join(str(k) for k in range(len(found.models)))}, map.json"),
+        ("written to", f"{out}: models in {', '.join(str(k) for k in range(len(found.models)))}, map.json"),
     ]

@@ -7,11 +7,8 @@ are far finer than averaged ones, so directions, verdicts and trust are measured
 final adjustment. Images that the averaging drops form components of their own.
 """
 
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, fields, replace
-from functools import partial
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -29,16 +26,14 @@ from sfm_shapefit.mapping.averaging import AveragedRotations, averaged
 from sfm_shapefit.mapping.options import LEAST_MATCHES, MapOptions
 from sfm_shapefit.mapping.results import MappedModel, MapResult
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.pipeline import locate
+from sfm_shapefit.pipeline import Progress, locate
+from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.results import LocateResult
 
 _DRAFT_WIDENING = 4.0  # of the reprojection limit: a draft is a few pixels off, and would lose long tracks
 _ALARMING_SHARE = 0.7  # of a model's pairs that agree with its rotations: castle-P30 0.97, lego100 0.89
 _DOUBTFUL_SHARE = 0.25  # of one image's pairs
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
-
-Progress = Callable[[str, int, int], None]
-"""Called with the name of a stage, the work done so far and the work in all."""
 
 
 def map_database(
@@ -60,18 +55,19 @@ def map_database(
         UnsolvableError: if no component of three images or more can be placed.
     """
     options = options or MapOptions()
-    path, run = Path(database), _Run(options, progress or (lambda _stage, _done, _total: None))
-    with run.timed("read"):
+    path, clock = Path(database), Clock(progress) if progress else Clock()
+    run = _Run(options, clock)
+    with clock("read"):
         images = read_images(path)
         unposed = read_model(images.reconstruction)
-    with run.timed("relative rotations"):
+    with clock("relative rotations"):
         relative = relative_rotations(
             path,
             unposed,
             LEAST_MATCHES,
             options.relative,
             options.num_threads(),
-            partial(run.progress, "relative rotations"),
+            clock.advance,
         )
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.components(unposed.num_images, relative, reasons):
@@ -82,7 +78,8 @@ def map_database(
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
         models.append(MappedModel(located=found, averaging=averaging, names=names))
-        reasons = {k: reason for k, reason in reasons.items() if k not in set(members.tolist())}
+        for k in members.tolist():
+            del reasons[k]
     if not models:
         raise UnsolvableError(_nothing_placed(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
@@ -94,7 +91,7 @@ def map_database(
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
         left_out=left_out,
-        timings_s=run.seconds,
+        timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
     )
 
@@ -104,16 +101,7 @@ class _Run:
     """The settings of one run, and the time its stages take, of all components together."""
 
     options: MapOptions
-    progress: Progress
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def timed(self, stage: str) -> Iterator[None]:
-        self.progress(stage, 0, 1)
-        start = time.perf_counter()
-        yield
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
-        self.progress(stage, 1, 1)
+    clock: Clock
 
     def components(
         self, num_images: int, relative: RelativeRotations, reasons: dict[int, str]
@@ -130,7 +118,7 @@ class _Run:
                     few = f"joined to {len(members) - 1} other image only; three make a model"
                     reasons |= dict.fromkeys(members.tolist(), few)
                 continue
-            with self.timed("rotation averaging"):
+            with self.clock("rotation averaging"):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 local = _renumbered(inside, members)
                 try:
@@ -163,12 +151,12 @@ class _Run:
             settings |= {"known_distance": None, "scale": "unit"}  # it belongs to another component
         rotations = averaging.rotations
         if self.options.bundle_adjust:
-            with self.timed("draft"):
+            with self.clock("draft"):
                 rotations = self._drafted(path, images, image_ids, rotations, settings)
             settings["refine_rotations"] = False
-        with self.timed("locate"):
+        with self.clock("locate"):
             model = posed_at_origin(images.reconstruction, image_ids, rotations)
-            return locate(model, path, LocateOptions(**settings), self.progress)
+            return locate(model, path, LocateOptions(**settings), self.clock.progress)
 
     def _drafted(
         self,

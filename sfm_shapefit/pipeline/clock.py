@@ -25,12 +25,12 @@ class Clock:
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
-        """Time a stage."""
+        """Time a stage; one that comes again adds to its time."""
         self.stage = stage
         self.progress(stage, 0, 1)
         start = time.perf_counter()
         yield
-        self.seconds[stage] = time.perf_counter() - start
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
         self.progress(stage, 1, 1)
 
     def advance(self, done: int, total: int) -> None:

@@ -85,7 +85,8 @@ class Finish:
     """Median and largest move of a node by the refinement, as a share of the median distance from the
     centre."""
     num_turned_pairs: int
-    """Pairs that fit the start and not the refined locations, or the other way round, at `levels_deg`."""
+    """Directions, those to points too, that fit the start and not the refined locations, or the other way
+    round, at `levels_deg`."""
     put_back: IntArray
     """Nodes that the refinement threw out of the scene, ascending; they are where LUD, or else the start, had
     them instead, and nothing says that they belong there."""
@@ -109,8 +110,8 @@ class Finish:
         median, largest = self.moved
         back = f"; {self.num_put_back} thrown out of the scene and put back" if self.num_put_back else ""
         return (
-            f"{self.start}, refined in angles (moved by {median:.2%} of the extent, at most {largest:.2%}; "
-            f"{self.num_turned_pairs} pairs changed sides{back}): {self.reason}"
+            f"{self.start}, refined in angles (moved by {median:.2%} of the scene's radius, at most "
+            f"{largest:.2%}; {self.num_turned_pairs} directions changed sides{back}): {self.reason}"
         )
 
 
@@ -356,7 +357,7 @@ def _unit(t: FloatArray) -> FloatArray:
 
 
 def _moves(kept: Start) -> tuple[float, float]:
-    """Return the median and the largest move by the refinement, as a share of the extent."""
+    """Return the median and the largest move by the refinement, see `Finish.moved`."""
     before, after = _unit(kept.locations), _unit(kept.best)
     moved = np.linalg.norm(after - before, axis=1) / median_spread(after)
     return float(np.median(moved)), float(moved.max())

@@ -267,7 +267,7 @@ def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
 def _reason(agreement: float, usual: float, cause: Looseness | None, few: bool) -> str:
     """Say why a camera's trust is low."""
     if cause is Looseness.DISTANCE:
-        return cause.value  # where it stands is arbitrary, and so is what agrees with it there
+        return str(cause.value)  # where it stands is arbitrary, and so is what agrees with it there
     found = []
     if agreement < usual:
         found.append("more of its matches contradict it than usual here: its rotation may be wrong")

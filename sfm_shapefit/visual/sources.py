@@ -11,7 +11,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.output import MARKER
+from sfm_shapefit.output import MAP_MARKER, MARKER
 from sfm_shapefit.placement import Placement
 from sfm_shapefit.report import CameraRow, PairRow, axis_names
 from sfm_shapefit.visual.scene import Scene, build_scene
@@ -72,6 +72,8 @@ def read_output(folder: Path) -> tuple[Scene, dict[str, Any]]:
     Raises:
         InputError: if it is no output of `locate` or `solve`, or its files are damaged.
     """
+    if (folder / MAP_MARKER).is_file():
+        raise InputError(f"{folder} holds the models of map; give one of them, such as {folder / '0'}")
     if not (folder / MARKER).is_file():
         raise InputError(f"{folder} has no {MARKER}; give a folder that locate or solve wrote")
     try:
