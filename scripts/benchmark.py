@@ -7,7 +7,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, peers, real, scale, solver, trust
+from benchmarks import coherent, directions, families, onedsfm, peers, real, rigs, scale, solver, trust
+from benchmarks import map as mapping
 
 SUBCOMMANDS = {
     "real": real,
@@ -15,9 +16,12 @@ SUBCOMMANDS = {
     "scale": scale,
     "graphs": families,
     "peers": peers,
+    "onedsfm": onedsfm,
     "directions": directions,
     "trust": trust,
     "coherent": coherent,
+    "rigs": rigs,
+    "map": mapping,
 }
 
 

@@ -1,16 +1,26 @@
 """Write the bundled scenes: `python scripts/make_data.py --out data_synthetic`.
 
-Each scene is replaced whole; the same versions of numpy and OpenCV give the same arrays.
+Each scene is replaced whole; the same versions of numpy, OpenCV and pycolmap give the same arrays.
 """
 
 import argparse
+import contextlib
 import shutil
+import sqlite3
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from sfm_shapefit.colmap.photographs import write_rendered_workspace
 from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.formats import graph_text
-from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene, random_graph_problem
+from sfm_shapefit.synthetic import (
+    RenderOptions,
+    SceneOptions,
+    WorkspaceOptions,
+    make_rendered_scene,
+    make_scene,
+    random_graph_problem,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 
 
@@ -21,6 +31,8 @@ class BundledScene:
     purpose: str
     scene: SceneOptions
     workspace: WorkspaceOptions
+    render: RenderOptions | None = None
+    """How its images are drawn; None for made-up keypoints."""
 
 
 GRAPH = "graph40.txt"
@@ -56,6 +68,24 @@ SCENES = {
         scene=SceneOptions(shape="facade", num_images=9, num_points=400, pixel_noise_px=0.5, seed=9),
         workspace=WorkspaceOptions(database=False),
     ),
+    "photographed": BundledScene(
+        purpose="A yard drawn with its textures, through a lens with distortion; keypoints, matches and"
+        " two-view geometries are those that COLMAP finds in the images. Some houses look the same, so that"
+        " pairs of different ones are matched, verified and wrong. The images and the descriptors are left"
+        " out here; the command below makes them. `sparse/0` knows the rotations only. `truth` is the exact"
+        " model, its points joined along right matches.",
+        scene=SceneOptions(
+            shape="courtyard",
+            num_images=16,
+            max_keypoints_per_image=500,
+            image_width=640,
+            image_height=480,
+            focal_length_px=480.0,
+            seed=1,
+        ),
+        workspace=WorkspaceOptions(model="rotations"),
+        render=RenderOptions(repeated_fraction=0.2),
+    ),
 }
 
 
@@ -83,14 +113,31 @@ def write_scene(name: str, folder: Path) -> None:
     """Write one bundled scene with its SOURCE.md, in place of what stands there."""
     if folder.exists():
         shutil.rmtree(folder)
-    write_workspace(make_scene(SCENES[name].scene), folder, SCENES[name].workspace)
+    bundled = SCENES[name]
+    if bundled.render is None:
+        write_workspace(make_scene(bundled.scene), folder, bundled.workspace)
+    else:
+        write_rendered_workspace(
+            make_rendered_scene(bundled.scene, bundled.render), folder, bundled.workspace
+        )
+        shutil.rmtree(folder / "images")
+        _drop_descriptors(folder / "database.db")
     (folder / "SOURCE.md").write_text(source_text(name), encoding="utf-8")
+
+
+def _drop_descriptors(database: Path) -> None:
+    """Remove what only matching needs from a database: most of its size."""
+    with contextlib.closing(sqlite3.connect(database, isolation_level=None)) as connection:
+        connection.execute("DELETE FROM descriptors")
+        connection.execute("VACUUM")
 
 
 def source_text(name: str) -> str:
     """Return what SOURCE.md says: what the scene is, and the commands that make it."""
     bundled = SCENES[name]
     flags = _changed_flags(bundled.scene) + _changed_flags(bundled.workspace)
+    if bundled.render is not None:
+        flags += ["--images", *_changed_flags(bundled.render)]
     return (
         f"# {name}\n\n{bundled.purpose}\n\n"
         f"Synthetic, seed {bundled.scene.seed}. Made, with the other scenes, by\n\n"
@@ -99,7 +146,7 @@ def source_text(name: str) -> str:
     )
 
 
-def _changed_flags(options: SceneOptions | WorkspaceOptions) -> list[str]:
+def _changed_flags(options: SceneOptions | WorkspaceOptions | RenderOptions) -> list[str]:
     """Return the command-line flags of the options that differ from their defaults."""
     default = type(options)()
     flags = []

@@ -133,6 +133,10 @@ def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
         picture = axis.pcolormesh(
             panel.q, panel.n, image(panel, results), cmap="gray_r", vmin=0.0, vmax=1.0, shading="nearest"
         )
+        if panel.n[-1] > 4 * panel.n[1]:  # sizes that double
+            axis.set_yscale("log")
+            axis.set_yticks(panel.n, [str(n) for n in panel.n])
+            axis.minorticks_off()
         axis.set(title=panel.title, xlabel="corruption probability q", ylabel="number of locations n")
     for axis in axes.ravel()[len(shown) :]:
         axis.set_axis_off()

@@ -14,9 +14,15 @@ for _name in ("OPENBLAS", "OMP", "MKL", "NUMBA", "RAYON"):
     os.environ[f"{_name}_NUM_THREADS"] = "1"
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from abuse import faults, fuzz  # noqa: E402
+from abuse import determinism, faults, fuzz, soak, walkers  # noqa: E402
 
-SUBCOMMANDS = {"fuzz": fuzz, "faults": faults}
+SUBCOMMANDS = {
+    "fuzz": fuzz,
+    "faults": faults,
+    "determinism": determinism,
+    "soak": soak,
+    "walkers": walkers,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from sfm_shapefit.conversion import convert
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.mapping.options import MapOptions
     from sfm_shapefit.mapping.results import MapResult, write_map_result
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.viewgraph import ViewGraph
 
 _HOMES = {
+    "conversion": ("convert",),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "mapping.options": ("MapOptions",),
     "mapping.results": ("MapResult", "write_map_result"),
@@ -58,6 +60,7 @@ __all__ = [
     "UnsolvableError",
     "ViewGraph",
     "certify",
+    "convert",
     "evaluate",
     "inspect",
     "locate",

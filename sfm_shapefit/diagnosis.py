@@ -140,6 +140,8 @@ class Inspection:
     diagnosis: Diagnosis
     theory: Theory | None
     """None if not asked for."""
+    rigs: str = "none: every image is a frame of its own"
+    """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""

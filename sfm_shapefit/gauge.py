@@ -5,12 +5,12 @@ the input's. A gauge is a scale and a shift of the centres and, with position pr
 whole model onto their axes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     Similarity,
@@ -20,7 +20,7 @@ from sfm_shapefit.geometry import (
     rotation_angles_deg,
 )
 
-Scale = Literal["auto", "input", "unit", "prior", "distance"]
+Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 
 _CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
 _ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
@@ -38,7 +38,7 @@ class Gauge:
 
     similarity: Similarity
     """Scale and shift in the input's axes; its rotation is the identity."""
-    scale: Scale
+    scale: Scale | Literal["fixed"]
     """The choice that was carried out."""
     statement: str
     """What scale, origin and axes the output has, for the report."""
@@ -103,6 +103,46 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
         )
     statement = "input: scale and origin of the input's centres, its axes"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
+
+
+def metric_gauge(
+    locations: FloatArray, unit: float, input_centers: FloatArray, fixed: BoolArray, *, has_rigs: bool
+) -> Gauge:
+    """Return the gauge of locations whose scale is known, with the origin of what is fixed, or of the input.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        unit: length of the output's unit in theirs.
+        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        fixed: (n,) the cameras that stay where the input has them.
+        has_rigs: whether the scale is that of rigs; else it is that of the fixed cameras.
+    """
+    scale = 1.0 / unit
+    shifts = input_centers - scale * locations
+    if fixed.any():
+        shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
+    elif np.ptp(input_centers, axis=0).max() > _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
+        shift, origin = np.median(shifts, axis=0), "origin of the input's centres"
+    else:
+        shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
+    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=shift)
+    if has_rigs:
+        return Gauge(
+            similarity=similarity,
+            scale="rig",
+            statement=f"rig: the unit of the sensors' offsets in their rigs; {origin}",
+        )
+    return Gauge(similarity=similarity, scale="fixed", statement=f"fixed: scale and {origin}")
+
+
+def moved_gauge(gauge: Gauge, location: FloatArray, center: FloatArray, name: str) -> Gauge:
+    """Return the gauge shifted so that one location (3,) comes to lie at `center`, where `name` stays."""
+    scale = gauge.similarity.scale
+    return replace(
+        gauge,
+        similarity=replace(gauge.similarity, translation=center - scale * location),
+        statement=f"{gauge.statement}; shifted so that {name} stays where it is",
+    )
 
 
 def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:

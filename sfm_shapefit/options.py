@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 
+FIX_SOLVED = "solved"
+"""In place of a file of names: fix every image that observes a 3D point of the input."""
+
 _MAX_CAMERAS_WITH_POINTS = 5_000  # beyond, the points would multiply the time of the solve
 
 
@@ -49,10 +52,18 @@ class LocateOptions:
     scale: Scale = "auto"
     """Scale and origin of the output: "input" takes those of the input's centres ("unit" where it has none);
     "unit" puts the centroid at 0 and the median distance from it at 1; "prior" maps onto position priors,
-    axes too; "distance" makes a known distance true. "auto": a known distance if one is given, else
-    priors if a table is given, else "input"."""
+    axes too; "distance" makes a known distance true; "rig" is the unit of the sensors' offsets in their rigs.
+    "auto": a known distance if one is given, else priors if a table is given, else "input". A model with
+    rigs of several cameras always has their scale, and one with two or more fixed cameras theirs."""
     known_distance: tuple[str, str, float] | None = None
     """Two images by name, and how far apart they are in the output's units."""
+    fix: str = ""
+    """Cameras that stay exactly where the input has them, while the others are placed around them: a text
+    file with one image name per line, or "solved": every image that observes a 3D point of the input, for new
+    images in a solved model. With two or more the scale is theirs, with one only the origin."""
+    refine_with_priors: bool = False
+    """Let the position priors that set the scale also pull the cameras, each by its standard deviation;
+    priors that are far off have no part."""
     min_inliers: int = 15
     """Least number of inlier matches of a pair, with parallax and in front of both cameras."""
     min_inlier_ratio: float = 0.5
@@ -93,6 +104,8 @@ class LocateOptions:
             raise ValueError(f"min_trust must lie in [0, 1], got {self.min_trust}")
         if self.refine_rotations and self.directions == "relative-poses":
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
+        if self.refine_with_priors and self.scale not in ("auto", "prior"):
+            raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if self.threads < 0:
             raise ValueError(f"threads must be 0 or more, got {self.threads}")
         self.for_placement()

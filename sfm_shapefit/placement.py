@@ -11,6 +11,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
@@ -56,6 +57,10 @@ class Placement:
     """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
     history: tuple[IterationInfo, ...] = ()
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
+    bodies: Bodies | None = None
+    """The rigid bodies of all nodes of the graph, if nodes do not move one by one."""
+    unit: float | None = None
+    """Length of the unit of the offsets inside rigid bodies, in the solver's units; None without bodies."""
 
     @property
     def nodes(self) -> IntArray:

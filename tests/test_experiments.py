@@ -3,6 +3,7 @@
 import importlib.util
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -109,3 +110,23 @@ def test_every_panel_of_every_figure_names_a_known_method():
     for figure in module.FIGURES:
         assert module.panels(figure)
         assert {panel.method for panel in module.panels(figure)} <= set(METHODS)
+
+
+def test_the_theory_plot_has_a_quick_mode_and_grants_less_than_is_recovered(tmp_path, capsys):
+    module = script("theory_plot")
+    module.main(["--out", str(tmp_path / "f.png"), "--quick"])
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    *_, dense = capsys.readouterr().out.splitlines()
+    granted, recovered = (float(dense.split(word)[1].split()[0]) for word in ("granted ", "recovered "))
+    assert dense.split()[0] == "1:"  # every pair: the theorems speak
+    assert 0.0 < granted < 1e-6 < recovered
+
+
+def test_the_worst_share_is_that_of_the_camera_with_most_wrong_pairs():
+    module = script("theory_plot")
+    problem = SimpleNamespace(
+        locations=np.zeros((4, 3)),
+        edges=np.array([[0, 1], [0, 2], [0, 3], [2, 3]]),
+        corrupted=np.array([True, False, True, True]),
+    )
+    assert module.worst_share(problem) == 0.5  # cameras 0 and 3 have two of four

@@ -139,3 +139,18 @@ def test_a_graph_that_determines_nothing_exits_with_4(tmp_path):
     result = CliRunner().invoke(app, ["solve", str(tmp_path / "g.txt"), str(tmp_path / "out")])
     assert result.exit_code == 4
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("word", ["--5", "-", "9" * 5000])
+def test_ids_that_only_look_like_numbers_are_words(tmp_path, word):
+    path = tmp_path / "graph.txt"
+    path.write_text(f"1 2 1 0 0\n2 {word} 0 1 0\n")
+    assert read_graph(path).names == tuple(sorted(["1", "2", word]))
+
+
+@pytest.mark.parametrize("weight", ["1e308", "1e-300"])
+def test_weights_whose_squares_overflow_are_refused_by_line(tmp_path, weight):
+    path = tmp_path / "graph.txt"
+    path.write_text(f"1 2 1 0 0 1\n2 3 0 1 0 {weight}\n")
+    with pytest.raises(InputError, match="line 2: has a weight beyond"):
+        read_graph(path)

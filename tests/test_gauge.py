@@ -15,6 +15,10 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.anchored import Anchors, refine_anchored
+from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.viewgraph import ViewGraph
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()
@@ -320,3 +324,87 @@ def test_priors_without_effect_are_refused(ring, tmp_path):
     result = run("locate", RING_MODEL, tmp_path / "out", "--scale", "prior")
     assert result.exit_code == 3
     assert "give a table with --priors" in result.stderr
+
+
+# --- priors that pull --------------------------------------------------------------------------------
+
+
+def test_priors_with_refinement_mend_what_directions_leave_open():
+    """A drive along a line: directions with errors drift; positions known to a few centimetres do not."""
+    terms, start, truth, priors = drive(sigma=0.05)
+    before = np.linalg.norm(start - truth, axis=1)
+    moved = refine_anchored(*terms, priors)
+    after = np.linalg.norm(moved - truth, axis=1)
+    assert np.median(before) > 5.0 * np.median(after)
+    assert np.median(after) < 1.538 * 0.05  # the median error of the priors themselves
+
+
+def test_a_fifth_of_wrong_priors_does_not_pull():
+    terms, _, truth, priors = drive(sigma=0.05)
+    right = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
+    wrong = np.random.default_rng(1).permutation(len(truth))[: len(truth) // 5]
+    priors.positions[wrong] += 5.0 * np.random.default_rng(2).standard_normal((len(wrong), 3))
+    left = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
+    # A fifth fewer positions: sqrt(5 / 4) times the error, if the wrong ones have no part.
+    assert np.median(left) < 1.25 * np.sqrt(5.0 / 4.0) * np.median(right)
+
+
+def drive(sigma):
+    """Fifty cameras in a row, each seeing the next four, placed by directions alone; priors of all."""
+    rng = np.random.default_rng(5)
+    n = 50
+    truth = np.stack([np.arange(n), 2.0 * np.sin(np.arange(n) / 8.0), 0.3 * rng.standard_normal(n)], axis=1)
+    edges = np.array([(i, j) for i in range(n) for j in range(i + 1, min(i + 5, n))])
+    error = 0.01
+    exact = normalized(truth[edges[:, 0]] - truth[edges[:, 1]])
+    v = normalized(exact + error * rng.standard_normal(exact.shape))
+    graph = ViewGraph(n, edges, v)
+    covariance = np.broadcast_to(error**2 * np.eye(2), (len(edges), 2, 2))
+    metric = Metric(covariance, np.zeros(len(edges), dtype=np.int64))
+    found = refine_angles(graph, truth, metric, plan_refinement(graph))
+    positions = truth + sigma * rng.standard_normal(truth.shape)
+    gauge = prior_gauge(found.locations, priors_of(positions, sigma))
+    start = gauge.similarity.apply(found.locations)
+    if gauge.axes is not None:
+        positions, truth = positions @ gauge.axes, truth @ gauge.axes
+    anchors = Anchors(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
+    return (graph, start, metric, found.levels_rad), start, truth, anchors
+
+
+def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
+    rng = np.random.default_rng(3)
+    sigma = 0.01
+    noisy = ring.centers + sigma * rng.standard_normal(ring.centers.shape)
+    table = write_table(tmp_path / "priors.txt", ring, noisy)
+    table.write_text("\n".join(f"{line} {sigma}" for line in table.read_text().splitlines()))
+    arguments = ("locate", RING_MODEL, "--priors", table, "--no-report", "--json")
+    plain = json.loads(run(*arguments, tmp_path / "plain").stdout)
+    facts = json.loads(run(*arguments, tmp_path / "out", "--refine-with-priors").stdout)
+    assert facts["scale"].startswith(plain["scale"] + "; the priors moved cameras by ")
+    off = []
+    for folder in ("plain", "out"):
+        model = pycolmap.Reconstruction(tmp_path / folder)
+        centres = {image.name: image.projection_center() for image in model.images.values()}
+        off.append([np.linalg.norm(centres[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
+    assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+
+
+def test_refinement_with_priors_needs_priors(tmp_path):
+    result = run("locate", RING_MODEL, tmp_path / "out", "--refine-with-priors")
+    assert result.exit_code == 3
+    assert "needs priors" in result.stderr
+    with pytest.raises(ValueError, match="no effect with the scale unit"):
+        LocateOptions(scale="unit", refine_with_priors=True)
+
+
+def test_standard_deviations_and_directions_follow_the_axes(ring, tmp_path):
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()  # x becomes y, y becomes -x
+    table = write_table(tmp_path / "priors.txt", ring, ring.centers @ quarter.T)
+    plain, found = locate(RING_MODEL), locate(RING_MODEL, priors=table)
+    ratio = found.gauge.similarity.scale / plain.gauge.similarity.scale
+    for before, after in zip(plain.cameras, found.cameras, strict=True):
+        x, y, z = before.sigma
+        # The ring is exact, so that the turn is a quarter to 1e-6 or so, and so are the variances' shares.
+        np.testing.assert_allclose(after.sigma, ratio * np.array([y, x, z]), rtol=1e-4)
+    for before, after in zip(plain.pairs, found.pairs, strict=True):
+        np.testing.assert_allclose(after.direction, quarter @ before.direction, atol=1e-5)

@@ -146,6 +146,24 @@ def test_a_covering_set_shows_every_camera_enough_points_or_all_there_are():
     assert (np.diff(chosen) > 0).all()
 
 
+def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
+    def fan(count, widest):
+        angles = np.linspace(0.0, widest, count)
+        return np.stack([np.sin(angles), np.zeros(count), np.cos(angles)], axis=1)
+
+    tracks = Tracks(
+        offsets=np.array([0, 3, 9]),
+        cameras=np.array([0, 1, 2, 0, 1, 2, 3, 4, 5]),
+        rays=np.concatenate([fan(3, 2.5), fan(6, 0.5)]),
+    )
+    assert covering_set(tracks, 6, per_camera=1).tolist() == [1]  # shows all; the wider one, only three
+
+
+def test_two_views_are_no_track():
+    _, _, batch = scene(cameras=2)
+    assert tracks_of(batch, cameras=2).num_tracks == 0
+
+
 def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     centers, points, batch = scene()
     directions = measured(batch)

@@ -6,7 +6,8 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.robust.trust import Evidence, main_body
+from sfm_shapefit.robust.conditioning import condition
+from sfm_shapefit.robust.trust import Evidence, judge_cameras, main_body
 from sfm_shapefit.robust.verdicts import assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -86,6 +87,42 @@ def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
         contradicting_support=np.full(len(against), 60),
     )
     assert assess(ViewGraph(40, edges, v), t, evidence=evidence).trust.min() > 0.6
+
+
+def judged(n, seed, wrong_share, leverages_of_5):
+    """The trust of n cameras held well, pairs wrong at random but for those of camera 5."""
+    t, edges, v = clean(n, seed)
+    own = (edges == 5).any(axis=1)
+    wrong = (np.random.default_rng(seed).random(len(edges)) < wrong_share) & ~own
+    angles, sigmas = np.where(wrong, 1.0, 1e-3), np.full((n, 3), 1e-6)
+    leverages = np.where(own, leverages_of_5, 0.1)
+    held = condition(t, edges, ~wrong, sigmas, n)
+    return judge_cameras(
+        ViewGraph(n, edges, v), t, angles, np.full(len(edges), 1e-3), sigmas, held, leverages
+    ).trust
+
+
+def test_pairs_that_nothing_checks_are_no_evidence():
+    trust = judged(30, 5, 0.0, 1.0)
+    assert trust[5] == pytest.approx(2.0 / 3.0, abs=0.05)  # the prior, over 3/4 of nearly 1
+    assert np.delete(trust, 5).min() > 0.99
+    assert judged(30, 5, 0.0, 0.3)[5] > 0.99
+    assert judged(30, 5, 0.0, np.nan)[5] == pytest.approx(trust[5])  # outside of what is rigid
+
+
+def test_without_evidence_a_camera_is_trusted_as_pairs_of_the_scene_are_right():
+    trust = judged(40, 6, 0.3, 1.0)  # about 0.7 of the votes agree: 2/3 of that
+    assert trust[5] == pytest.approx(0.47, abs=0.06)
+    assert np.median(trust) > 0.99
+
+
+def test_one_pair_of_thousands_of_matches_does_not_outvote_the_others():
+    t, edges, v = clean(20, 7)
+    own = np.flatnonzero((edges == 3).any(axis=1))
+    v[own[1:]] = normalized(np.random.default_rng(7).standard_normal((len(own) - 1, 3)))
+    support = np.full(len(edges), 100)
+    support[own[0]] = 100_000
+    assert assess(ViewGraph(20, edges, v), t, evidence=supported(len(edges), support)).trust[3] < 0.5
 
 
 def test_evidence_follows_its_cameras_and_pairs():

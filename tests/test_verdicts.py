@@ -63,6 +63,14 @@ def test_a_pair_that_knows_it_is_uncertain_is_not_blamed():
     assert assess(graph, t, unsure).inliers[3]
 
 
+def test_a_reversed_direction_is_an_outlier_however_uncertain_it_is():
+    t, edges, v = measured(2)
+    v[3] = -v[3]
+    unsure = covariances(len(edges))
+    unsure[3] = 2.0**2 * np.eye(2)
+    assert not assess(ViewGraph(12, edges, v), t, unsure).inliers[3]
+
+
 def test_unknown_covariances_are_judged_by_the_common_level():
     t, edges, v = measured(3)
     v[3] = normalized(np.cross(v[3], v[4]))

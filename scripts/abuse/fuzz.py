@@ -7,6 +7,7 @@ sentence with exit code 2, 3 or 4; where the damage does not concern what is ask
 
 import argparse
 import collections
+import contextlib
 import os
 import shutil
 import sqlite3
@@ -81,19 +82,28 @@ def run(args: argparse.Namespace) -> int:
         start = time.perf_counter()
         codes: collections.Counter[tuple[str, int]] = collections.Counter()
         slowest = largest = failed = 0.0
-        for report in reports(base, work / "case", numbers, args.seed, expected, keep=args.only is not None):
-            codes[report.case.label.partition(":")[0], report.outcome.code] += 1
-            slowest, largest = (
-                max(slowest, report.outcome.cpu_s),
-                max(largest, report.outcome.peak_bytes / 1e9),
-            )
-            if report.faults:
-                failed += 1
-                print(f"case {report.number} ({report.case.label}): {'; '.join(report.faults)}", flush=True)
-                print(f"    {' '.join(report.case.arguments)}: {report.outcome.stderr[-1200:]}", flush=True)
-            if args.only is not None:
-                print(report)
-        print(f"{len(numbers)} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
+        done = 0
+        with contextlib.suppress(KeyboardInterrupt):  # which ends it early, with the figures so far
+            for report in reports(
+                base, work / "case", numbers, args.seed, expected, keep=args.only is not None
+            ):
+                done += 1
+                codes[report.case.label.partition(":")[0], report.outcome.code] += 1
+                slowest, largest = (
+                    max(slowest, report.outcome.cpu_s),
+                    max(largest, report.outcome.peak_bytes / 1e9),
+                )
+                if report.faults:
+                    failed += 1
+                    print(
+                        f"case {report.number} ({report.case.label}): {'; '.join(report.faults)}", flush=True
+                    )
+                    print(
+                        f"    {' '.join(report.case.arguments)}: {report.outcome.stderr[-1200:]}", flush=True
+                    )
+                if args.only is not None:
+                    print(report)
+        print(f"{done} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
         print(f"slowest {slowest:.1f} s of processor time, largest {largest:.2f} GB")
         for (kind, code), count in sorted(codes.items()):
             print(f"{kind:10} exit {code:3}: {count}")

@@ -80,7 +80,7 @@ def _cut_image(cutter: _Cutter) -> None:
     cutter.take_name()
     for _ in range(cutter.take("Q", "count")):
         cutter.take_many("dd", "xy")
-        cutter.take("Q", "reference")
+        cutter.take("Q", "point reference")
 
 
 def _cut_point(cutter: _Cutter) -> None:
@@ -89,7 +89,8 @@ def _cut_point(cutter: _Cutter) -> None:
     cutter.take_many("BBB", "colour")
     cutter.take("d", "error")
     for _ in range(cutter.take("Q", "count")):
-        cutter.take_many("II", "reference")
+        cutter.take("I", "image reference")
+        cutter.take("I", "reference")
 
 
 def _cut_rig(cutter: _Cutter) -> None:
@@ -108,7 +109,7 @@ def _cut_frame(cutter: _Cutter) -> None:
     for _ in range(cutter.take("I", "count")):
         cutter.take("i", "sensor type")
         cutter.take("I", "reference")
-        cutter.take("Q", "reference")
+        cutter.take("Q", "image reference")
 
 
 def words(data: bytes) -> list[tuple[int, int]]:

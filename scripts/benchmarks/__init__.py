@@ -10,7 +10,9 @@
     solver.py    subcommand `solver`: Newton against a generic cone solver
     clarabel_direct.py    ... called without cvxpy
     scale.py     subcommand `scale`: large graphs as they grow
+    rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
     trust.py     subcommand `trust`: standard deviations and trust against errors
+    onedsfm.py   subcommand `onedsfm`: the published scene Madrid Metropolis
     peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
     graph_peers.py    ... on bare graphs
     real_peers.py     ... on real scenes

@@ -120,7 +120,7 @@ def _solved(name: str, directions: Directions, folder: Path) -> Located:
     from sfm_shapefit import ViewGraph
     from sfm_shapefit.colmap.model import read_model
 
-    model = read_model(folder / "sparse" / "0", poses_only=True)
+    model = read_model(folder / "sparse" / "0")
     graph = ViewGraph(len(directions.cameras), directions.edges, directions.directions, directions.weights)
     solver = next(one for one in GRAPH_CONTENDERS if one.name == name).prepare(graph)
     reset_peak()
@@ -188,12 +188,12 @@ def _errors(found: Located, folder: Path, scene: Scene) -> Errors:
     from sfm_shapefit.colmap.model import read_model
     from sfm_shapefit.evaluation import evaluate_poses
 
-    truth = read_model(folder / scene.truth, poses_only=True)
+    truth = read_model(folder / scene.truth)
     if len(set(found.names) & set(truth.names)) < 3:
         raise RuntimeError("fewer than three cameras of the truth are placed")
     nowhere = np.tile(np.eye(3), (len(found.names), 1, 1))  # rotations are not compared
     errors = evaluate_poses(found.names, nowhere, found.centers, truth.names, truth.rotations, truth.centers)
-    given = set(read_model(folder / "sparse" / "0", poses_only=True).names) & set(truth.names)
+    given = set(read_model(folder / "sparse" / "0").names) & set(truth.names)
     position = errors.position
     missing = len(given - set(found.names))
     return Errors(median=position.median, mean=position.mean, max=position.max, num_missing=missing)

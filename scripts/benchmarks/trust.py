@@ -335,7 +335,7 @@ def _real_row(scene: Path) -> list[str]:
 
     found = sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db")
     reference = scene / "gt" if (scene / "gt").is_dir() else scene / "sparse" / "0"
-    truth = read_model(reference, poses_only=True)
+    truth = read_model(reference)
     cameras = found.placement.cameras
     wrong = rotation_errors_deg(found.model, truth)[cameras] > WRONG_DEG
     errors = sfm_shapefit.evaluate(found.reconstruction, reference).position

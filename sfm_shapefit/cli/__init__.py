@@ -4,7 +4,27 @@ A module per command. Flags are the fields of the options dataclasses. Results g
 messages to stderr.
 """
 
-from sfm_shapefit.cli import evaluate, inspection, locate, mapping, pictures, solve, synth
+from sfm_shapefit.cli import (
+    conversion,
+    evaluate,
+    inspection,
+    locate,
+    mapping,
+    pictures,
+    solve,
+    synth,
+)
 from sfm_shapefit.cli.app import app, main
 
-__all__ = ["app", "evaluate", "inspection", "locate", "main", "mapping", "pictures", "solve", "synth"]
+__all__ = [
+    "app",
+    "conversion",
+    "evaluate",
+    "inspection",
+    "locate",
+    "main",
+    "mapping",
+    "pictures",
+    "solve",
+    "synth",
+]

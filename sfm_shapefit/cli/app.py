@@ -8,7 +8,7 @@ from typer.core import TyperGroup
 
 from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination, refuse_little_memory
 
-_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "synth")
+_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
 """Of the commands in the help, by importance."""
 
 

@@ -84,6 +84,7 @@ def _inspection_table(found: "Inspection") -> Rows:
         ("directions", found.directions),
         ("pairs", statuses),
         ("points as nodes", found.points),
+        ("rigs", found.rigs),
         ("components", _components_line(seen)),
         *([("rigid pieces", shortened(_piece_lines(seen), SEE_JSON))] if seen.pieces else []),
         *([("not placed", shortened(left_out, SEE_JSON))] if left_out else []),

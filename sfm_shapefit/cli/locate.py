@@ -62,7 +62,8 @@ def locate_command(
         from sfm_shapefit.output import claimed_output
 
         options = options_from(LocateOptions, given, config)
-        protect = [path for path in (source, database, priors, config) if path is not None]
+        names = Path(options.fix) if options.fix else None
+        protect = [path for path in (source, database, priors, names, config) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=protect):
             from sfm_shapefit.pipeline import locate
             from sfm_shapefit.report import dumps
@@ -90,6 +91,7 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", shortened(left_out))] if left_out else []),
+        *_bodies_line(facts),
         *pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", objective_line(found.solve)),
@@ -102,6 +104,15 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str) -> Rows:
         ("time", f"{sum(found.timings_s.values()):.1f} s"),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
     ]
+
+
+def _bodies_line(facts: dict[str, Any]) -> Rows:
+    bodies = facts["bodies"]
+    if bodies is None:
+        return []
+    fixed = f", {bodies['num_fixed']} cameras fixed" if bodies["num_fixed"] else ""
+    inner = f"; {bodies['num_inner_pairs']} pairs inside them give no constraint"
+    return [("rigid bodies", f"{bodies['num_placed']} of {bodies['num_bodies']} placed{fixed}{inner}")]
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:

@@ -14,6 +14,8 @@ from sfm_shapefit.cli.flags import (
     OutputPath,
     Overwrite,
     Quiet,
+    Report,
+    Scene,
     one_path,
     options_from,
     takes,
@@ -35,6 +37,8 @@ def map_command(
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
     overwrite: Overwrite = False,
+    report: Report = True,
+    scene: Scene = False,
     config: Config = None,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -44,20 +48,22 @@ def map_command(
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
     with reported():
-        from sfm_shapefit.output import check_output
+        from sfm_shapefit.output import claimed_output
 
         options = options_from(MapOptions, given, config)
         protect = [path for path in (source, config) if path is not None]
-        check_output(target, overwrite=overwrite, protect=protect)
+        with claimed_output(target, overwrite=overwrite, protect=protect):
+            from sfm_shapefit.mapping.results import map_summary, write_map_result
+            from sfm_shapefit.mapping.run import map_database
+            from sfm_shapefit.report import dumps
 
-        from sfm_shapefit.mapping.results import map_summary, write_map_result
-        from sfm_shapefit.mapping.run import map_database
-        from sfm_shapefit.report import dumps
-
-        catch_termination()
-        with shown_progress(not quiet) as progress:
-            found = map_database(source, options, progress)
-            write_map_result(found, target, overwrite=overwrite, protect=protect)
+            catch_termination()
+            with shown_progress(not quiet) as progress:
+                found = map_database(source, options, progress)
+                write_map_result(
+                    found, target, overwrite=overwrite, protect=protect, report=report, scene=scene
+                )
+    with reported("interrupted; the output is complete"):
         if as_json:
             print(dumps(map_summary(found)))  # noqa: T201
         elif not quiet:

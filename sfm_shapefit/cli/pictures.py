@@ -26,9 +26,8 @@ def report_command(out: Output = None, *, scene: Scene = False) -> None:
         try:
             write_pictures(drawn, facts, folder, report=True, meshes=scene)
         except OSError as error:
-            raise InputError(
-                f"{folder} cannot be written ({error.strerror}); copy it elsewhere first"
-            ) from error
+            what = f"{folder} cannot be written ({error.strerror})"
+            raise InputError(f"{what}; copy it elsewhere first") from error
 
 
 @app.command("view")
@@ -40,7 +39,7 @@ def view_command(
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port to listen on.")] = 8080,
 ) -> None:
-    """Explore OUT in the browser: thresholds to move, cameras to pick, the input's poses beside the new ones."""
+    """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
     folder = one_path(out, None, "OUT")
     with reported():
         from sfm_shapefit.visual.sources import read_output

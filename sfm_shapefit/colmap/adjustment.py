@@ -22,7 +22,7 @@ their last digits from run to run.
 
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import cast
@@ -94,6 +94,7 @@ def bundle_adjust(
     tracks: TrackSource,
     structure_options: StructureOptions | None = None,
     options: AdjustmentOptions | None = None,
+    fixed_frames: Collection[int] = (),
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -102,10 +103,12 @@ def bundle_adjust(
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None.
         options: settings; the defaults if None.
+        fixed_frames: ids of frames whose poses stay what they are to the last bit.
 
     Returns:
         The adjusted model, with ids and colours of points as from `triangulate`. The gauge is held by two
-        cameras, so scale and axes stay near the seed's.
+        cameras, so scale and axes stay near the seed's; fewer than two fixed frames do not hold it. The poses
+        of sensors in their rigs stay what they are.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or the adjustment diverges.
@@ -125,7 +128,7 @@ def bundle_adjust(
                 "no 3D point can be triangulated at these camera positions, so there is nothing to adjust; "
                 "run without bundle adjustment"
             )
-        steps, converged = _solve(current, stage.loss_scale_px, options)
+        steps, converged = _solve(current, stage.loss_scale_px, options, fixed_frames)
         _refuse_diverged(current)
         iterations += steps
     answer = filtered(current, structure_options)
@@ -175,12 +178,17 @@ def quiet_stderr(enabled: bool = True) -> Iterator[None]:
 
 
 def _solve(
-    reconstruction: pycolmap.Reconstruction, loss_scale_px: float, options: AdjustmentOptions
+    reconstruction: pycolmap.Reconstruction,
+    loss_scale_px: float,
+    options: AdjustmentOptions,
+    fixed_frames: Collection[int],
 ) -> tuple[int, bool]:
     """Adjust our own `reconstruction` in place; return the number of steps and whether they converged."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)
+    for frame_id in sorted(set(fixed_frames) & set(reconstruction.reg_frame_ids())):
+        config.set_constant_rig_from_world_pose(frame_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     settings = _settings(loss_scale_px, options)
     with quiet_stderr(options.quiet):
@@ -201,6 +209,7 @@ def _settings(loss_scale_px: float, options: AdjustmentOptions) -> pycolmap.Bund
     settings.refine_focal_length = options.refine_intrinsics
     settings.refine_extra_params = options.refine_intrinsics
     settings.refine_principal_point = False
+    settings.refine_sensor_from_rig = False
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     settings.ceres.loss_function_scale = loss_scale_px
     settings.ceres.solver_options.function_tolerance = _FUNCTION_TOLERANCE

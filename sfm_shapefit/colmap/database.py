@@ -15,6 +15,7 @@ to 4.2 (columns that came later, identity or zero poses that mean "none") measur
 """
 
 import os
+import secrets
 import shutil
 import sqlite3
 import struct
@@ -35,6 +36,7 @@ from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.output import locked_folder, remove_abandoned
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
@@ -260,9 +262,9 @@ class MatchDatabase:
         return np.frombuffer(qvec + tvec, dtype="<f8")
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
-        """Return the matches of the chosen pairs, without repetitions and matches that have no ray."""
+        """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
         keypoints, pair_of = self._read_match_rows(chosen)
-        keypoints, pair_of = _without_repetitions(keypoints, pair_of)
+        keypoints, pair_of = _in_order(keypoints, pair_of)
         bounds = np.searchsorted(pair_of, np.arange(len(chosen) + 1))
         rays = np.empty((2, len(keypoints), 3))
         for k, pair in enumerate(chosen.tolist()):
@@ -410,10 +412,13 @@ def _size(path: Path) -> int:
 def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
     files = [path, *(_sidecar(path, suffix) for suffix in _SIDECARS)]
+    parent = Path(tempfile.gettempdir())
+    remove_abandoned(parent, ".shapefit-*.copy")
     for _ in range(_COPY_ATTEMPTS):
         before = _fingerprints(files)
         try:
-            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sfm_shapefit_")))
+            name = f".shapefit-{secrets.token_hex(8)}.copy"
+            folder = stack.enter_context(locked_folder(parent / name))
             for file in filter(Path.exists, files):
                 shutil.copyfile(file, folder / file.name)
         except OSError as error:
@@ -584,14 +589,13 @@ def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     return len(data) == rows * cols * itemsize
 
 
-def _without_repetitions(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
-    """Drop all but the first occurrence of each match (M, 2) within its pair; pairs stay in order."""
-    columns = (pair_of, keypoints[:, 0], keypoints[:, 1])
-    order = np.lexsort(columns[::-1])
-    in_order = [column[order] for column in columns]
-    repeated = np.logical_and.reduce([column[1:] == column[:-1] for column in in_order])
-    if not repeated.any():
-        return keypoints, pair_of
-    keep = np.ones(len(keypoints), dtype=np.bool_)
-    keep[order[1:][repeated]] = False  # lexsort is stable: the first of equals comes first
+def _in_order(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:
+    """Sort the matches (M, 2) within each pair and drop repetitions; pairs stay in order.
+
+    Sums over matches then do not depend on the order in which the database lists them.
+    """
+    order = np.lexsort((keypoints[:, 1], keypoints[:, 0], pair_of))
+    keypoints, pair_of = keypoints[order], pair_of[order]
+    repeated = (pair_of[1:] == pair_of[:-1]) & (keypoints[1:] == keypoints[:-1]).all(axis=1)
+    keep = np.append(True, ~repeated)[: len(pair_of)]
     return keypoints[keep], pair_of[keep]

@@ -4,7 +4,9 @@ COLMAP's convention is x_cam = R x_world + t with centre C = -R^T t. Only R and 
 trusted: the centres of the input are carried along for comparison and never place a camera.
 
 Poses live in frames (`rig_from_world`); for a model of an older COLMAP, pycolmap makes one frame per
-image. A rig with several sensors would tie positions together by metric offsets; it is refused here.
+image. In a rig of several sensors cam_from_world = sensor_from_rig * rig_from_world, so that a camera stands
+at C = C_frame + R_frame^T o, with the metric offset o = -R_s^T t_s of its sensor; the frames are the
+unknowns.
 
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
@@ -20,9 +22,12 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.colmap.check import check_model_files, model_suffix
+from sfm_shapefit.colmap.foreign import reconstruction_of
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
 
 UInt64Array = npt.NDArray[np.uint64]
@@ -31,6 +36,7 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
+_LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
 _QUIET = 3  # glog's FATAL
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalised coordinates are the same numbers.
@@ -39,12 +45,16 @@ _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PosedModel:
-    """The posed images of a COLMAP model, in ascending order of their ids. Arrays are read-only."""
+    """The posed images of a COLMAP model, in the order of their names. Arrays are read-only.
+
+    Ids are what a program happened to count; names are the user's. So the answer, whose sums depend on the
+    order of images, does not depend on the order in which they were once added.
+    """
 
     reconstruction: pycolmap.Reconstruction
     """The input; nobody modifies it."""
     image_ids: IntArray
-    """(n,) ascending ids of the images that have a pose."""
+    """(n,) ids of the images that have a pose."""
     names: tuple[str, ...]
     """The names of those images, all different."""
     rotations: FloatArray
@@ -53,6 +63,21 @@ class PosedModel:
     """(n, 3) the input's camera centres; they never place a camera, and may all be 0."""
     focal_lengths_px: FloatArray
     """(n,) mean focal length; for a camera without one (equirectangular) its pixels per radian."""
+    frame_ids: IntArray
+    """(n,) id of the frame of each image."""
+    frame_offsets: FloatArray
+    """(n, 3) C - C_frame in world axes and the unit of the rigs, exactly 0 for a rig's reference sensor."""
+
+    @property
+    def bodies(self) -> Bodies:
+        """The frames as rigid bodies of images."""
+        _, labels = np.unique(self.frame_ids, return_inverse=True)
+        return Bodies(body_of=labels.ravel(), offsets=self.frame_offsets)
+
+    @property
+    def has_rigs(self) -> bool:
+        """Whether any frame has several posed images."""
+        return len(np.unique(self.frame_ids)) < self.num_images
 
     @property
     def num_images(self) -> int:
@@ -60,21 +85,24 @@ class PosedModel:
         return len(self.image_ids)
 
 
-def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool = False) -> PosedModel:
+def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     """Read a model folder, or take a reconstruction in memory, and refuse what cannot be used.
 
     Args:
         source: a folder with cameras, images and points3D (.bin preferred over .txt) and, from COLMAP
-            3.12 on, rigs and frames; or a reconstruction, which is not modified.
-        poses_only: the poses are read to be compared, and no camera will be moved: rigs with several
-            sensors are accepted.
+            3.12 on, rigs and frames; or a reconstruction, which is not modified; or a model file of Bundler,
+            openMVG or OpenSfM.
 
     Raises:
         InputError: if files are missing, truncated or not finite (see `check_model_files`), if pycolmap
-            refuses them, if a rig has several sensors, or if fewer than two images have a pose.
+            refuses them, if the pose of a sensor in its rig is not known, or if fewer than two images have a
+            pose.
     """
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
+        is_checked = False
+    elif is_model_file(source):
+        label, reconstruction = str(source), reconstruction_of(read_scene(source), source)
         is_checked = False
     else:
         folder = Path(source)
@@ -83,7 +111,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction, *, poses_only: bool
     try:
         with quiet_pycolmap():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
-            return _posed_model(label, reconstruction, accept_rigs=poses_only)
+            return _posed_model(label, reconstruction)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
@@ -95,7 +123,12 @@ def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
         model: the posed images.
         turns: (n, 3, 3) rotations of the cameras in world axes: cam_from_world becomes R turn^T. Where one is
             exactly the identity the rotation keeps its bits.
+
+    Raises:
+        InputError: if frames have several images, which cannot turn one by one.
     """
+    if model.has_rigs:
+        raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
     copy = pycolmap.Reconstruction(model.reconstruction)
     for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
         image = copy.image(int(model.image_ids[index]))
@@ -211,15 +244,16 @@ def _refuse_not_finite(label: str, kind: str, ids: list[int], values: npt.ArrayL
         raise InputError(f"{label}: {kind} {ids[int(np.argmin(finite))]} is not finite")
 
 
-def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_rigs: bool) -> PosedModel:
+def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedModel:
     """Collect the posed images of a reconstruction."""
-    image_ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    posed = {i: image.name for i, image in reconstruction.images.items() if image.has_pose}
+    image_ids = sorted(posed, key=lambda i: (posed[i], i))
     if len(image_ids) < 2:
         few = "only one image" if image_ids else "no image"
         raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
     images = [reconstruction.image(i) for i in image_ids]
-    for image in [] if accept_rigs else images:
-        _refuse_rig(label, image, reconstruction.frame(image.frame_id))
+    for image in images:
+        _refuse_uncalibrated(label, image, reconstruction)
     names = tuple(image.name for image in images)
     if len(set(names)) < len(names):
         repeated = next(name for k, name in enumerate(names) if name in names[:k])
@@ -229,7 +263,8 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_
     poses = [image.cam_from_world() for image in images]
     rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
-    _refuse_not_finite(label, "the position of image", image_ids, translations)
+    absurd = np.abs(translations) > _LARGEST_COORDINATE
+    _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
     return PosedModel(
         reconstruction=reconstruction,
         image_ids=frozen(np.array(image_ids, dtype=np.int64)),
@@ -237,16 +272,33 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction, *, accept_
         rotations=frozen(rotations),
         centers=frozen(-np.einsum("nji,nj->ni", rotations, translations)),
         focal_lengths_px=frozen(_focal_lengths_px(label, cameras)),
+        frame_ids=frozen(np.array([image.frame_id for image in images], dtype=np.int64)),
+        frame_offsets=frozen(np.array([_frame_offset(image, reconstruction) for image in images])),
     )
 
 
-def _refuse_rig(label: str, image: pycolmap.Image, frame: pycolmap.Frame) -> None:
-    """Refuse an image whose frame has other images, or whose camera is not its rig's reference."""
-    if len(list(frame.image_ids)) > 1 or not image.is_ref_in_frame():
+def _refuse_uncalibrated(label: str, image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> None:
+    """Refuse an image whose sensor has no pose in its rig: nothing says where it stands in its frame."""
+    rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
+    sensor = reconstruction.camera(image.camera_id).sensor_id
+    if not rig.is_ref_sensor(sensor) and not rig.has_sensor_from_rig(sensor):
         raise InputError(
-            f"{label}: image {image.name} belongs to a rig with several sensors, which is not supported yet; "
-            "give a model with one trivial rig per camera"
+            f"{label}: camera {image.camera_id} has no pose in rig {rig.rig_id} (sensor_from_rig), so that "
+            f"image {image.name} has none; calibrate the rig, or give a trivial rig to each camera"
         )
+
+
+def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> FloatArray:
+    """Return C - C_frame of a posed image in world axes, exactly 0 for the reference sensor."""
+    frame = reconstruction.frame(image.frame_id)
+    sensor, rig = reconstruction.camera(image.camera_id).sensor_id, reconstruction.rig(frame.rig_id)
+    if rig.is_ref_sensor(sensor):
+        return np.zeros(3)
+    sensor_from_rig, rig_from_world = rig.sensor_from_rig(sensor), frame.rig_from_world
+    assert sensor_from_rig is not None
+    assert rig_from_world is not None
+    in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
+    return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
 
 
 def _checked_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:

@@ -1,7 +1,8 @@
 """A seeded model: the input's rotations and intrinsics, our camera centres, and no 3D points yet.
 
-COLMAP keeps poses in frames, x_cam = R x_world + t with t = -R C. Moving a camera replaces t and hands on
-the very same quaternion, so that rotations and intrinsics come out bit-identical.
+COLMAP keeps poses in frames, x_rig = R x_world + t with t = -R C. Moving a frame replaces t and hands on
+the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in
+their rigs are not touched: all images of a frame move with it.
 """
 
 from collections.abc import Callable, Mapping
@@ -20,7 +21,11 @@ Keypoints = Mapping[int, FloatArray] | Callable[[int], FloatArray]
 
 
 def build_seed(
-    model: PosedModel, placed: BoolArray, centers: FloatArray, keypoints: Keypoints | None = None
+    model: PosedModel,
+    placed: BoolArray,
+    centers: FloatArray,
+    keypoints: Keypoints | None = None,
+    fixed: BoolArray | None = None,
 ) -> pycolmap.Reconstruction:
     """Return a new reconstruction with the cameras at `centers`; the input is not touched.
 
@@ -28,10 +33,12 @@ def build_seed(
 
     Args:
         model: the input.
-        placed: (n,) which images have a centre; the others, and images that had no pose, are unregistered.
+        placed: (n,) which images have a centre; the others, and images that had no pose, are unregistered
+            unless another image of their frame is placed.
         centers: (n, 3) camera centres in world axes; rows of images that are not placed are ignored.
         keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
             it has none (a missing key, or no rows), and all images if None, keep those of the model.
+        fixed: (n,) images whose frame keeps its pose to the last bit; none if None.
 
     Raises:
         ValueError: if the shapes do not fit the model, or the centre of a placed image is not finite.
@@ -44,17 +51,25 @@ def build_seed(
         raise ValueError(f"the centre of image {model.names[worst]} is not finite")
 
     seed = without_points(model.reconstruction)
+    still = np.zeros(n, dtype=np.bool_) if fixed is None else fixed
+    settled = set(model.frame_ids[still].tolist())
     for index, image_id in enumerate(model.image_ids.tolist()):
         image = seed.image(image_id)
-        if placed[index]:
-            translation = -(model.rotations[index] @ centers[index])
-            pose = pycolmap.Rigid3d(image.cam_from_world().rotation, translation)
-            seed.frame(image.frame_id).rig_from_world = pose  # frames are trivial: one image each
+        if placed[index] and image.frame_id not in settled:
+            frame = seed.frame(image.frame_id)
+            old = frame.rig_from_world
+            assert old is not None  # a posed image's frame has a pose
+            rotation = old.rotation
+            is_reference = not model.frame_offsets[index].any() and image.is_ref_in_frame()
+            turn = model.rotations[index] if is_reference else rotation.matrix()
+            translation = -(turn @ (centers[index] - model.frame_offsets[index]))
+            frame.rig_from_world = pycolmap.Rigid3d(rotation, translation)
+            settled.add(image.frame_id)
         xy = _keypoints_of(keypoints, index)
         if xy is not None and len(xy):
             image.points2D.clear()  # the setter insists on it
             image.points2D = pycolmap.Image(keypoints=np.ascontiguousarray(xy, dtype=np.float64)).points2D
-    registered = {seed.image(i).frame_id for i in model.image_ids[placed].tolist()}
+    registered = set(model.frame_ids[placed | still].tolist())
     for frame_id in sorted(set(seed.reg_frame_ids()) - registered):
         seed.deregister_frame(frame_id)
     return seed
@@ -75,8 +90,8 @@ def turned(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolma
     return copy
 
 
-def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary format into an existing folder, and walk the files once more.
+def write_model(reconstruction: pycolmap.Reconstruction, folder: Path, *, text: bool = False) -> None:
+    """Write a model in COLMAP's binary or text format into an existing folder, and walk the files once more.
 
     pycolmap does not notice a disk that is full, hence the second look.
 
@@ -84,7 +99,10 @@ def write_model(reconstruction: pycolmap.Reconstruction, folder: Path) -> None:
         InputError: if the files cannot be written, or are not complete afterwards.
     """
     try:
-        reconstruction.write_binary(folder)
+        if text:
+            reconstruction.write_text(folder)
+        else:
+            reconstruction.write_binary(folder)
     except PYCOLMAP_ERRORS as error:
         raise InputError(f"{folder} cannot be written; check its permissions and the free space") from error
     try:

@@ -17,38 +17,42 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.rig_workspace import camera_id_of, new_frames, new_rigs, rig_model
 from sfm_shapefit.output import atomic_folder
-from sfm_shapefit.synthetic import Scene, WorkspaceOptions
+from sfm_shapefit.synthetic import RigScene, Scene, WorkspaceOptions
 
 _CAMERA_ID = 1
 _CALIBRATED = 2  # COLMAP's TwoViewGeometry::ConfigurationType
 
 
-def write_workspace(scene: Scene, out: Path, options: WorkspaceOptions | None = None) -> None:
+def write_workspace(
+    scene: Scene, out: Path, options: WorkspaceOptions | None = None, rigs: RigScene | None = None
+) -> None:
     """Write a scene as a COLMAP workspace, whole or not at all.
 
     Args:
         scene: what to write.
         out: a folder that does not exist yet; its parents are made.
         options: what stands in it; the defaults if None.
+        rigs: the rigs of that very scene; one camera and a frame per image if None.
 
     Raises:
         InputError: if `out` exists or cannot be written.
     """
     with atomic_folder(out) as workspace:
-        _write_contents(scene, workspace, options or WorkspaceOptions())
+        _write_contents(scene, workspace, options or WorkspaceOptions(), rigs)
 
 
-def _write_contents(scene: Scene, workspace: Path, options: WorkspaceOptions) -> None:
+def _write_contents(scene: Scene, workspace: Path, options: WorkspaceOptions, rigs: RigScene | None) -> None:
     """Write the files of a workspace into an empty folder."""
     if options.database:
-        _write_database(scene, workspace / "database.db", relative_poses=options.relative_poses)
-    truth = _full_model(scene, scene.rotations)
+        _write_database(scene, workspace / "database.db", rigs, relative_poses=options.relative_poses)
+    truth = _full_model(scene, scene.rotations, rigs)
     perturbed = not np.array_equal(scene.rotations, scene.stated_rotations)
     if options.model == "rotations":
-        model = _rotations_only_model(scene)
+        model = _rotations_only_model(scene, rigs)
     else:
-        model = _full_model(scene, scene.stated_rotations) if perturbed else truth
+        model = _full_model(scene, scene.stated_rotations, rigs) if perturbed else truth
     write_model(model, workspace / "sparse" / "0")
     if model is not truth:
         write_model(truth, workspace / "truth")
@@ -63,8 +67,11 @@ def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
     model.write_binary(folder)
 
 
-def _rotations_only_model(scene: Scene) -> pycolmap.Reconstruction:
-    """Return cameras and images with rotations, all centres at the origin, and nothing else."""
+def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Reconstruction:
+    """Return cameras and images with rotations, all centres (of frames) at the origin, and nothing else."""
+    if rigs is not None:
+        images = [_image(k, camera_id=camera_id_of(rigs, k)) for k in range(scene.num_images)]
+        return rig_model(rigs, _camera(scene), images, np.zeros((len(rigs.rig_of_frame), 3)))
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(_camera(scene))
     for index, rotation in enumerate(scene.stated_rotations):
@@ -72,16 +79,20 @@ def _rotations_only_model(scene: Scene) -> pycolmap.Reconstruction:
     return model
 
 
-def _full_model(scene: Scene, rotations: FloatArray) -> pycolmap.Reconstruction:
+def _full_model(scene: Scene, rotations: FloatArray, rigs: RigScene | None) -> pycolmap.Reconstruction:
     """Return the model at the true centres and points, with the given rotations.
 
     Points that fewer than two images show are left out. Point p of the scene has id p + 1.
     """
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(_camera(scene))
-    for index, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):
-        pose = rigid(rotation, -rotation @ center)
-        model.add_image_with_trivial_frame(_image(index, scene.keypoints[index]), pose)
+    if rigs is not None:
+        images = [_image(k, xy, camera_id_of(rigs, k)) for k, xy in enumerate(scene.keypoints)]
+        model = rig_model(rigs, _camera(scene), images, scene.centers[rigs.sensor_of_image == 0])
+    else:
+        model = pycolmap.Reconstruction()
+        model.add_camera_with_trivial_rig(_camera(scene))
+        for index, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):
+            pose = rigid(rotation, -rotation @ center)
+            model.add_image_with_trivial_frame(_image(index, scene.keypoints[index]), pose)
 
     point_ids, first, image_ids, keypoint_ids = _tracks(scene)
     for k, point in enumerate(point_ids):
@@ -129,12 +140,12 @@ def image_name(index: int) -> str:
     return f"{index + 1:04d}.jpg"
 
 
-def _image(index: int, keypoints: FloatArray | None = None) -> pycolmap.Image:
+def _image(index: int, keypoints: FloatArray | None = None, camera_id: int = _CAMERA_ID) -> pycolmap.Image:
     """Return image `index` without pose."""
     return pycolmap.Image(
         name=image_name(index),
         keypoints=np.empty((0, 2)) if keypoints is None else keypoints,
-        camera_id=_CAMERA_ID,
+        camera_id=camera_id,
         image_id=index + 1,
     )
 
@@ -147,12 +158,15 @@ def rigid(rotation: FloatArray, translation: FloatArray) -> pycolmap.Rigid3d:
 # --- database --------------------------------------------------------------------------------------------
 
 
-def _write_database(scene: Scene, path: Path, *, relative_poses: bool) -> None:
+def _write_database(scene: Scene, path: Path, rigs: RigScene | None, *, relative_poses: bool) -> None:
     """Write a new database; nothing but the file itself is left in the folder."""
     database = pycolmap.Database.open(path)
     try:
         with pycolmap.DatabaseTransaction(database):
-            _write_images(scene, database)
+            if rigs is None:
+                _write_images(scene, database)
+            else:
+                _write_rig_images(rigs, database)
             _write_pairs(scene, database, relative_poses=relative_poses)
     finally:
         database.close()
@@ -180,6 +194,21 @@ def _write_images(scene: Scene, database: pycolmap.Database) -> None:
         database.write_image(image, use_image_id=True)
         database.write_frame(frame, use_frame_id=True)
         database.write_keypoints(index + 1, keypoints.astype(np.float32))
+
+
+def _write_rig_images(rigs: RigScene, database: pycolmap.Database) -> None:
+    """Write cameras, rigs, frames, images and keypoints."""
+    cameras, made = new_rigs(rigs, _camera(rigs.scene))
+    for camera in cameras:
+        database.write_camera(camera, use_camera_id=True)
+    for rig in made:
+        database.write_rig(rig, use_rig_id=True)
+    images = [_image(k, camera_id=camera_id_of(rigs, k)) for k in range(rigs.scene.num_images)]
+    for frame in new_frames(rigs, images):
+        database.write_frame(frame, use_frame_id=True)
+    for image, keypoints in zip(images, rigs.scene.keypoints, strict=True):
+        database.write_image(image, use_image_id=True)
+        database.write_keypoints(image.image_id, keypoints.astype(np.float32))
 
 
 def _write_pairs(scene: Scene, database: pycolmap.Database, *, relative_poses: bool) -> None:

@@ -39,11 +39,12 @@ def read_graph(path: Path | str) -> ViewGraph:
     if width < _MIN_COLUMNS:
         raise InputError(f"{file}, line {numbers[0]}: expected i j and a direction, got {width} columns")
     values = number_table(file, numbers, rows, first=2, width=width)
-    directions, weights = _directions_and_weights(values)
+    with np.errstate(over="ignore"):  # a length that overflows is no unit length
+        directions, weights = _directions_and_weights(values)
+        lengths = np.linalg.norm(directions, axis=1)
     ids, nodes = node_indices([word for row in rows for word in row[:2]])
     edges = nodes.reshape(-1, 2)
 
-    lengths = np.linalg.norm(directions, axis=1)
     refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
     refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
     refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")

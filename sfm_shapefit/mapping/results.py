@@ -87,7 +87,13 @@ def _averaging_summary(averaging: AveragedRotations) -> dict[str, Any]:
 
 
 def write_map_result(
-    found: MapResult, out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()
+    found: MapResult,
+    out: Path | str,
+    *,
+    overwrite: bool = False,
+    protect: Sequence[Path | str] = (),
+    report: bool = True,
+    scene: bool = False,
 ) -> None:
     """Write all models into a folder that appears whole or not at all.
 
@@ -96,11 +102,12 @@ def write_map_result(
         out: the folder to be made.
         overwrite: replace an earlier output of this package.
         protect: paths that `out` must not be or contain, beside the database.
+        report, scene: for each model as in `write_result`.
 
     Raises:
         InputError: if the folder exists, cannot be written, or would hit a protected path.
     """
     with atomic_folder(out, overwrite=overwrite, protect=[found.database, *protect]) as folder:
         for number, model in enumerate(found.models):
-            write_result(model.located, folder / str(number))
+            write_result(model.located, folder / str(number), report=report, scene=scene)
         write_json(map_summary(found), folder / MAP_MARKER)

@@ -25,8 +25,8 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    model = read_model(reconstruction, poses_only=True)
-    truth = read_model(reference, poses_only=True)
+    model = read_model(reconstruction)
+    truth = read_model(reference)
     return evaluate_poses(
         model.names,
         model.rotations,

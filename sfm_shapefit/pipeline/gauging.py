@@ -25,6 +25,8 @@ def read_priors(
     if table is not None:
         return table_priors(Path(table), model)
     if options.scale != "prior":
+        if options.refine_with_priors:
+            raise InputError("refine_with_priors needs priors; give a table, or the scale prior")
         return None
     if inputs.database is None:
         raise InputError("the scale prior needs position priors; give a table with --priors, or a database")

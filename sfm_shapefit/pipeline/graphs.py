@@ -1,19 +1,31 @@
 """`solve GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
 
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.averaging import average_rotations
+from sfm_shapefit.colmap.foreign import relative_poses_of
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import EpipolarGeometries, is_onedsfm, read_graph, read_onedsfm, read_rotations
+from sfm_shapefit.formats import (
+    EpipolarGeometries,
+    is_onedsfm,
+    is_relative_poses,
+    read_graph,
+    read_onedsfm,
+    read_relative_poses,
+    read_rotations,
+)
 from sfm_shapefit.pipeline.clock import Clock
 from sfm_shapefit.placement import place, place_further
 from sfm_shapefit.results import GraphResult
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.viewgraph import ViewGraph
+
+if TYPE_CHECKING:
+    import pycolmap
 
 MAX_ROTATION_ERROR_DEG = 10.0
 
@@ -27,7 +39,7 @@ class _Rotations(NamedTuple):
 
 
 def solve_graph_file(
-    path: Path | str,
+    path: "Path | str | pycolmap.PoseGraph",
     options: PlacementOptions | None = None,
     *,
     rotations: Path | str | None = None,
@@ -37,7 +49,8 @@ def solve_graph_file(
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
 
     Args:
-        path: a text file, see `formats.read_graph`, or a 1DSfM folder or EGs.txt, see `formats.read_onedsfm`.
+        path: a text file, see `formats.read_graph`; or relative poses: a 1DSfM folder or EGs.txt, see
+            `formats.read_onedsfm`, GLOMAP's text, see `formats.read_relative_poses`, or a pose graph.
         options: settings; defaults if None.
         rotations: rots.txt of a 1DSfM source, see `formats.read_rotations`; averaged by pycolmap if None.
         max_rotation_error_deg: pairs of a 1DSfM source whose relative rotation contradicts those of the
@@ -50,16 +63,17 @@ def solve_graph_file(
     """
     options = options or PlacementOptions()
     clock = Clock()
-    geometries, found, statement = None, None, "directions as given"
-    if is_onedsfm(path):
+    found, statement = None, "directions as given"
+    with clock("read"):
+        geometries = _relative_poses(path)
+    if geometries is not None:
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
-        with clock("read"):
-            geometries = read_onedsfm(path)
         with clock("rotations"):
             found = _rotations(geometries, rotations)
         graph, statement = _consistent(geometries, found, max_rotation_error_deg)
     else:
+        assert isinstance(path, Path | str)
         if rotations is not None:
             raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
         with clock("read"):
@@ -71,7 +85,7 @@ def solve_graph_file(
     with clock("further pieces"):
         further = tuple(place_further(placement, options))
     return GraphResult(
-        path=Path(path),
+        path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
         statement=statement,
         options=options,
         placement=placement,
@@ -80,6 +94,15 @@ def solve_graph_file(
         geometries=geometries,
         rotations=None if found is None else found.cam_from_world,
     )
+
+
+def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeometries | None:
+    """Return the relative poses of a source; None if it is a bare graph of directions."""
+    if not isinstance(source, Path | str):
+        return relative_poses_of(source)
+    if is_onedsfm(source):
+        return read_onedsfm(source)
+    return read_relative_poses(source) if is_relative_poses(source) else None
 
 
 def _consistent(

@@ -8,9 +8,11 @@ from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import DirectionStatus
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
+from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
 from sfm_shapefit.pipeline.measurement import evidence_of, joint_graph, measure_directions, view_graph
+from sfm_shapefit.pipeline.rigid_bodies import rigs_statement
 from sfm_shapefit.pipeline.sources import choose_inputs, open_source
 
 if TYPE_CHECKING:
@@ -39,7 +41,7 @@ def inspect(
             is diagnosed; `diagnosis.obstacle` says why.
     """
     options = options or LocateOptions()
-    if isinstance(source, Path | str) and Path(source).is_file():
+    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
         return _inspect_graph(Path(source), options, theory=theory)
@@ -65,6 +67,7 @@ def inspect(
                     evidence_of(directions).contradicting,
                 ),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+                rigs=rigs_statement(model, joint),
             )
 
 

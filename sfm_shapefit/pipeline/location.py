@@ -20,10 +20,12 @@ from sfm_shapefit.pipeline.measurement import (
     shared_errors,
     with_points,
 )
+from sfm_shapefit.pipeline.pulling import pulled
+from sfm_shapefit.pipeline.rigid_bodies import placed, rigid_gauge, rigid_parts
 from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
 from sfm_shapefit.pipeline.sources import MatchSource, choose_inputs, open_source
-from sfm_shapefit.placement import Placement, place
+from sfm_shapefit.placement import Placement
 from sfm_shapefit.results import LocateResult, quality_warnings, trust_warnings
 
 if TYPE_CHECKING:
@@ -61,6 +63,7 @@ def locate(
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
         known = read_priors(model, inputs, options, priors)
+        rigid = rigid_parts(model, options, has_priors=known is not None)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
@@ -71,14 +74,17 @@ def locate(
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = place(
-                joint.graph, options.for_placement(), joint.covariance, evidence, joint.num_cameras
+            placement = placed(joint, rigid, evidence, options)
+            kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+            gauge = rigid_gauge(
+                model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)
             )
-            kept = trusted(placement, options.min_trust)
-            gauge = chosen_gauge(model, placement, kept, options, known)
+            if known is not None and options.refine_with_priors:
+                placement, gauge = pulled(placement, gauge, known, joint.covariance, evidence)
+                kept = trusted(placement, options.min_trust)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock)
+        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)
         warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
@@ -94,6 +100,7 @@ def locate(
         warnings=warnings,
         turned_deg=turned_deg,
         further=further,
+        fixed=rigid.fixed,
     )
 
 

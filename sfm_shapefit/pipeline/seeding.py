@@ -38,20 +38,23 @@ def seeded_model(
     gauge: Gauge,
     options: LocateOptions,
     clock: Clock,
+    fixed: BoolArray | None = None,
 ) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
     """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
 
     `kept` says which of the placement's cameras are in the model, `gauge` where those are in its units.
+    Images that are `fixed` keep their poses to the last bit.
     """
     adjusted = None
     located = kept, gauge.similarity.apply(placement.locations[kept])
     with clock("structure"):
-        seed, tracks = _seed_and_tracks(source, placement, located, clock.advance)
+        seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
         if not options.bundle_adjust:  # which triangulates at the seed's poses itself
             seeded = triangulate(seed, tracks, options.for_structure())
     if options.bundle_adjust:
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options.for_structure())
+            still = () if fixed is None else source.model.frame_ids[fixed].tolist()
+            adjusted = bundle_adjust(seed, tracks, options.for_structure(), fixed_frames=still)
             seeded = adjusted.reconstruction
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
@@ -89,19 +92,17 @@ def _seed_and_tracks(
     placement: Placement,
     located: tuple[BoolArray, FloatArray],
     advance: Callable[[int, int], None],
+    fixed: BoolArray | None,
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
-    """Return the model with its cameras moved, and the tracks to triangulate at their new poses.
-
-    `located` says which of the placement's cameras are kept, and where those are in the output's units.
-    """
+    """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
     model, (kept, centers) = source.model, located
     placed = np.zeros(model.num_images, dtype=np.bool_)
     placed[placement.cameras[kept]] = True
     all_centers = np.full((model.num_images, 3), np.nan)
     all_centers[placement.cameras[kept]] = centers
     if source.database is None:
-        return build_seed(model, placed, all_centers), model.reconstruction
-    seed = build_seed(model, placed, all_centers, source.database.keypoints)
+        return build_seed(model, placed, all_centers, fixed=fixed), model.reconstruction
+    seed = build_seed(model, placed, all_centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     batches = _counted(_without_pairs(source.batches(among), placement.rejected_pairs), source.total, advance)

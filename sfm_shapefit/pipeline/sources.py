@@ -61,7 +61,9 @@ def choose_inputs(
         return Inputs(
             folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
         )
-    path = Path(database) if database is not None else folder and find_database(folder)
+    is_folder = folder is not None and not folder.is_file()  # pixels of other programs' models may differ
+    found = find_database(folder) if folder is not None and is_folder else None
+    path = Path(database) if database is not None else found
     if path is None:
         if source != "auto":
             raise InputError(f"directions from {source} need a database; give one with --database")

@@ -18,11 +18,16 @@ from sfm_shapefit.viewgraph import ViewGraph
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
 _FILTERED = "left out by the filter"
 _OUTSIDE = "outside the pieces that are solved"
+_INNER = "inside a frame, or between fixed cameras: it says nothing of positions"
 _NOT_SOLVED = "free: its directions determine no placement"
 
 
 def camera_rows(
-    placement: Placement, centers: FloatArray, scale: float, further: Sequence[Placement] = ()
+    placement: Placement,
+    centers: FloatArray,
+    scale: float,
+    further: Sequence[Placement] = (),
+    axes: FloatArray | None = None,
 ) -> list[CameraRow]:
     """Return one row per camera of a placed graph.
 
@@ -32,6 +37,7 @@ def camera_rows(
             because they are not trusted.
         scale: the output's units in one unit of the solver.
         further: the other pieces that are solved; the rows of their cameras say where they stand.
+        axes: (d, d) rotation from the input's axes to the output's; the same if None.
     """
     graph = placement.graph
     homes = _home_pieces(placement)
@@ -44,18 +50,20 @@ def camera_rows(
         for camera, degree in enumerate(degrees.tolist())
     ]
     for camera, row in zip(
-        placement.cameras.tolist(), own_camera_rows(placement, centers, scale), strict=True
+        placement.cameras.tolist(), own_camera_rows(placement, centers, scale, axes), strict=True
     ):
         rows[camera] = replace(row, degree=rows[camera].degree)
     return rows
 
 
-def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> list[CameraRow]:
+def own_camera_rows(
+    placement: Placement, centers: FloatArray, scale: float, axes: FloatArray | None = None
+) -> list[CameraRow]:
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_cameras)
-    sigmas = scale * assessment.sigmas
+    sigmas = scale * (assessment.sigmas if axes is None else _turned_sigmas(assessment.covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -73,6 +81,15 @@ def own_camera_rows(placement: Placement, centers: FloatArray, scale: float) -> 
             )
         )
     return rows
+
+
+def _turned_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return standard deviations (n, d) along other axes, infinite where nothing holds a node."""
+    held = ~np.isinf(covariances).any(axis=(1, 2))
+    sigmas = np.full(covariances.shape[:2], np.inf)
+    turned = axes @ covariances[held] @ axes.T
+    sigmas[held] = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
+    return sigmas
 
 
 def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:
@@ -101,7 +118,11 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             weight=float(graph.weights[edge]),
         )
         if edge not in judged:
-            rows.append(replace(row, reason=_FILTERED if edge in dropped else _OUTSIDE))
+            inner = placement.bodies is not None and bool(
+                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            )
+            elsewhere = _FILTERED if edge in dropped else _OUTSIDE
+            rows.append(replace(row, reason=_INNER if inner else elsewhere))
             continue
         piece, e, dual_norm = judged[edge]
         assessment = piece.assessment

@@ -34,7 +34,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         },
         "options": asdict(found.options),
         "num_images": len(all_names(found)),
-        "num_placed": int(np.sum(found.kept)),
+        "num_placed": found.reconstruction.num_reg_images(),
         "not_trusted": _not_trusted(found),
         "num_pairs": len(found.directions.pairs),
         "num_pairs_rejected": num_unusable + len(placement.rejected_pairs),
@@ -48,6 +48,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
+        "bodies": _bodies_summary(found),
         "pieces": [asdict(row) for row in _pieces_of(found)],
         "solve": solve_summary(found.solve),
         "finish": _finish_summary(placement.finish),
@@ -87,6 +88,22 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "timings_s": found.timings_s,
         "warnings": list(quality_warnings(placement)),
         "versions": _versions(),
+    }
+
+
+def _bodies_summary(found: LocateResult) -> dict[str, int] | None:
+    """Return what moved together: frames of rigs, and fixed cameras; None where each camera moves by
+    itself."""
+    placement = found.placement
+    if placement.bodies is None:
+        return None
+    cameras = placement.bodies.body_of[: placement.num_cameras]
+    pairs = placement.graph.edges[: placement.num_pairs]
+    return {
+        "num_bodies": len(np.unique(cameras)),
+        "num_placed": len(np.unique(cameras[placement.cameras[found.kept]])),
+        "num_fixed": 0 if found.fixed is None else int(np.sum(found.fixed)),
+        "num_inner_pairs": int(np.sum(~placement.bodies.joins(pairs))),
     }
 
 

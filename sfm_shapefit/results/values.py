@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     import pycolmap
 
 
+CARRIED_FIXED = "fixed; no pair of it takes part"
+CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Inputs:
     """What `locate` worked from."""
@@ -68,6 +72,8 @@ class LocateResult:
     rotations were not to be refined."""
     further: "tuple[FurtherPiece, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
+    fixed: BoolArray | None = None
+    """(n,) images that stay exactly where the input has them; None if that was not asked for."""
 
     @property
     def solve(self) -> SolverResult:
@@ -85,11 +91,27 @@ class LocateResult:
         image_ids = self.model.image_ids[self.placement.cameras]
         centers = _centers_of(self.reconstruction, image_ids, self.kept)
         solved_pieces = [piece.placement for piece in self.further]
-        rows = camera_rows(self.placement, centers, self.gauge.similarity.scale, solved_pieces)
+        rows = camera_rows(
+            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
+        )
         for camera, reason in without_direction(self.directions, self.placement.graph).items():
             rows[camera] = replace(rows[camera], reason=reason)
+        for camera, center in self._carried().items():
+            is_fixed = self.fixed is not None and self.fixed[camera]
+            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
+            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         unposed = sorted(set(all_names(self)) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    def _carried(self) -> dict[int, tuple[float, ...]]:
+        """Return the centres of images in the output that no pair placed: fixed ones, and rest of a frame."""
+        ids = self.model.image_ids
+        judged = set(self.placement.cameras[self.kept].tolist())
+        return {
+            camera: tuple(self.reconstruction.image(image_id).projection_center().tolist())
+            for camera, image_id in enumerate(ids.tolist())
+            if camera not in judged and self.reconstruction.image(image_id).has_pose
+        }
 
     @property
     def pairs(self) -> list[PairRow]:
@@ -97,8 +119,9 @@ class LocateResult:
         support = self.directions.num_inliers[self.directions.usable()]
         usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
         names = self.model.names
+        axes = self.gauge.axes
         return [
-            next(usable)
+            _turned(next(usable), axes)
             if status is DirectionStatus.USABLE
             else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
             for (i, j), status, support in zip(
@@ -108,6 +131,11 @@ class LocateResult:
                 strict=True,
             )
         ]
+
+
+def _turned(row: PairRow, axes: FloatArray | None) -> PairRow:
+    """Return a pair's row with its direction in the output's axes."""
+    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.robust.options import PlacementOptions
@@ -26,6 +27,7 @@ from sfm_shapefit.solver.angular import (
     residual_levels,
     robust_cost,
 )
+from sfm_shapefit.solver.bodies import ReducedFactor, lud_over_bodies
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
 from sfm_shapefit.viewgraph import ViewGraph
@@ -112,6 +114,7 @@ def finish(
     options: PlacementOptions,
     covariance: FloatArray | None = None,
     classes: IntArray | None = None,
+    bodies: Bodies | None = None,
 ) -> Finish:
     """Return the locations to keep for a solved view graph.
 
@@ -122,16 +125,18 @@ def finish(
         covariance: (m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
             unknown, None where all are.
         classes: (m,) 0 for pairs of cameras, 1 for directions to points; None: all 0.
+        bodies: the rigid bodies that the nodes belong to; then every pair joins two of them, and the
+            locations are theirs.
     """
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     metric = Metric(covariance, classes)
     if solved.status is Status.NOT_SOLVED:
         return _as_located(graph, solved, metric)
-    lud = _lud_start(graph, classes, options.threads) if has_second_start(graph) else None
-    plan = plan_refinement(graph) if options.refines else None
+    lud, second = _second_start(graph, classes, options.threads, bodies)
+    plan = _plan(graph, bodies) if options.refines else None
 
-    apart = None if lud is None else disagreement(graph, solved.locations, lud.locations)
-    candidates = [("ShapeFit", solved.locations)] + ([] if lud is None else [("LUD", lud.locations)])
+    apart = None if second is None else disagreement(graph, solved.locations, second)
+    candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
     if apart is not None and apart > _UNEQUAL:
         candidates.reverse()  # the likely better one first: the other ends early where it loses
     starts: list[Start] = []
@@ -158,6 +163,33 @@ def finish(
         num_put_back=kept.put_back,
         lud=lud,
     )
+
+
+def _plan(graph: ViewGraph, bodies: Bodies | None) -> SymbolicFactor | ReducedFactor | None:
+    """Return what the refinement factors with, or None if its factor would be too large."""
+    return plan_refinement(graph) if bodies is None else ReducedFactor(graph.edges, bodies.normalised())
+
+
+def _second_start(
+    graph: ViewGraph, classes: IntArray, threads: int, bodies: Bodies | None
+) -> tuple[LudResult | None, FloatArray | None]:
+    """Return LUD's solution, which bodies have none of, and its locations."""
+    if bodies is None:
+        lud = _lud_start(graph, classes, threads) if has_second_start(graph) else None
+        return lud, None if lud is None else lud.locations
+    metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
+    found = []
+    for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
+        locations = lud_over_bodies(_weighted(graph, classes, point_weight), bodies)
+        if locations is not None and projected_length(graph, locations) > 0.0:
+            found.append((robust_cost(graph, locations, metric, opening), locations))
+    return None, min(found, key=lambda pair: pair[0])[1] if found else None
+
+
+def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
+    """Return the graph with the weights that directions to points have in LUD."""
+    weights = np.where(classes > 0, point_weight, 1.0) * graph.weights
+    return ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
 
 
 def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:
@@ -204,10 +236,8 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
 
 def _lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
     """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
-    weights = np.where(classes > 0, _POINT_WEIGHT, 1.0) * graph.weights
-    weighted = ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
     certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
-    found = solve_lud(weighted, _LUD_STEPS, certified=certified, threads=threads)
+    found = solve_lud(_weighted(graph, classes), _LUD_STEPS, certified=certified, threads=threads)
     usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
     return found if usable else None
 
@@ -217,28 +247,35 @@ def _refined(
     locations: FloatArray,
     graph: ViewGraph,
     metric: Metric,
-    plan: SymbolicFactor | None,
+    plan: SymbolicFactor | ReducedFactor | None,
     rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round."""
     if plan is None:
         return Start(name=name, locations=locations, refined=None)
     refined = refine_angles(graph, locations, metric, plan, rival)
-    refined, num_strays = _without_strays(graph, locations, refined, metric)
+    alone = np.ones(graph.num_cameras, dtype=np.bool_)
+    if isinstance(plan, ReducedFactor):
+        alone = np.bincount(plan.bodies.body_of)[plan.bodies.body_of] == 1
+    refined, num_strays = _without_strays(graph, locations, refined, metric, alone)
     if projected_length(graph, refined.locations) <= 0.0:
         return Start(name=name, locations=locations, refined=None)
     return Start(name=name, locations=locations, refined=refined, put_back=num_strays)
 
 
 def _without_strays(
-    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric
+    graph: ViewGraph, start: FloatArray, refined: AngularResult, metric: Metric, alone: BoolArray
 ) -> tuple[AngularResult, int]:
-    """Return a refinement whose strays are put back, and their number; of the start, if that fits better."""
+    """Return a refinement whose strays are put back, and their number; of the start, if that fits better.
+
+    Only nodes that are a body of their own, `alone`, can be put back one by one.
+    """
     levels = refined.levels_rad
     far = left_scene(start, refined.locations)
     if not far.any():
         return refined, 0
     nodes = strays(graph, far, agreeing_pairs(graph, refined.locations, metric, levels))
+    nodes = nodes[alone[nodes]]
     if len(nodes) == 0:
         return refined, 0
     locations = _unit(put_back(start, refined.locations, nodes))

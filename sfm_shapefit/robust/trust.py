@@ -47,6 +47,7 @@ _AGREEING_SIGMAS = 5.0
 _MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
 _PRIOR = 30.0  # matches, half of them for the camera in a clean scene
+_LEAST_MEDIAN = 0.5
 _MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
 _UNKNOWN_SUPPORT = 50.0  # of a pair that does not say
 _USUAL_SHARE = 0.75  # of the median agreement of all cameras: a camera with that much loses nothing
@@ -111,6 +112,7 @@ def judge_cameras(
     conditioning: Conditioning,
     leverages: FloatArray,
     evidence: Evidence | None = None,
+    rigid: IntArray | None = None,
 ) -> CameraTrust:
     """Return the trust of each camera and the reasons for a low one.
 
@@ -125,17 +127,26 @@ def judge_cameras(
         leverages: (m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside
             the largest rigid piece of those, and everywhere if unknown.
         evidence: support and contradicting pairs; unknown if None.
+        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of
+            all its cameras together; every node is its own if None.
     """
     num_cameras = len(conditioning.num_pairs)
     votes = _votes(graph, angles, sigmas_of_pairs, evidence)
-    body: BoolArray = np.ones(graph.num_cameras, dtype=np.bool_)
+    labels = np.arange(graph.num_cameras) if rigid is None else rigid
+    heard, votes = _checked(votes, leverages), votes.of_bodies(labels)
+    body: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
-        body = main_body(graph.num_cameras, votes.pairs, signed)
-    agreement = _shares(_checked(votes, leverages), body, num_cameras)
+        body = main_body(len(body), votes.pairs, signed)
+    agreement = _shares(heard.of_bodies(labels), body, int(labels[:num_cameras].max()) + 1)[
+        labels[:num_cameras]
+    ]
+    body = body[labels]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
-    trust = np.minimum(agreement / usual, 1.0) * hold
+    # Where most cameras have no agreement at all, any agreement is more than usual.
+    relative = agreement / usual if usual > 0.0 else (agreement > 0.0).astype(np.float64)
+    trust = np.minimum(relative, 1.0) * hold
     few = conditioning.num_pairs <= FEW_PAIRS
     reasons = [""] * num_cameras
     for k in np.flatnonzero(trust < _LOW).tolist():
@@ -150,6 +161,12 @@ class _Votes:
     pairs: IntArray
     agrees: BoolArray
     weights: FloatArray
+
+    def of_bodies(self, labels: IntArray) -> "_Votes":
+        """Return the votes between the bodies of these labels (n,) in place of their nodes."""
+        pairs = labels[self.pairs]
+        outer = pairs[:, 0] != pairs[:, 1]
+        return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])
 
 
 def _votes(
@@ -191,6 +208,7 @@ def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
     good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
     spoken = heard > 0.0
     median = float(np.median(good[spoken] / heard[spoken])) if spoken.any() else 1.0
+    median = max(median, _LEAST_MEDIAN)  # a collapsed answer, with which hardly anything agrees
     return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
 
 

@@ -26,6 +26,7 @@ over d - 1. Where it is 1 no other direction checks it, and its residual is 0 wh
 (Cook and Weisberg 1982, "Residuals and Influence in Regression", section 2.1).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,7 +77,7 @@ def propagate(
     edges: IntArray,
     information: FloatArray,
     num_cameras: int | None = None,
-    errors: FloatArray | None = None,
+    errors: Iterable[FloatArray] | None = None,
 ) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
@@ -85,8 +86,8 @@ def propagate(
         edges: (m, 2) pairs that make the nodes rigid, none of length 0.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
         num_cameras: the first so many nodes may decide the gauge; all if None.
-        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
-            information if None.
+        errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
+            only one is held at a time; independent errors of that information if None.
 
     Returns:
         None if the factor would take more than 2 GB: about a hundred thousand cameras in space.
@@ -113,28 +114,33 @@ def propagate(
     covariances, gauge = _held(factor, inverse, locations, is_camera)
     samples = None
     if errors is not None:
-        forces = (across @ errors.transpose(0, 2, 1)) / np.maximum(lengths, _SHORTEST * lengths.max())[
-            :, None, None
-        ]
-        samples = _moved(factor, locations, edges, forces, gauge)
+        pulls = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None]
+        samples = _moved(factor, locations, _right_side(edges, pulls, errors, n), gauge)
     return Uncertainty(
         covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge, samples=samples
     )
 
 
-def _moved(
-    factor: CholeskyFactor, locations: FloatArray, edges: IntArray, forces: FloatArray, gauge: BoolArray
-) -> FloatArray:
-    """Return S A^-1 D^T f for each of the samples in the forces f (m, d, s), shape (n, d, s)."""
-    n, d = locations.shape
-    right = np.zeros((n, d, forces.shape[2]))
-    flat = apply_incidence_transposed(edges, np.ascontiguousarray(forces.reshape(len(edges), -1)), n)
-    right[:] = flat.reshape(right.shape)
+def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray], n: int) -> FloatArray:
+    """Return D^T (Lambda theta / l) of each sample, (n, d, s), from theta in consecutive parts."""
+    total, start = np.zeros((n, pulls.shape[1], 1)), 0
+    for part in errors:
+        stop = start + len(part)
+        forces = pulls[start:stop] @ part.transpose(0, 2, 1)
+        flat = apply_incidence_transposed(edges[start:stop], forces.reshape(len(part), -1), n)
+        total = total + flat.reshape(n, *forces.shape[1:])
+        start = stop
+    return total
+
+
+def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gauge: BoolArray) -> FloatArray:
+    """Return S A^-1 of the right sides (n, d, s), in the gauge of those nodes."""
     moved = factor.solve(right)
     null, fixed = _gauge_pair(locations, gauge)
     drift = np.einsum("nak,nas->ks", fixed, moved)
-    result: FloatArray = moved - np.einsum("nak,ks->nas", null, drift)
-    return result
+    for a in range(moved.shape[1]):  # axis by axis: the samples are large
+        moved[:, a] -= null[:, a] @ drift
+    return moved
 
 
 def _across(information: FloatArray, units: FloatArray) -> FloatArray:

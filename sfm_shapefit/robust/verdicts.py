@@ -18,17 +18,21 @@ camera say together is `trust`.
 
 import enum
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from scipy.special import chdtri
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, normalized, tangent_bases
 from sfm_shapefit.rigidity import parallel_rigid_pieces
+from sfm_shapefit.robust.body_uncertainty import propagate_bodies
 from sfm_shapefit.robust.conditioning import LooseGroup, condition
 from sfm_shapefit.robust.trust import Evidence, judge_cameras
 from sfm_shapefit.robust.uncertainty import propagate
+from sfm_shapefit.solver.bodies import largest_tied
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -41,6 +45,7 @@ _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
 _BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
+_PART = 10_000  # directions whose error samples are worked on at a time
 _LOOSENING_RAD = 1e-4
 """Noise for which it is asked at least which nodes are loose: with none, none would be."""
 _UNCHECKED_LEVERAGE = 0.99
@@ -77,10 +82,15 @@ class Assessment:
     """k sentences that say why a trust is low; empty where it is not."""
     loose_groups: tuple[LooseGroup, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
-    sigmas: FloatArray
-    """(n, d) standard deviation of each location in the units of `locations`, with centroid and scale
-    of the cameras held fixed; infinite for nodes outside the largest rigid piece of the inlier pairs; NaN,
-    all of them, where the graph is too large for its factor."""
+    covariances: FloatArray
+    """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
+    cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
+    NaN, all of them, where the graph is too large for its factor."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(n, d) standard deviation of each location along the axes."""
+        return _standard_deviations(self.covariances)
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""
@@ -96,6 +106,8 @@ def assess(
     covariance: FloatArray | None = None,
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
+    bodies: Bodies | None = None,
+    held: int | None = None,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -107,6 +119,8 @@ def assess(
         evidence: support of the pairs, and pairs that have no direction because their matches contradict the
             given rotations; unknown if None.
         num_cameras: k, the first so many nodes are cameras and the others points; all if None.
+        bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
+        held: the body that stays where it is; the mean of the cameras does if None.
     """
     freedom = graph.dimension - 1
     k = graph.num_cameras if num_cameras is None else num_cameras
@@ -114,24 +128,27 @@ def assess(
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
-    num_unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    num_bodies = graph.num_cameras if bodies is None else bodies.num_bodies
+    num_unknowns = graph.dimension * (num_bodies - 1) - (1 if bodies is None else 0)
     excess, inliers = _excess(residuals, own, behind, num_unknowns)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
     bases = tangent_bases(graph.directions)
-    errors = None
-    if evidence is not None and evidence.errors is not None:
-        errors = _with_excess(evidence.errors, excess) @ bases.transpose(0, 2, 1)
     angles = np.linalg.norm(residuals, axis=1)
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if errors is None else errors / scale
-    sigmas, leverages = _propagated(graph, locations, inliers, information, k, errors)
-    sigmas = scale * sigmas
+    propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
+    covariances, leverages = propagated(graph, locations, inliers, information, k, errors)
+    covariances = scale**2 * covariances
+    sigmas = _standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
-    judged = judge_cameras(graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence)
+    rigid = None if bodies is None else bodies.body_of
+    judged = judge_cameras(
+        graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
+    )
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,
@@ -141,7 +158,7 @@ def assess(
         trust=judged.trust,
         reasons=judged.reasons,
         loose_groups=conditioning.groups,
-        sigmas=sigmas,
+        covariances=covariances,
     )
 
 
@@ -218,9 +235,26 @@ def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wa
     return high
 
 
-def _with_excess(errors: FloatArray, excess: float) -> FloatArray:
-    """Add independent normal errors of the excess to samples (m, s, d - 1)."""
-    return errors + excess * np.random.default_rng(0).standard_normal(errors.shape)
+class _Sampled(NamedTuple):
+    """Samples of the errors of the directions."""
+
+    errors: FloatArray
+    """(m, s, d - 1) that sharing keypoints explains, in tangent bases, radians."""
+    excess: float
+    """Standard deviation of what it does not explain."""
+    scale: float
+    """By which the errors are divided."""
+
+    def parts(self, directions: FloatArray, rows: IntArray) -> Iterator[FloatArray]:
+        """Yield the errors (., s, d) of the given rows in world axes, a part at a time."""
+        random = np.random.default_rng(0)
+        for start in range(0, len(self.errors), _PART):
+            own = self.errors[start : start + _PART]
+            whole = own + self.excess * random.standard_normal(own.shape)
+            first, last = np.searchsorted(rows, (start, start + _PART))
+            chosen = rows[first:last]
+            bases = tangent_bases(directions[chosen]).transpose(0, 2, 1)
+            yield whole[chosen - start] @ bases / self.scale
 
 
 def _propagated(
@@ -229,23 +263,23 @@ def _propagated(
     inliers: BoolArray,
     information: FloatArray,
     num_cameras: int,
-    errors: FloatArray | None,
+    sampled: _Sampled | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the standard deviations (n, d) and the leverages (m,).
+    """Return the covariances (n, d, d) and the leverages (m,).
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid.
     """
-    sigmas = np.full(locations.shape, np.inf)
+    covariances = _unheld(locations)
     leverages = np.where(inliers, np.nan, 0.0)
     pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[inliers], graph.dimension)
     rows = np.flatnonzero(inliers)[pieces == 0]
     held, edges = np.unique(graph.edges[rows], return_inverse=True)
     cameras = int(np.sum(held < num_cameras))
     if cameras < _SMALLEST_RIGID:
-        return sigmas, leverages
-    unknown = np.full(locations.shape, np.nan), np.where(inliers, np.nan, 0.0)
+        return covariances, leverages
+    unknown = np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
     try:
-        samples = None if errors is None else errors[rows]
+        samples = None if sampled is None else sampled.parts(graph.directions, rows)
         found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
     except UnsolvableError:  # singular in spite of the ridge
         return unknown
@@ -253,6 +287,48 @@ def _propagated(
         return unknown
     extent = np.ptp(locations[held], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
-    sigmas[held] = np.where(is_loose[:, None], np.inf, found.sigmas)
+    covariances[held[~is_loose]] = found.covariances[~is_loose]
     leverages[rows] = found.leverages
-    return sigmas, leverages
+    return covariances, leverages
+
+
+def _propagated_over(
+    bodies: Bodies,
+    held: int | None,
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    sampled: _Sampled | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances (n, d, d) and the leverages (m,) of rigid bodies, their scale held.
+
+    Only the bodies that the inlier pairs tie at these locations have any: those around the one that is held,
+    or most cameras.
+    """
+    covariances = _unheld(locations)
+    leverages = np.where(inliers, np.nan, 0.0)
+    cameras = np.bincount(bodies.body_of[:num_cameras], minlength=bodies.num_bodies)
+    tied = largest_tied(graph.edges[inliers], bodies, cameras, locations, around=held)
+    inside = np.isin(bodies.body_of, tied)
+    rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
+    if len(tied) < 2 or len(rows) == 0:
+        return covariances, leverages
+    nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
+    share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
+    samples = None if errors is None else errors[rows]
+    part = bodies.restricted_to(nodes)
+    try:
+        found = propagate_bodies(
+            locations[nodes], edges, information[rows], part, share / share.sum(), samples
+        )
+    except UnsolvableError:
+        found = None
+    if found is None:
+        return np.full_like(covariances, np.nan), leverages
+    extent = np.ptp(locations[nodes], axis=0).max()
+    is_loose = (found.sigmas > extent).any(axis=1)
+    covariances[nodes[~is_loose]] = found.covariances[~is_loose]
+    leverages[rows] = found.leverages
+    return covariances, leverages

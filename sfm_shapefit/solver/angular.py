@@ -25,7 +25,7 @@ with angles in place of its chords; the kernel and its graduation: Yang, Antonan
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from scipy.special import chdtri
@@ -34,7 +34,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread, tangent_bases
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
@@ -57,6 +57,16 @@ _HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival
 _MAX_STEPS = 60
 _MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
 _MAX_BYTES = 2_000_000_000
+
+
+class NormalFactor(Protocol):
+    """What solves the normal equations of a step: a factor of the Laplacian, or of that over bodies."""
+
+    def refactor(self, weights: FloatArray, /) -> None:
+        """Factor the matrix of edge blocks (m, d, d), or raise UnsolvableError."""
+
+    def solve(self, rhs: FloatArray, /) -> FloatArray:
+        """Return the step of the locations, (n, d), for a right-hand side of that shape."""
 
 
 class Metric(NamedTuple):
@@ -96,7 +106,7 @@ def refine_angles(
     graph: ViewGraph,
     start: FloatArray,
     metric: Metric,
-    plan: SymbolicFactor,
+    plan: SymbolicFactor | NormalFactor,
     rival: FloatArray | None = None,
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
@@ -105,7 +115,8 @@ def refine_angles(
         graph: a connected view graph.
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
-        plan: of the factorisation, from `plan_refinement`.
+        plan: of the factorisation, from `plan_refinement`; or memory for a factor, such as that over bodies,
+            in which case locations are and stay those of the bodies.
         rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
             as low as these, and where it clearly cannot.
 
@@ -113,7 +124,9 @@ def refine_angles(
         Locations whose cost at the final levels is not above that of the start: these, if nothing better
         was found.
     """
-    factor = allocate_factor(plan, graph.dimension)
+    factor: NormalFactor = (
+        allocate_factor(plan, graph.dimension) if isinstance(plan, SymbolicFactor) else plan
+    )
     spread = _spread(graph, metric)
     first = _unit(start)
     other = None if rival is None else _unit(rival)
@@ -154,6 +167,22 @@ def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels:
     """
     information = _information(graph, _spread(graph, metric), levels[metric.classes])
     return _cost(graph, information, _unit(locations))
+
+
+class AngularTerms:
+    """The terms of the directions at given levels, for a refinement that adds others to them."""
+
+    def __init__(self, graph: ViewGraph, metric: Metric, levels: FloatArray) -> None:
+        self.graph = graph
+        self._information = _information(graph, _spread(graph, metric), levels[metric.classes])
+
+    def cost(self, locations: FloatArray) -> float:
+        """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
+        return _cost(self.graph, self._information, locations)
+
+    def linearised(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
+        return _linearised(self.graph, self._information, locations)
 
 
 def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
@@ -224,7 +253,7 @@ def _information(
 def _step(
     graph: ViewGraph,
     information: FloatArray,
-    factor: CholeskyFactor,
+    factor: NormalFactor,
     t: FloatArray,
     damping: float,
     *,

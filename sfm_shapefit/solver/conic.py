@@ -6,6 +6,8 @@ complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
     minimise    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
+With bodies (`sfm_shapefit.bodies`) t = A x, and x takes the place of t, body 0 grounded.
+
 The multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow beside a solver made
 for the program, and trusted: every other solver is tested against it.
 """
@@ -15,9 +17,10 @@ import warnings
 from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array
+from scipy.sparse import coo_array, csr_array, hstack
 
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.bodies import Bodies, separate
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.solver.program import scale_functional
@@ -28,13 +31,16 @@ _LOOSER = (1.0, 10.0, 100.0, 1000.0)  # factors on the tolerance, tried in turn
 _TIGHTER = 1e-3  # the cone solver's tolerance below ours: its gap is relative to an inexact dual
 
 
-def solve_conic(graph: ViewGraph, tol: float, max_iterations: int) -> tuple[FloatArray, FloatArray, int]:
+def solve_conic(
+    graph: ViewGraph, tol: float, max_iterations: int, bodies: Bodies | None = None
+) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with cvxpy and Clarabel.
 
     Args:
         graph: a connected, parallel-rigid view graph.
         tol: the certified gap wanted.
         max_iterations: limit of interior-point steps.
+        bodies: of its nodes, where the program is that over bodies; no pair may lie inside one.
 
     Returns:
         locations (n, d), the approximate dual (m, d), and the number of interior-point steps.
@@ -45,9 +51,10 @@ def solve_conic(graph: ViewGraph, tol: float, max_iterations: int) -> tuple[Floa
     import cvxpy as cp
 
     bases = tangent_bases(graph.directions)
-    matrix = _grounded_operator(graph, bases)
-    c = scale_functional(graph)[1:].ravel()
     m, d = graph.num_edges, graph.dimension
+    reduction = _reduction(separate(graph.num_cameras, d) if bodies is None else bodies)
+    matrix = _operator(graph, bases) @ reduction
+    c = reduction.T @ scale_functional(graph).ravel()
 
     t = cp.Variable(matrix.shape[1])
     z = cp.Variable((d - 1, m))
@@ -63,24 +70,33 @@ def solve_conic(graph: ViewGraph, tol: float, max_iterations: int) -> tuple[Floa
             f"the conic solver stopped with status {program.status!r} and no answer; "
             "check the graph's rigidity and its directions"
         )
-    locations = np.vstack([np.zeros((1, d)), np.reshape(t.value, (-1, d))])
+    locations = np.reshape(reduction @ t.value, (-1, d))
     y = np.einsum("edk,ek->ed", bases, np.reshape(fits.dual_value, (m, d - 1)))
     points_up = np.sum(y * (locations[graph.edges[:, 0]] - locations[graph.edges[:, 1]])) >= 0.0
     return locations, y if points_up else -y, iterations
 
 
-def _grounded_operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
-    """Return the sparse map from (t_1, ..., t_{n-1}) to all B_e^T (t_i - t_j), stacked edge by edge."""
+def _operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
+    """Return the sparse map from (t_0, ..., t_{n-1}) to all B_e^T (t_i - t_j), stacked edge by edge."""
     m, d, k = bases.shape
     rows = np.broadcast_to((np.arange(m)[:, None] * k + np.arange(k))[:, None, :], (m, d, k))
     parts: list[tuple[Any, Any, Any]] = []
     for end, sign in ((0, 1.0), (1, -1.0)):
-        nodes = graph.edges[:, end] - 1
+        nodes = graph.edges[:, end]
         columns = np.broadcast_to((nodes[:, None] * d + np.arange(d))[:, :, None], (m, d, k))
-        kept = nodes >= 0
-        parts.append((sign * bases[kept].ravel(), rows[kept].ravel(), columns[kept].ravel()))
+        parts.append((sign * bases.ravel(), rows.ravel(), columns.ravel()))
     values, row, column = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return coo_array((values, (row, column)), shape=(m * k, (graph.num_cameras - 1) * d)).tocsr()
+    return coo_array((values, (row, column)), shape=(m * k, graph.num_cameras * d)).tocsr()
+
+
+def _reduction(bodies: Bodies) -> csr_array:
+    """Return A without the columns of body 0, which is grounded, and without that of s if it is 0."""
+    n, d = bodies.offsets.shape
+    rows = np.arange(n * d)
+    columns = (bodies.body_of[:, None] * d + np.arange(d)).ravel()
+    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, bodies.num_bodies * d)).tocsc()[:, d:]
+    scaled = [csr_array(bodies.offsets.reshape(-1, 1))] if bodies.offsets.any() else []
+    return csr_array(hstack([moving, *scaled]))
 
 
 def _run(program: Any, tolerance: float, max_iterations: int) -> int:

@@ -1,4 +1,22 @@
-"""Synthetic input whose truth is known: photographed scenes, and bare graphs of directions.
+"""Synthetic input whose truth is known, for the tests of this package and of pipelines around it.
+
+Scenes of cameras and surface points (`make_scene`), the same with textured surfaces that are drawn and
+photographed (`make_rendered_scene`), and bare graphs of directions (`random_graph_problem` and others):
+
+    scene = make_scene(SceneOptions(shape="courtyard", corrupted_pair_fraction=0.2, seed=3))
+    scene.keypoints, scene.pairs, scene.matches_of(0)      # what a camera would see, and which images match
+    scene.rotations, scene.centers, scene.pair_is_corrupted    # the truth
+
+    drawn = make_rendered_scene(SceneOptions(shape="facade", image_width=640, image_height=480))
+    draw_image(drawn, 0)                                   # (480, 640, 3) red, green, blue
+    surface_points(drawn, 0, xy)                           # what the pixels show: the truth of any match
+
+    problem = random_graph_problem(50, p=0.5, sigma=0.01, q=0.2)
+    problem.view_graph, problem.locations, problem.corrupted
+
+`sfm_shapefit.colmap.workspace` and `.photographs` write scenes as COLMAP workspaces, and
+`sfm_shapefit.synthetic.fixtures` is a pytest plugin with all of these as fixtures, and with comparisons.
+The same options give the same values on every run.
 
 Names are imported when they are first used: the options are cheap, and what makes scenes needs scipy.
 """
@@ -28,6 +46,7 @@ if TYPE_CHECKING:
         project_distorted,
         surface_points,
     )
+    from sfm_shapefit.synthetic.rigs import RigScene, make_rig_drive
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
@@ -53,6 +72,7 @@ _HOMES = {
         "project_distorted",
         "surface_points",
     ),
+    "rigs": ("RigScene", "make_rig_drive"),
     "scenes": ("Scene", "make_scene", "project_points"),
     "streets": ("StreetProblem", "street_problem"),
 }
@@ -63,6 +83,7 @@ __all__ = [
     "GraphProblem",
     "RenderOptions",
     "RenderedScene",
+    "RigScene",
     "Scene",
     "SceneOptions",
     "StreetProblem",
@@ -74,6 +95,7 @@ __all__ = [
     "expander_graph_problem",
     "lawn_graph_problem",
     "make_rendered_scene",
+    "make_rig_drive",
     "make_scene",
     "measured_problem",
     "project_distorted",

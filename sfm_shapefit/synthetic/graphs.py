@@ -35,6 +35,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.viewgraph import ViewGraph
 
 Seed = int | np.random.Generator
 Corruption = Literal["uniform", "self-consistent", "concentrated"]
@@ -54,6 +55,11 @@ class GraphProblem:
     """(m,) True where the direction is a wrong one."""
     false_locations: FloatArray | None = None
     """(n, d) the configuration that self-consistent wrong directions agree on; None for other corruption."""
+
+    @property
+    def view_graph(self) -> ViewGraph:
+        """The graph to be solved, without the answer."""
+        return ViewGraph(len(self.locations), self.edges, self.directions)
 
 
 def random_graph_problem(

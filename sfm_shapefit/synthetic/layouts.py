@@ -46,7 +46,7 @@ def _ring(n: int, p: int, rng: np.random.Generator) -> Layout:
     longitude = np.arctan2(outward[:, 1], outward[:, 0])
     return Layout(
         centers=centers,
-        rotations=_looking_along(target - centers),
+        rotations=looking_along(target - centers),
         points=outward * rng.uniform(1.35, 1.45, (p, 1)),
         normals=outward,
         colors=_checkered(4.0 * longitude, 6.0 * outward[:, 2], (214, 96, 77), (247, 224, 190), rng),
@@ -64,7 +64,7 @@ def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
     height = rng.uniform(0.0, 2.0 * float(row.max()) + 7.0, p)
     return Layout(
         centers=centers,
-        rotations=_looking_along(forward),
+        rotations=looking_along(forward),
         points=np.stack([along, rng.uniform(-0.5, 0.5, p), height], axis=1),
         normals=_tilted(np.broadcast_to([0.0, -1.0, 0.0], (p, 3)), rng),
         colors=_checkered(along / 1.5, height / 1.5, (205, 170, 125), (92, 107, 130), rng),
@@ -91,7 +91,7 @@ def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     asphalt = _checkered(along / 3.0, lateral / 3.0, (96, 96, 96), (120, 120, 118), rng)
     return Layout(
         centers=centers,
-        rotations=_looking_along(ahead + 0.02 * rng.standard_normal((n, 3))),
+        rotations=looking_along(ahead + 0.02 * rng.standard_normal((n, 3))),
         points=points,
         normals=_tilted(normals, rng),
         colors=np.where(on_ground[:, None], asphalt, walls),
@@ -114,7 +114,7 @@ def _cloud(n: int, p: int, rng: np.random.Generator) -> Layout:
     points = rng.standard_normal((p, 3))
     return Layout(
         centers=centers,
-        rotations=_looking_along(target - centers, up=rng.standard_normal((n, 3))),
+        rotations=looking_along(target - centers, up=rng.standard_normal((n, 3))),
         points=points,
         normals=normalized(rng.standard_normal((p, 3))),
         colors=_checkered(points[:, 0], points[:, 1] + points[:, 2], (67, 147, 195), (244, 165, 130), rng),
@@ -143,7 +143,7 @@ def _courtyard(n: int, p: int, rng: np.random.Generator) -> Layout:
     paving = _checkered(flat[:, 0] / 2.0, flat[:, 1] / 2.0, (128, 128, 120), (150, 150, 140), rng)
     return Layout(
         centers=centers,
-        rotations=_looking_along(forward),
+        rotations=looking_along(forward),
         points=points,
         normals=_tilted(normals, rng),
         colors=np.where((wall == 4)[:, None], paving, bricks),
@@ -171,7 +171,7 @@ def turned_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Gen
     return turned
 
 
-def _looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:
+def looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:
     """Return cam_from_world (n, 3, 3) of cameras that look along `forward` (n, 3), `up` upwards.
 
     Up is z if None. The rows are the camera's axes in the world: x to the right, y down, z ahead.

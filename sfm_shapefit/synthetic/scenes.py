@@ -108,9 +108,21 @@ def make_scene(options: SceneOptions) -> Scene:
         InputError: if no two images share `min_matches` points, or if fewer pairs can be corrupted
             than asked for.
     """
-    rngs = np.random.default_rng(options.seed).spawn(7)  # one stream for each kind of draw
-    layout_rng, pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng, thinning_rng = rngs
-    layout = LAYOUTS[options.shape](options.num_images, options.num_points, layout_rng)
+    rngs = np.random.default_rng(options.seed).spawn(6)  # one stream for each kind of draw
+    layout = LAYOUTS[options.shape](options.num_images, options.num_points, rngs[0])
+    return scene_of(layout, options, rngs[1:])
+
+
+def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
+    """Photograph, pair and corrupt a layout; `make_scene` says what it raises.
+
+    Args:
+        layout: cameras and surfaces.
+        options: `shape` is not read.
+        rngs: five streams, one for each kind of draw.
+    """
+    pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
+    thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
     candidates = _candidates(layout, options)
     images = [_photograph(layout, image, ids, options, pixel_rng) for image, ids in enumerate(candidates)]
     keypoint_points = [ids for ids, _ in images]

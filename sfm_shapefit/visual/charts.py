@@ -9,7 +9,7 @@ from sfm_shapefit.visual.scene import PairClass, Pairs
 
 _RANGE_DEG = (1e-3, 180.0)  # smaller residuals count in the first bin
 _BINS = 42
-_MOST_CELLS = 200  # per side of the matrix; with more cameras, several share a cell
+MOST_CELLS = 200  # per side of the matrix; with more cameras, several share a cell
 _UNBINNED_RANK = np.array([1, 4, 2, 3])  # of each PairClass: cells show the worst of their pairs
 
 
@@ -61,7 +61,7 @@ def residual_histogram(pairs: Pairs) -> Histogram:
 
 def view_graph_matrix(pairs: Pairs, num_cameras: int) -> Matrix:
     """Return the matrix of pairs, of at most 200 x 200 cells."""
-    per_cell = max(-(-num_cameras // _MOST_CELLS), 1)
+    per_cell = max(-(-num_cameras // MOST_CELLS), 1)
     side = -(-num_cameras // per_cell)
     i, j = (pairs.cameras // per_cell).T
     cells, counts = np.zeros((side, side)), np.zeros((side, side), dtype=np.int64)

@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.visual.charts import residual_histogram, view_graph_matrix
+from sfm_shapefit.visual.charts import MOST_CELLS, residual_histogram, view_graph_matrix
 from sfm_shapefit.visual.scene import MAX_POINTS, PairClass, Scene, frustum_corners
 from sfm_shapefit.visual.words import Hint, first_looks, shortened, summary_sentences
 
@@ -246,7 +246,7 @@ def _tiles(scene: Scene, facts: dict[str, Any]) -> list[list[str]]:
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
     """Return a hint with the rows of the page; a pair that is not listed is only told."""
-    found = np.flatnonzero(pairs == hint.pair) if hint.pair is not None else []
+    found = np.flatnonzero(pairs == (-1 if hint.pair is None else hint.pair))
     return {
         "text": hint.text,
         "camera": None if hint.camera is None else int(rank[hint.camera]),
@@ -262,8 +262,8 @@ def _scene_note(scene: Scene) -> str:
         notes.append(f"The first three of {scene.dimension} dimensions are drawn.")
     if scene.points.num_all > len(scene.points.positions):
         notes.append(
-            f"{len(scene.points.positions):,} of {scene.points.num_all:,} points are drawn (at most {MAX_POINTS:,}, "
-            "without those far outside)."
+            f"{len(scene.points.positions):,} of {scene.points.num_all:,} points are drawn "
+            f"(at most {MAX_POINTS:,}, without those far outside)."
         )
     return " ".join([*notes, _pairs_note(scene)]).strip()
 
@@ -273,41 +273,59 @@ def _pairs_note(scene: Scene) -> str:
     if total <= MAX_PAIRS:
         return ""
     return (
-        f"Of {total:,} pairs the worst {MAX_PAIRS:,} are drawn and listed here: those that contradict the solution, "
-        "then those that cannot be judged, then the largest residuals. pairs.csv has all."
+        f"Of {total:,} pairs the worst {MAX_PAIRS:,} are drawn and listed here: those that contradict the "
+        "solution, then those that cannot be judged, then the largest residuals. pairs.csv has all."
     )
 
 
 def _notes(scene: Scene, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
-    named = {
+    known = int(np.isfinite(scene.cameras.trust).sum())
+    return {
+        "histogram": _histogram_note(medians_deg),
+        "trust": f"The {_MAX_BARS} least trusted of {known:,} cameras." if known > _MAX_BARS else "",
+        "matrix": _matrix_note(-(-len(scene.cameras.names) // MOST_CELLS)),
+        "support": _support_note(scene),
+        "convergence": _convergence_note(scene),
+        "pieces": "Directions fix neither scale nor place of one piece against another; a hinge is a camera "
+        "that two pieces share.",
+    }
+
+
+def _histogram_note(medians_deg: dict[str, float]) -> str:
+    if not medians_deg:
+        return "No pair has a residual."
+    where = {
         "input": "at the input's centres",
         "optimum": "at the convex optimum",
-        "output": "at the output's",
+        "output": "at the output's centres",
     }
-    medians = ", ".join(f"{value:.3g}° {named[state]}" for state, value in medians_deg.items())
-    known = int(np.isfinite(scene.cameras.trust).sum())
-    per_cell = -(-len(scene.cameras.names) // 200)
+    medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
+    return f"Angle between each measured direction and its baseline; medians: {medians}."
+
+
+def _matrix_note(cameras_per_cell: int) -> str:
+    if cameras_per_cell > 1:
+        return (
+            f"{cameras_per_cell} cameras share a cell; its colour is the share of its pairs that contradict "
+            "the solution."
+        )
+    return "Blue agrees, red contradicts, yellow cannot be judged, grey has no direction."
+
+
+def _support_note(scene: Scene) -> str:
+    if not np.any(scene.pairs.support > 0):
+        return "A bare graph does not say how many matches a pair has."
     listed = " Shown are the listed pairs." if len(scene.pairs.classes) > MAX_PAIRS else ""
-    return {
-        "histogram": f"Angle between each measured direction and its baseline; medians: {medians}."
-        if medians
-        else "No pair has a residual.",
-        "trust": f"The {_MAX_BARS} least trusted of {known:,} cameras." if known > _MAX_BARS else "",
-        "matrix": f"{per_cell} cameras share a cell; its colour is the share of its pairs that contradict the solution."
-        if per_cell > 1
-        else "Blue agrees, red contradicts, yellow cannot be judged, grey has no direction.",
-        "support": f"Wrong pairs with many matches are repeated structure or wrong rotations.{listed}"
-        if np.any(scene.pairs.support > 0)
-        else "A bare graph does not say how many matches a pair has.",
-        "convergence": "The bound proves that no placement has a lower objective; the certificate at the end is computed anew."
-        if any(bound is not None for _, _, bound in scene.history)
-        else "The splitting method has no bound on the way; its certificate is computed at the end."
-        if scene.history
-        else "The iterations of this solve were not recorded.",
-        "pieces": "Directions fix neither scale nor place of one piece against another; a hinge is a camera that two "
-        "pieces share.",
-    }
+    return f"Wrong pairs with many matches are repeated structure or wrong rotations.{listed}"
+
+
+def _convergence_note(scene: Scene) -> str:
+    if not scene.history:
+        return "The iterations of this solve were not recorded."
+    if any(bound is not None for _, _, bound in scene.history):
+        return "The bound proves that no placement has a lower objective; it is certified anew at the end."
+    return "The splitting method has no bound on the way; its certificate is computed at the end."
 
 
 def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:

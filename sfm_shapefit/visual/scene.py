@@ -51,7 +51,7 @@ class Poses:
     centers: FloatArray
     """(n, 3)"""
     half_sizes: FloatArray
-    """(n, 2) half the width and half the height of the picture at distance 1, limited to what can be drawn."""
+    """(n, 2) half the width and height of the picture at distance 1, limited to what can be drawn."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -70,7 +70,7 @@ class Cameras:
     sigmas: FloatArray
     """(n,) largest standard deviation over the axes, in the output's units; NaN where it is not known."""
     poses: Poses
-    """Rotations and pictures; `poses.centers` are those of the input, in the input's units."""
+    """Rotations in the output's axes, pictures; `poses.centers` are the input's, in its own."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -143,6 +143,7 @@ def build_scene(
     *,
     model: "PosedModel | None" = None,
     original: "PosedModel | None" = None,
+    turn: FloatArray | None = None,
     points: "pycolmap.Reconstruction | None" = None,
     certified: FloatArray | None = None,
     input_is_aligned: bool = False,
@@ -155,6 +156,7 @@ def build_scene(
         cameras, pairs: rows of the tables.
         model: where rotations and pictures come from; unknown if None.
         original: the input, for its centres; unknown if None.
+        turn: (3, 3) from the axes of `model` to the output's; None if they are the same.
         points: the reconstruction whose 3D points are drawn; none if None.
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
         input_is_aligned: the input's centres are in the output's units.
@@ -162,11 +164,12 @@ def build_scene(
         history: iteration, objective and bound of the solve.
     """
     names = tuple(row.name for row in cameras)
-    poses, before = (
+    known, before = (
         _unknown_poses(len(names)) if source is None else poses_of(source, names)
         for source in (model, original)
     )
-    poses = replace(poses, centers=before.centers)
+    rotations = known.rotations if turn is None else known.rotations @ turn.T
+    poses = replace(known, rotations=rotations, centers=before.centers)
     own = _cameras(cameras, names, poses)
     positions = own.centers[own.placed]
     drawn = _points(points, positions)
@@ -232,8 +235,8 @@ def view_axes(rotations: FloatArray) -> FloatArray:
     x, y, z = (rotations[:, axis] for axis in range(3))
     _, vectors = np.linalg.eigh((x.T @ x - _UPRIGHT * y.T @ y) / len(rotations))
     up = vectors[:, 0]
-    leaning = -np.array([y.mean(axis=0) @ up, z.mean(axis=0) @ up])
-    up = up * np.sign(leaning[np.argmax(np.abs(leaning))] or 1.0)
+    leaning = (y.mean(axis=0) @ up, z.mean(axis=0) @ up)
+    up = -up if max(leaning, key=abs) > 0.0 else up
     forward = z.mean(axis=0) - (z.mean(axis=0) @ up) * up
     if np.linalg.norm(forward) < _UPRIGHT:  # they look all around
         forward = np.eye(3)[np.argmin(np.abs(up))]
@@ -342,7 +345,7 @@ def _frustum_depth(positions: FloatArray) -> float:
         return 1.0
     low, high = np.quantile(positions, [0.05, 0.95], axis=0)
     extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
-    distances, _ = cKDTree(positions).query(positions, k=2)
+    distances = np.asarray(cKDTree(positions).query(positions, k=2)[0])
     smallest, largest = _FRUSTUM_OF_EXTENT
     wanted = _FRUSTUM_SHARE * float(np.median(distances[:, 1]))
     return float(np.clip(wanted, smallest * extent, largest * extent))

@@ -32,6 +32,7 @@ def scene_of_model(found: "LocateResult", cameras: Sequence[CameraRow], pairs: S
         pairs,
         model=found.model,
         original=found.model,
+        turn=found.gauge.axes,
         points=found.reconstruction,
         certified=_certified(found.placement, len(cameras)),
         input_is_aligned=found.gauge.scale == "input",
@@ -100,7 +101,7 @@ def _input_of(facts: dict[str, Any]) -> PosedModel | None:
     """Return the input, if it can still be read."""
     path = Path(facts["inputs"]["model"])
     try:
-        return read_model(path, poses_only=True) if path.is_dir() else None
+        return read_model(path) if path.is_dir() else None
     except InputError:
         return None
 

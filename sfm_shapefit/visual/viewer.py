@@ -4,6 +4,8 @@ Everything is shown around the median of the cameras, because the viewer compute
 as plain labels of its controls, shortened; never as markup.
 """
 
+import io
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -22,9 +24,10 @@ if TYPE_CHECKING:
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 """Of a pyramid: apex, then corners."""
 _GREY = (140, 140, 140)
-_WHITE = (240, 180, 40)
+_CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
+_FEWEST_FITTED = 3
 _LEAST_DEG = 0.01  # the slider is logarithmic, up to 180 degrees
 
 
@@ -80,7 +83,8 @@ def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.V
         import viser
     except ImportError as error:
         raise InputError("the viewer needs viser; pip install 'sfm_shapefit[viewer]'") from error
-    server = viser.ViserServer(host=host, port=port, verbose=False)
+    with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
+        server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction(tuple(scene.axes[2].tolist()))
     _View(server, scene, facts)
     return server
@@ -136,11 +140,7 @@ class _View:
         self._counts = gui.add_text("pairs drawn", "", disabled=True)
         if self._input is not None:
             handle, shown = self._input, gui.add_checkbox("input's poses (grey)", True)
-
-            @shown.on_update
-            def _(_event: object) -> None:
-                handle.visible = shown.value
-
+            shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
         for control in (self._residual, self._support, self._trust, self._picked):
             control.on_update(lambda _event: self._draw())
 
@@ -156,7 +156,7 @@ class _View:
         )
         rows = np.flatnonzero(scene.cameras.placed & ~(scene.cameras.trust < thresholds.min_trust))
         colors = trust_colors(scene.cameras.trust[rows])
-        colors[rows == (-1 if chosen is None else chosen)] = _WHITE
+        colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
         self._frusta("/cameras", rows, scene.cameras.centers[rows], colors)
         drawn = drawn_pairs(scene, thresholds)
         kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
@@ -191,14 +191,14 @@ class _View:
 
 
 def input_centers(scene: Scene) -> FloatArray | None:
-    """Return the input's centres (n, 3) in the output's units, brought there by scale and shift if need be.
+    """Return the input's centres (n, 3) in the output's units and axes, brought there by a fit if need be.
 
     None where the input has no centres, or they all coincide.
     """
     before, after = scene.cameras.poses.centers, scene.cameras.centers
     common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    if common.sum() < 2 or not np.ptp(before[common], axis=0).max() > 0.0:
+    if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
         return None
     if scene.input_is_aligned:
         return before
-    return fit_similarity_l1(before[common], after[common], rotate=False).apply(before)
+    return fit_similarity_l1(before[common], after[common]).apply(before)

@@ -89,7 +89,8 @@ def _pairs(scene: Scene, facts: dict[str, Any]) -> str:
     if counts[PairClass.UNDETERMINED]:
         text += f"; {counts[PairClass.UNDETERMINED]:,} cannot be judged"
     if counts[PairClass.NO_DIRECTION]:
-        text += f"; {counts[PairClass.NO_DIRECTION]:,} have no usable direction"
+        has = "has" if counts[PairClass.NO_DIRECTION] == 1 else "have"
+        text += f"; {counts[PairClass.NO_DIRECTION]:,} {has} no usable direction"
     return text + "."
 
 
@@ -153,7 +154,8 @@ def _contradictions(scene: Scene) -> Iterator[Hint]:
         first, second = (shortened(scene.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
         matches = f" with {pairs.support[row]:,} matches" if pairs.support[row] else ""
         yield Hint(
-            text=f"{first} to {second}{matches} contradicts the solution by {pairs.residuals_deg[row]:.3g} degrees",
+            text=f"{first} to {second}{matches} contradicts the solution "
+            f"by {pairs.residuals_deg[row]:.3g} degrees",
             pair=row,
         )
 
@@ -168,6 +170,5 @@ def _loose(facts: dict[str, Any]) -> Iterator[Hint]:
 def _unchecked(scene: Scene) -> Iterator[Hint]:
     count = int(np.sum(scene.pairs.classes == PairClass.UNDETERMINED))
     if count:
-        yield Hint(
-            text=f"{count:,} pairs cannot be judged: no other pair checks them, or their piece is not solved"
-        )
+        what = "1 pair" if count == 1 else f"{count:,} pairs"
+        yield Hint(text=f"{what} cannot be judged: unchecked by others, or in a piece that is not solved")

@@ -209,7 +209,7 @@
     const size = placedCameras.length > 2000 ? 2.5 : 4;
     addLayer("cameras", `Cameras (${count(placedCameras.length)})`, null, true, [
       trace({
-        x: frusta.x, y: frusta.y, z: frusta.z, customdata: frusta.camera, kind: "camera", hoverinfo: "skip",
+        x: frusta.x, y: frusta.y, z: frusta.z, customdata: frusta.camera, kind: "camera",
         line: { color: frusta.camera.map((k) => trustColors[k]), colorscale: RAMP, cmin: 0, cmax: 1, width: 2 },
       }),
       trace({
@@ -231,7 +231,7 @@
       const shown = code === 3 ? false : pairsOf[code].length <= MANY_PAIRS;
       addLayer(verdict, `Pairs: ${verdict} (${count(pairsOf[code].length)})`, VARIABLES[code], shown, [trace({
         x: lines.x, y: lines.y, z: lines.z, customdata: lines.pair, kind: "pair",
-        opacity: code === 0 ? Math.max(Math.min(60 / Math.sqrt(pairsOf[code].length + 1), 40) / 100, 0.12) : 0.75,
+        opacity: code === 0 ? Math.max(Math.min(6 / Math.sqrt(pairsOf[code].length + 1), 0.6), 0.15) : 0.75,
         line: { color: color(VARIABLES[code]), width: code === 0 ? 1.5 : 2 },
       })]);
     });
@@ -249,7 +249,7 @@
     }
     for (const mode of ["lines", "markers"]) {
       traces.push(trace({
-        ...nothing(), mode, kind: "selection", hoverinfo: "skip",
+        ...nothing(), mode, kind: "selection",
         line: { color: color("--chosen"), width: 6 },
         marker: { size: 9, symbol: "circle-open", color: color("--chosen"), line: { width: 2, color: color("--chosen") } },
       }));
@@ -307,7 +307,10 @@
   const customOf = (event) => {
     const point = event.points[0];
     const source = traces[point.curveNumber];
-    if (!source || !source.kind || !source.customdata) return null;
+    if (!source || !source.kind) return null;
+    if (source.kind === "selection") { // it lies over what it marks
+      return source.mode === "markers" ? ["camera", placedEnds(selected)[point.pointNumber]] : selected;
+    }
     return [source.kind, source.customdata[point.pointNumber]];
   };
   const listen = (target, find) => {
@@ -319,11 +322,25 @@
       else showTooltip(pairTitle(found[1]), pairFacts(found[1]));
     });
     target.on("plotly_unhover", hideTooltip);
-    target.on("plotly_click", (event) => {
-      const found = find(event);
-      if (found && found[0] !== "text") select(found[0], found[1], target !== plot, true);
-    });
+    if (target !== plot) {
+      target.on("plotly_click", (event) => {
+        const found = find(event);
+        if (found && found[0] !== "text") select(found[0], found[1], true, true);
+      });
+    }
     target.addEventListener("mouseleave", hideTooltip);
+  };
+  // Plotly tells of a click in 3D while it draws, if the button is still down then: it misses quick clicks, and
+  // drawing the choice from within would start over without end. So the pointer itself is watched.
+  const listenToPresses = () => {
+    let [under, pressed] = [null, null];
+    plot.on("plotly_hover", (event) => { under = customOf(event); });
+    plot.on("plotly_unhover", () => { under = null; });
+    plot.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; }, true);
+    plot.addEventListener("pointerup", (event) => {
+      const still = pressed && Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) < 4;
+      if (still && under && event.button === 0) select(under[0], under[1], false, true);
+    }, true);
   };
   const CONFIG = { displaylogo: false, responsive: true, modeBarButtonsToRemove: ["tableRotation", "resetCameraLastSave3d", "hoverClosest3d", "select2d", "lasso2d", "autoScale2d"] };
   const hasWebgl = () => {
@@ -343,11 +360,13 @@
     drawLayerControls();
     await Plotly.newPlot(plot, traces, sceneLayout(), CONFIG);
     listen(plot, customOf);
+    listenToPresses();
   };
 
   // --- selection ------------------------------------------------------------------------------------
 
-  let selected = null;
+  let selected = null; // "camera" or "pair", and its row
+  const placedEnds = ([kind, k]) => (kind === "camera" ? [k] : [pairs.first[k], pairs.second[k]]).filter(isPlaced);
   const select = (kind, k, scroll = false, turn = false) => {
     selected = [kind, k];
     plot.dataset.selected = `${kind}:${k}`;
@@ -361,7 +380,7 @@
   const highlight = (centred) => {
     if (!plot.data) return;
     const [kind, k] = selected;
-    const ends = (kind === "camera" ? [k] : [pairs.first[k], pairs.second[k]]).filter(isPlaced);
+    const ends = placedEnds(selected);
     const lines = frustumLines(ends);
     if (kind === "pair" && ends.length === 2) {
       const baseline = pairLines([k]);
@@ -380,7 +399,7 @@
       const keep = kind === "camera" ? 0.7 : 0.85; // of the distance, down to a limit
       const offset = ["x", "y", "z"].map((c) => view.eye[c] - view.center[c]);
       const distance = Math.hypot(...offset);
-      const wanted = Math.min(distance, Math.max(distance * keep, 0.9 * Math.max(reach, 0.15)));
+      const wanted = Math.min(distance, Math.max(distance * keep, 1.3 * Math.max(reach, 0.15)));
       const [x, y, z] = offset.map((v, c) => middle[c] + (v * wanted) / distance);
       layout["scene.camera"] = { up: view.up, center: { x: middle[0], y: middle[1], z: middle[2] }, eye: { x, y, z } };
     }
@@ -400,7 +419,10 @@
     const item = (verdict, text, note, action) => {
       const line = element("li");
       const dot = element("span", "", "dot");
-      if (verdict !== null) dot.style.background = `var(${VARIABLES[verdict]})`;
+      if (verdict !== null) {
+        dot.style.background = `var(${VARIABLES[verdict]})`;
+        dot.title = VERDICTS[verdict];
+      }
       const button = element("button", text, "link");
       button.type = "button";
       button.onclick = action;
@@ -536,7 +558,7 @@
     title, value, cell: (k) => element("td", value(k), className),
   });
   const verdictCell = (p) => {
-    const cell = element("td");
+    const cell = element("td", "", "verdict");
     const dot = element("span", "", "dot");
     dot.style.background = `var(${VARIABLES[pairs.verdict[p]]})`;
     cell.append(dot, ` ${VERDICTS[pairs.verdict[p]]}`);
@@ -653,7 +675,7 @@
     const { iterations, objectives, bounds } = data.convergence;
     const made = [{ type: "scatter", mode: "lines+markers", name: "objective", x: iterations, y: objectives, line: { color: color("--agrees"), width: 2 }, marker: { size: 5 }, hoverinfo: "none" }];
     if (bounds.some((b) => b !== null)) {
-      made.push({ type: "scatter", mode: "lines+markers", name: "lower bound", x: iterations, y: bounds, line: { color: color("--contradicts"), width: 2, dash: "dot" }, marker: { size: 5 }, hoverinfo: "none" });
+      made.push({ type: "scatter", mode: "lines+markers", name: "lower bound", x: iterations, y: bounds, line: { color: color("--undetermined"), width: 2, dash: "dot" }, marker: { size: 5 }, hoverinfo: "none" });
     }
     return [made, layout({ xaxis: { title: title("iteration") }, yaxis: { title: title("objective"), ...(data.convergence.range ? { range: data.convergence.range } : {}) } })];
   }, (event) => {
@@ -699,7 +721,7 @@
     const body = table.createTBody();
     data.pieces.forEach((piece) => {
       const row = body.insertRow();
-      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none", "name"), element("td", piece.scale, "name"), element("td", piece.folder === "." ? "this folder" : piece.folder || "not written"));
+      row.append(element("td", String(piece.number)), element("td", count(piece.cameras)), element("td", count(piece.placed)), element("td", piece.hinges || "none"), element("td", piece.scale), element("td", piece.folder === "." ? "this folder" : piece.folder || "not written"));
     });
     const scroll = element("div", "", "scroll");
     scroll.append(table);

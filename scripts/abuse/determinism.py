@@ -1,0 +1,221 @@
+"""The same answer, byte by byte, for any number of threads, hash seed and repetition, and any order of input.
+
+Reordered input has the same images, matches and points under other ids and in another order: positions must
+agree to 1e-12 of the extent.
+"""
+
+import argparse
+import json
+import os
+import shutil
+import sqlite3
+import struct
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from abuse.layouts import Field, binary_fields
+from abuse.verdicts import MODEL_FILES, read_cameras
+
+HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
+_PROJECT = Path(__file__).resolve().parents[2]
+_MAX_NUM_IMAGES = 2147483647
+_AGREEMENT = 1e-12
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scenes", nargs="*", type=Path, help="folders with sparse/0 and, maybe, database.db")
+    parser.add_argument("--orders", type=int, default=5, help="reordered copies of each scene")
+    parser.add_argument("--seed", type=int, default=0)
+
+
+def run(args: argparse.Namespace) -> int:
+    """Check all scenes and print a table; 1 if anything differs."""
+    bundled = _PROJECT / "data_synthetic"
+    scenes = args.scenes or [bundled / name for name in ("ring8", "facade9", "courtyard")]
+    failed = False
+    for scene in scenes:
+        with tempfile.TemporaryDirectory() as temporary:
+            work = Path(temporary)
+            different = list(differing_files(scene, work))
+            worst = max(
+                (
+                    reordered_difference(scene, work, seed)
+                    for seed in range(args.seed, args.seed + args.orders)
+                ),
+                default=0.0,
+            )
+        failed |= bool(different) or worst > _AGREEMENT
+        print(
+            f"{scene.name}: {len(different)} files differ {different[:3]}, reordered by {worst:.1e}",
+            flush=True,
+        )
+    return int(failed)
+
+
+# --- the same input --------------------------------------------------------------------------------------
+
+VARIANTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
+    "again": (("--threads", "1"), {"PYTHONHASHSEED": "0"}),
+    "two threads": (("--threads", "2"), {"PYTHONHASHSEED": "0"}),
+    "hash seed 1": (("--threads", "1"), {"PYTHONHASHSEED": "1"}),
+    "hash seed 4242, two threads": (("--threads", "2"), {"PYTHONHASHSEED": "4242"}),
+}
+
+
+def differing_files(scene: Path, work: Path) -> Iterator[str]:
+    """Yield which file differs in which variant of the run."""
+    first = contents(_located(scene, work / "first", ("--threads", "1"), {"PYTHONHASHSEED": "0"}))
+    for name, (flags, environment) in VARIANTS.items():
+        other = contents(_located(scene, work / "other", flags, environment))
+        yield from (f"{name}: {file}" for file in sorted(first | other) if first.get(file) != other.get(file))
+        shutil.rmtree(work / "other")
+
+
+def contents(out: Path) -> dict[str, object]:
+    """Return the bytes of every file of an output, and of locate.json all but times and threads."""
+    found: dict[str, object] = {
+        str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()
+    }
+    facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
+    found["locate.json"] = _without_times(facts)
+    return found
+
+
+def _without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        left_out = ("timings_s", "seconds", "threads")
+        return {key: _without_times(item) for key, item in value.items() if key not in left_out}
+    return [_without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def _located(scene: Path, out: Path, flags: tuple[str, ...], environment: dict[str, str]) -> Path:
+    command = [
+        sys.executable,
+        "-m",
+        "sfm_shapefit.cli",
+        "locate",
+        str(scene / "sparse" / "0"),
+        str(out),
+        "-q",
+    ]
+    subprocess.run(
+        [*command, *flags],
+        env={**os.environ, "PYTHONPATH": str(_PROJECT), **environment},
+        cwd=_PROJECT,
+        check=True,
+    )
+    return out
+
+
+# --- reordered input -------------------------------------------------------------------------------------
+
+
+def reordered_difference(scene: Path, work: Path, seed: int) -> float:
+    """Return by how much of the extent positions move when everything is listed in another order."""
+    from sfm_shapefit.options import LocateOptions
+    from sfm_shapefit.pipeline import locate
+    from sfm_shapefit.results import write_result
+
+    copy = reordered(scene, work / f"order{seed}", np.random.default_rng(seed))
+    tables = []
+    for place in (scene, copy):
+        out = work / "out"
+        write_result(locate(place / "sparse" / "0", options=LocateOptions(threads=1)), out, overwrite=True)
+        tables.append({row["name"]: row for row in read_cameras(out)})
+    shutil.rmtree(copy)
+    shutil.rmtree(out)
+    if [row["placed"] for row in tables[0].values()] != [tables[1][name]["placed"] for name in tables[0]]:
+        return float("inf")
+    names = [name for name, row in tables[0].items() if row["placed"] == "true"]
+    centers = [np.array([[float(table[name][axis]) for axis in "xyz"] for name in names]) for table in tables]
+    extent = np.linalg.norm(np.ptp(centers[0], axis=0))
+    return float(np.abs(centers[0] - centers[1]).max() / extent)
+
+
+def reordered(scene: Path, target: Path, rng: Generator) -> Path:
+    """Write a copy of a scene with other image and point ids and everything listed in another order."""
+    source, model = scene / "sparse" / "0", target / "sparse" / "0"
+    model.mkdir(parents=True)
+    data = {name: (source / f"{name}.bin").read_bytes() for name in MODEL_FILES}
+    images = _values(
+        data["images"], [f for f in binary_fields("images", data["images"]) if f.meaning == "id"]
+    )
+    points = _values(
+        data["points3D"], [f for f in binary_fields("points3D", data["points3D"]) if f.meaning == "id"]
+    )
+    image_ids = dict(zip(images, (1 + rng.permutation(2 * len(images)))[: len(images)].tolist(), strict=True))
+    point_ids = dict(zip(points, (1 + rng.permutation(len(points))).tolist(), strict=True))
+    for name in MODEL_FILES:
+        (model / f"{name}.bin").write_bytes(_reordered_file(name, data[name], image_ids, point_ids, rng))
+    if (scene / "database.db").exists():
+        _reorder_database(scene / "database.db", target / "database.db", image_ids, rng)
+    return target
+
+
+def _values(data: bytes, fields: list[Field]) -> list[int]:
+    return [int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0]) for field in fields]
+
+
+def _reordered_file(
+    name: str, data: bytes, image_ids: dict[int, int], point_ids: dict[int, int], rng: Generator
+) -> bytes:
+    """Rename ids in a model file and shuffle its records."""
+    maps = {
+        ("images", "id"): image_ids,
+        ("images", "point reference"): point_ids,
+        ("points3D", "id"): point_ids,
+        ("points3D", "image reference"): image_ids,
+        ("frames", "image reference"): image_ids,
+    }
+    fields, changed = binary_fields(name, data), bytearray(data)
+    for field in fields:
+        if (name, field.meaning) in maps:
+            (value,) = _values(data, [field])
+            renamed = maps[name, field.meaning].get(value, value)  # no point: stays
+            struct.pack_into(f"<{field.kind}", changed, field.offset, renamed)
+    starts = [field.offset for field in fields if field.meaning == "id"]
+    records = [bytes(changed[a:b]) for a, b in zip(starts, [*starts[1:], len(changed)], strict=False)]
+    if name not in ("cameras", "rigs"):
+        records = [records[int(k)] for k in rng.permutation(len(records))]
+    return bytes(changed[:8]) + b"".join(records)
+
+
+def _reorder_database(source: Path, target: Path, image_ids: dict[int, int], rng: Generator) -> None:
+    """Rename images in a database and list rows, matches, and the images of pairs in another order."""
+    shutil.copyfile(source, target)
+    with closing(sqlite3.connect(target)) as connection:
+        tables = {}
+        for table in ("images", "keypoints", "two_view_geometries"):
+            cursor = connection.execute(f"SELECT * FROM {table}")
+            names = [column[0] for column in cursor.description]
+            tables[table] = [dict(zip(names, row, strict=True)) for row in cursor]
+            connection.execute(f"DELETE FROM {table}")
+        for row in (*tables["images"], *tables["keypoints"]):
+            row["image_id"] = image_ids[row["image_id"]]
+        for row in tables["two_view_geometries"]:
+            _rename_pair(row, image_ids, rng)
+        for table, rows in tables.items():
+            for k in rng.permutation(len(rows)):
+                row = rows[int(k)]
+                marks = ", ".join("?" * len(row))
+                connection.execute(
+                    f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", [*row.values()]
+                )
+        connection.commit()
+
+
+def _rename_pair(row: dict[str, Any], image_ids: dict[int, int], rng: Generator) -> None:
+    first, second = (image_ids[i] for i in divmod(row["pair_id"], _MAX_NUM_IMAGES))
+    row["pair_id"] = min(first, second) * _MAX_NUM_IMAGES + max(first, second)
+    matches = np.frombuffer(row["data"] or b"", dtype="<u4").reshape(-1, 2)
+    row["data"] = rng.permutation(matches if first < second else matches[:, ::-1], axis=0).tobytes()
+    for name in ("F", "E", "H", "qvec", "tvec"):  # of the pair in its old order; not read for directions
+        row[name] = None

@@ -1,0 +1,205 @@
+"""Bundler's .out file, version 0.3: read.
+
+    # Bundle file v0.3
+    <num_cameras> <num_points>
+    f k1 k2 / R (3 rows) / t                   per camera; f = 0: not reconstructed
+    X / r g b / n  (camera key x y) * n        per point
+
+    P = R X + t,   p = -P / P_z,   pixel = f (1 + k1 |p|^2 + k2 |p|^4) p
+
+from the centre of the image, x to the right and y up: the camera looks along -z. S = diag(1, -1, -1) takes
+its axes to COLMAP's, cam_from_world = S R; the distortion is that of COLMAP's RADIAL.
+
+Names stand in a list file beside it, one a line (`list.txt`, or the .out file's name with .list.txt
+appended, as COLMAP writes it); without one they are camera0000 and so on. Sizes of images stand nowhere:
+the smallest even size that holds all observations is taken, with the principal point at its centre, as
+Bundler has it.
+
+Source: Snavely, "Bundler v0.4 User's Manual", section VI.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile, is_rotation
+
+_HEADER = "# Bundle file v0.3"
+_NUMBERS_PER_CAMERA = 15
+_LEAST_SIZE = 2
+
+
+def is_bundler(file: Path) -> bool:
+    """Return whether a file begins as Bundler's do."""
+    if not file.is_file():  # a pipe would be read for ever
+        return False
+    try:
+        with file.open("rb") as stream:
+            return stream.read(13) == b"# Bundle file"
+    except OSError:
+        return False
+
+
+def read_bundler(file: Path) -> SceneFile:
+    """Read the reconstructed cameras and the points.
+
+    Raises:
+        InputError: if the file is malformed, naming the line.
+    """
+    words = _Words.of(file)
+    num_cameras, num_points = words.integer(), words.integer()
+    if num_cameras < 0 or num_points < 0:
+        raise words.error("the numbers of cameras and points must not be negative")
+    all_names = _names(file, num_cameras)
+    index_of: dict[int, int] = {}
+    cameras: list[FloatArray] = []
+    rotations, centers = [], []
+    for camera in range(num_cameras):
+        values = words.numbers(_NUMBERS_PER_CAMERA)
+        focal = values[0]
+        if focal <= 0.0:
+            continue
+        rotation = values[3:12].reshape(3, 3)
+        if not is_rotation(rotation):
+            raise words.error(f"camera {camera} has no rotation")
+        index_of[camera] = len(cameras)
+        cameras.append(values[:3])
+        rotations.append(FLIP_YZ @ rotation)
+        centers.append(-rotation.T @ values[12:15])
+    points, colors, observed, offsets = _points(words, num_points, num_cameras, index_of)
+    n = len(cameras)
+    sizes = _sizes(n, observed, offsets)
+    halves = sizes / 2.0
+    images = observed[:, 1]
+    return SceneFile(
+        cameras=tuple(
+            SceneCamera(
+                model="RADIAL",
+                width=int(size[0]),
+                height=int(size[1]),
+                params=(float(f), size[0] / 2.0, size[1] / 2.0, float(k1), float(k2)),
+            )
+            for (f, k1, k2), size in zip(cameras, sizes.tolist(), strict=True)
+        ),
+        names=tuple(all_names[camera] for camera in index_of),
+        camera_of=np.arange(n),
+        rotations=np.array(rotations).reshape(n, 3, 3),
+        centers=np.array(centers).reshape(n, 3),
+        points=points,
+        colors=colors,
+        observed=observed,
+        pixels=halves[images] + offsets * [1.0, -1.0],
+    )
+
+
+class _Words:
+    """The words of a file, one after the other, with their lines."""
+
+    def __init__(self, file: Path, words: list[str], lines: list[int]) -> None:
+        self.file, self._words, self._lines, self._next = file, words, lines, 0
+
+    @classmethod
+    def of(cls, file: Path) -> "_Words":
+        try:
+            text = file.read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{file} is not a readable text file ({error})") from error
+        first, _, rest = text.partition("\n")
+        if first.strip() != _HEADER:
+            raise InputError(f"{file}, line 1: expected {_HEADER!r}; other versions are not read")
+        words, lines = [], []
+        for number, line in enumerate(rest.splitlines(), start=2):
+            own = line.split()
+            words += own
+            lines += [number] * len(own)
+        return cls(file, words, lines)
+
+    def numbers(self, count: int) -> FloatArray:
+        """Return the next numbers, all finite."""
+        taken = self._words[self._next : self._next + count]
+        if len(taken) < count:
+            raise InputError(f"{self.file} ends early, in line {self._lines[-1] if self._lines else 1}")
+        try:
+            values = np.array(taken, dtype=np.float64)
+        except ValueError:
+            values = np.full(count, np.nan)
+        if not np.isfinite(values).all():
+            self._next += int(np.argmax([not _is_finite(word) for word in taken]))
+            raise self.error(f"{self._words[self._next]!r} is no finite number")
+        self._next += count
+        return values
+
+    def integer(self) -> int:
+        """Return the next whole number."""
+        (value,) = self.numbers(1)
+        if value != int(value):
+            self._next -= 1
+            raise self.error(f"{value:g} is no whole number")
+        return int(value)
+
+    def error(self, what: str) -> InputError:
+        """Return the error that names the line that was read last."""
+        line = self._lines[min(self._next, len(self._lines) - 1)]
+        return InputError(f"{self.file}, line {line}: {what}")
+
+
+def _is_finite(word: str) -> bool:
+    try:
+        return bool(np.isfinite(float(word)))
+    except ValueError:
+        return False
+
+
+def _points(
+    words: _Words, num_points: int, num_cameras: int, index_of: dict[int, int]
+) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
+    """Return points, colours, observations (point, image), and their offsets from the image's centre."""
+    points, colors, observed, offsets = [], [], [], []
+    for point in range(num_points):
+        values = words.numbers(6)
+        points.append(values[:3])
+        colors.append(np.clip(values[3:], 0, 255))
+        count = words.integer()
+        if count < 0:
+            raise words.error("the length of a view list must not be negative")
+        views = words.numbers(4 * count).reshape(count, 4)
+        for camera, _, x, y in views.tolist():
+            if not 0 <= camera < num_cameras:
+                raise words.error(f"point {point} is seen by camera {camera:g} of {num_cameras}")
+            if int(camera) in index_of:
+                observed.append((point, index_of[int(camera)]))
+                offsets.append((x, y))
+    return (
+        np.array(points).reshape(-1, 3),
+        np.array(colors).reshape(-1, 3).astype(np.int64),
+        np.array(observed, dtype=np.int64).reshape(-1, 2),
+        np.array(offsets, dtype=np.float64).reshape(-1, 2),
+    )
+
+
+def _sizes(num_images: int, observed: IntArray, offsets: FloatArray) -> FloatArray:
+    """Return (n, 2) the smallest even width and height that hold the observations of each image."""
+    halves = np.full((num_images, 2), _LEAST_SIZE / 2.0)
+    np.maximum.at(halves, observed[:, 1], np.ceil(np.abs(offsets)))
+    return 2.0 * halves
+
+
+def _names(file: Path, count: int) -> list[str]:
+    """Return the names of the list file beside a .out file, or made-up ones."""
+    for candidate in (
+        file.with_name(file.name + ".list.txt"),
+        file.with_suffix(".list.txt"),
+        file.with_name("list.txt"),
+    ):
+        if candidate.is_file():
+            try:
+                lines = candidate.read_text(encoding="utf-8").splitlines()
+            except (OSError, UnicodeDecodeError) as error:
+                raise InputError(f"{candidate} is not a readable text file ({error})") from error
+            names = [line.split()[0] for line in lines if line.split()]
+            if len(names) != count:
+                raise InputError(f"{candidate} has {len(names)} names, but {file} has {count} cameras")
+            return names
+    return [f"camera{k:04d}" for k in range(count)]

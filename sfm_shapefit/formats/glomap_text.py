@@ -1,0 +1,87 @@
+"""Relative poses as text, one pair a line: read and written. GLOMAP's form, names instead of ids.
+
+    NAME1 NAME2 QW QX QY QZ TX TY TZ        # comments and empty lines are skipped
+
+is cam2_from_cam1 in COLMAP's camera axes: x_2 = R(q) x_1 + t. Only the direction of t counts; t = 0 is
+refused, for such a pair has none. Names have no blanks.
+
+Source: GLOMAP's relative pose files, `glomap/io/pose_io.cc` (ReadRelPose).
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
+from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
+from sfm_shapefit.geometry import normalized
+
+_COLUMNS = 9
+_UNIT_TOLERANCE = 1e-3
+
+
+def is_relative_poses(source: Path | str) -> bool:
+    """Return whether a path is a text file whose first line is one of GLOMAP's: 9 words, a quaternion."""
+    if not Path(source).is_file():  # a pipe would be read for ever
+        return False
+    try:
+        with Path(source).open(encoding="utf-8") as stream:
+            first = next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
+        values = np.array(first[2:], dtype=np.float64)
+    except (OSError, UnicodeDecodeError, ValueError):
+        return False
+    if len(first) != _COLUMNS:
+        return False
+    is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= _UNIT_TOLERANCE
+    return is_unit and bool(np.any(values[4:]))  # a direction in 7 dimensions would be of length 1 with these
+
+
+def read_relative_poses(path: Path | str) -> EpipolarGeometries:
+    """Read relative poses; names are in order, numbers by value.
+
+    Raises:
+        InputError: if the file is malformed, naming the first bad line.
+    """
+    file = Path(path)
+    numbers, rows = read_lines(file, "NAME1 NAME2 QW QX QY QZ TX TY TZ")
+    values = number_table(file, numbers, rows, first=2, width=_COLUMNS)
+    names, nodes = node_indices([word for row in rows for word in row[:2]])
+    pairs = nodes.reshape(-1, 2)
+    quaternions, translations = values[:, :4], values[:, 4:]
+    lengths = np.linalg.norm(quaternions, axis=1)
+    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins an image with itself")
+    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit quaternion QW QX QY QZ")
+    refuse(
+        file, numbers, ~(np.linalg.norm(translations, axis=1) > 0.0), "has no translation, so no direction"
+    )
+    keys = np.sort(pairs, axis=1)
+    first = np.zeros(len(keys), dtype=np.bool_)
+    first[np.unique(keys, axis=0, return_index=True)[1]] = True
+    refuse(file, numbers, ~first, "gives a pair for the second time")
+    rotations = np.array([rotation_from_quaternion(q) for q in quaternions])
+    return EpipolarGeometries(
+        names=tuple(names),
+        pairs=pairs,
+        rotations=rotations,
+        to_second=normalized(-np.einsum("kji,kj->ki", rotations, translations)),
+    )
+
+
+def relative_poses_text(poses: EpipolarGeometries) -> str:
+    """Return relative poses in the form that `read_relative_poses` takes; t has length 1.
+
+    Raises:
+        InputError: if a name has blanks, or begins a comment.
+    """
+    for name in poses.names:
+        if len(name.split()) != 1 or "#" in name:
+            raise InputError(f"the name {name!r} cannot stand in a file of relative poses; rename the image")
+    lines = []
+    for (i, j), rotation, to_second in zip(
+        poses.pairs.tolist(), poses.rotations, poses.to_second, strict=True
+    ):
+        numbers = [*quaternion_from_rotation(rotation).tolist(), *(-rotation @ to_second).tolist()]
+        lines.append(" ".join([poses.names[i], poses.names[j], *(repr(number + 0.0) for number in numbers)]))
+    return "".join(f"{line}\n" for line in lines)

@@ -1,0 +1,144 @@
+"""openMVG's sfm_data.json: read.
+
+    views        [{key, value: {ptr_wrapper: {data: {filename, width, height,
+                   id_view, id_intrinsic, id_pose}}}}]
+    intrinsics   [{key, value: {polymorphic_name, ptr_wrapper: {data: {width, height, focal_length,
+                   principal_point, disto_k1 | disto_k3 | disto_t2 | fisheye}}}}]
+    extrinsics   [{key, value: {rotation: 3 rows, center: [3]}}]
+    structure    [{key, value: {X: [3], observations: [{key: view, value: {x: [2]}}]}}]
+
+    x_cam = rotation (X - center)
+
+so rotation is cam_from_world, with z forward and y down as in COLMAP, and center the camera's centre.
+Newer versions nest the base classes' members in objects `value0`; both forms are read. The camera model is
+known by the name of its distortion, for `polymorphic_name` stands only at the first of a kind. Pixels are
+taken as they are.
+
+Source: https://openmvg.readthedocs.io, "SfM data scene representation", and openMVG's cameras.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.formats.scene import JsonNode, SceneCamera, SceneFile
+
+_NO_POSE = 2**32 - 1  # openMVG's UndefinedIndexT
+
+
+def is_openmvg(content: object) -> bool:
+    """Return whether the content of a JSON file is openMVG's scene."""
+    return isinstance(content, dict) and "sfm_data_version" in content
+
+
+def read_openmvg(file: Path, content: object) -> SceneFile:
+    """Read the posed views and the structure of a file whose JSON is `content`.
+
+    Raises:
+        InputError: naming the key that is missing or wrong.
+    """
+    root = JsonNode(file, "", content)
+    cameras = {key: _camera(_data(node)) for key, node in _entries(root, "intrinsics")}
+    poses = {
+        key: (node.get("rotation").rotation(), np.array(node.get("center").numbers(3)))
+        for key, node in _entries(root, "extrinsics")
+    }
+    order = {key: k for k, key in enumerate(cameras)}
+    index_of: dict[int, int] = {}
+    names: list[str] = []
+    camera_of, rotations, centers = [], [], []
+    for _, node in _entries(root, "views"):
+        view = _data(node)
+        pose = view.get("id_pose").integer()
+        if pose == _NO_POSE or pose not in poses:
+            continue
+        intrinsic = view.get("id_intrinsic").integer()
+        if intrinsic not in cameras:
+            raise view.error(f"has the intrinsic {intrinsic}, which is not among the intrinsics")
+        folder = view.get("local_path").value if view.has("local_path") else ""
+        index_of[view.get("id_view").integer()] = len(names)
+        names.append("/".join(part for part in (str(folder).strip("/"), view.get("filename").text()) if part))
+        camera_of.append(order[intrinsic])
+        rotations.append(poses[pose][0])
+        centers.append(poses[pose][1])
+    points, observed, pixels = _structure(root, index_of)
+    return SceneFile(
+        cameras=tuple(cameras.values()),
+        names=tuple(names),
+        camera_of=np.array(camera_of, dtype=np.int64),
+        rotations=np.array(rotations).reshape(-1, 3, 3),
+        centers=np.array(centers).reshape(-1, 3),
+        points=points,
+        colors=np.full((len(points), 3), 128, dtype=np.int64),
+        observed=observed,
+        pixels=pixels,
+    )
+
+
+def _entries(root: JsonNode, key: str) -> Iterator[tuple[int, JsonNode]]:
+    """Yield the keys and values of one of openMVG's maps; none if it is missing."""
+    for node in root.get(key).elements() if root.has(key) else []:
+        yield node.get("key").integer(), node.get("value")
+
+
+def _data(node: JsonNode) -> JsonNode:
+    """Return the members behind a pointer."""
+    return node.get("ptr_wrapper").get("data")
+
+
+def _found(node: JsonNode, key: str) -> JsonNode | None:
+    """Return a member of an object or of its nested base classes; None if there is none."""
+    if node.has(key):
+        return node.get(key)
+    return _found(node.get("value0"), key) if node.has("value0") else None
+
+
+def _camera(node: JsonNode) -> SceneCamera:
+    """Return a camera in COLMAP's terms."""
+    members = {}
+    for key in ("width", "height", "focal_length", "principal_point"):
+        member = _found(node, key)
+        if member is None:
+            raise node.error(f"has no key {key!r}")
+        members[key] = member
+    width, height = members["width"].integer(), members["height"].integer()
+    f, center = members["focal_length"].number(), members["principal_point"].numbers(2)
+    if f <= 0.0 or width < 1 or height < 1:
+        raise node.error("has a focal length or a size that is not positive")
+    model, params = _model(node, f, center)
+    return SceneCamera(model=model, width=width, height=height, params=params)
+
+
+def _model(node: JsonNode, f: float, center: list[float]) -> tuple[str, tuple[float, ...]]:
+    """Return COLMAP's name and parameters of the camera model."""
+    if k1 := _found(node, "disto_k1"):
+        return "SIMPLE_RADIAL", (f, *center, *k1.numbers(1))
+    if k3 := _found(node, "disto_k3"):
+        a, b, c = k3.numbers(3)
+        return "FULL_OPENCV", (f, f, *center, a, b, 0.0, 0.0, c, 0.0, 0.0, 0.0)
+    if t2 := _found(node, "disto_t2"):
+        a, b, c, p1, p2 = t2.numbers(5)
+        return "FULL_OPENCV", (f, f, *center, a, b, p1, p2, c, 0.0, 0.0, 0.0)
+    if fisheye := _found(node, "fisheye"):
+        return "OPENCV_FISHEYE", (f, f, *center, *fisheye.numbers(4))
+    return "SIMPLE_PINHOLE", (f, *center)
+
+
+def _structure(root: JsonNode, index_of: dict[int, int]) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Return points, observations (point, image) and their pixels."""
+    points: list[list[float]] = []
+    observed, pixels = [], []
+    for _, node in _entries(root, "structure"):
+        for seen in node.get("observations").elements():
+            view = seen.get("key").integer()
+            if view in index_of:
+                observed.append((len(points), index_of[view]))
+                pixels.append(seen.get("value").get("x").numbers(2))
+        points.append(node.get("X").numbers(3))
+    return (
+        np.array(points, dtype=np.float64).reshape(-1, 3),
+        np.array(observed, dtype=np.int64).reshape(-1, 2),
+        np.array(pixels, dtype=np.float64).reshape(-1, 2),
+    )

@@ -1,0 +1,148 @@
+"""OpenSfM's reconstruction.json: read, with the observations of the tracks.csv beside it, if there is one.
+
+    [{"cameras": {id: {projection_type, width, height, focal, k1, k2, ...}},
+      "shots":   {name: {rotation: [3], translation: [3], camera: id}},
+      "points":  {id: {coordinates: [3], color: [3]}}}, ...]
+
+`rotation` is the angle-axis vector of cam_from_world, `translation` its t: x_cam = R x + t, z forward and
+y down as in COLMAP. Lengths in the image are in units of its larger side, from its centre:
+
+    pixel = larger side * normalised + (width, height) / 2          (COLMAP's pixels: first centre at 0.5)
+
+tracks.csv, versions 1 and 2: `image track feature x y [scale] r g b ...`, tab-separated, x and y
+normalised; tracks are the points. Of several reconstructions the one with most shots is read.
+
+Source: https://opensfm.org/docs/geometry.html and dataset.html.
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.scene import JsonNode, SceneCamera, SceneFile, rotation_from_quaternion
+
+_TRACKS_FILE = "tracks.csv"
+_MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
+
+
+def is_opensfm(content: object) -> bool:
+    """Return whether the content of a JSON file is a list of reconstructions."""
+    return (
+        isinstance(content, list) and bool(content) and isinstance(content[0], dict) and "shots" in content[0]
+    )
+
+
+def read_opensfm(file: Path, content: object) -> SceneFile:
+    """Read the largest reconstruction of a file whose JSON is `content`.
+
+    Raises:
+        InputError: naming the key that is missing or wrong.
+    """
+    reconstructions = JsonNode(file, "", content).elements()
+    chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
+    camera_ids, cameras = [], []
+    for key, node in chosen.get("cameras").items():
+        camera_ids.append(key)
+        cameras.append(_camera(node))
+    names, camera_of, rotations, centers = [], [], [], []
+    for name, shot in chosen.get("shots").items():
+        key = shot.get("camera").text()
+        if key not in camera_ids:
+            raise shot.error(f"has the camera {key!r}, which is not among the cameras")
+        rotation = rotation_from_vector(np.array(shot.get("rotation").numbers(3)))
+        names.append(name)
+        camera_of.append(camera_ids.index(key))
+        rotations.append(rotation)
+        centers.append(-rotation.T @ np.array(shot.get("translation").numbers(3)))
+    ids, points, colors = [], [], []
+    for key, node in chosen.get("points").items() if chosen.has("points") else []:
+        ids.append(key)
+        points.append(node.get("coordinates").numbers(3))
+        colors.append(node.get("color").numbers(3) if node.has("color") else [0.0, 0.0, 0.0])
+    observed, normalised = _observations(file, ids, names)
+    sizes = np.array([[cameras[k].width, cameras[k].height] for k in camera_of], dtype=np.float64).reshape(
+        -1, 2
+    )
+    of_image = sizes[observed[:, 1]]
+    return SceneFile(
+        cameras=tuple(cameras),
+        names=tuple(names),
+        camera_of=np.array(camera_of, dtype=np.int64),
+        rotations=np.array(rotations).reshape(-1, 3, 3),
+        centers=np.array(centers).reshape(-1, 3),
+        points=np.array(points).reshape(-1, 3),
+        colors=np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.int64),
+        observed=observed,
+        pixels=normalised * of_image.max(axis=1, keepdims=True, initial=0.0) + of_image / 2.0,
+    )
+
+
+def rotation_from_vector(vector: FloatArray) -> FloatArray:
+    """Return the (3, 3) rotation about `vector` by its length in radians."""
+    half = np.linalg.norm(vector) / 2.0
+    return rotation_from_quaternion(np.array([np.cos(half), *(np.sinc(half / np.pi) / 2.0 * vector)]))
+
+
+def _camera(node: JsonNode) -> SceneCamera:
+    """Return a camera in COLMAP's terms; missing coefficients are 0."""
+    kind = node.get("projection_type").text()
+    if kind not in _MODELS:
+        raise node.error(f"has the projection type {kind!r}; {', '.join(_MODELS)} are read")
+    width, height = node.get("width").integer(), node.get("height").integer()
+    if width < 1 or height < 1:
+        raise node.error("has no size")
+    size = float(max(width, height))
+
+    def value(key: str) -> float:
+        return node.get(key).number() if node.has(key) else 0.0
+
+    two = node.has("focal_x")
+    fx, fy = (
+        node.get(key).number() * size for key in (("focal_x", "focal_y") if two else ("focal", "focal"))
+    )
+    if fx <= 0.0 or fy <= 0.0:
+        raise node.error("has a focal length that is not positive")
+    center = (size * value("c_x") + width / 2.0, size * value("c_y") + height / 2.0)
+    k1, k2 = value("k1"), value("k2")
+    params: tuple[float, ...]
+    if kind == "perspective":
+        model, params = "RADIAL", (fx, *center, k1, k2)
+    elif kind == "fisheye":
+        model, params = "OPENCV_FISHEYE", (fx, fy, *center, k1, k2, 0.0, 0.0)
+    elif kind == "brown":
+        extra = (value("p1"), value("p2"), value("k3"), 0.0, 0.0, 0.0)
+        model, params = "FULL_OPENCV", (fx, fy, *center, k1, k2, *extra)
+    else:
+        model, params = "OPENCV", (fx, fy, *center, k1, k2, 0.0, 0.0)
+    return SceneCamera(model=model, width=width, height=height, params=params)
+
+
+def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:
+    """Return the observations (point, image) of tracks.csv, and their normalised coordinates."""
+    tracks = file.with_name(_TRACKS_FILE)
+    observed, coordinates = [], []
+    if tracks.is_file():
+        try:
+            lines = tracks.read_text(encoding="utf-8").splitlines()
+        except (OSError, UnicodeDecodeError) as error:
+            raise InputError(f"{tracks} is not a readable text file ({error})") from error
+        point_of, image_of = ({key: k for k, key in enumerate(keys)} for keys in (points, names))
+        for number, line in enumerate(lines, start=1):
+            words = line.split("\t")
+            if line.startswith("OPENSFM_TRACKS_VERSION") or not line.strip():
+                continue
+            try:
+                image, track, x, y = words[0], words[1], float(words[3]), float(words[4])
+            except (IndexError, ValueError):
+                raise InputError(f"{tracks}, line {number}: expected image, track, feature, x, y") from None
+            if not (np.isfinite(x) and np.isfinite(y)):
+                raise InputError(f"{tracks}, line {number}: has a number that is not finite")
+            if track in point_of and image in image_of:
+                observed.append((point_of[track], image_of[image]))
+                coordinates.append((x, y))
+    return (
+        np.array(observed, dtype=np.int64).reshape(-1, 2),
+        np.array(coordinates, dtype=np.float64).reshape(-1, 2),
+    )

@@ -1,0 +1,293 @@
+"""Pytest fixtures for pipelines that place cameras: scenes, graphs and workspaces whose truth is known.
+
+Name the plugin in the conftest.py at the root of your tests (or run pytest with `-p` and its name):
+
+    pytest_plugins = ["sfm_shapefit.synthetic.fixtures"]
+
+Then ask for what you need, and compare with the truth:
+
+    from sfm_shapefit import locate, solve
+    from sfm_shapefit.synthetic import WorkspaceOptions
+    from sfm_shapefit.synthetic.fixtures import assert_locations_near, assert_reconstruction_near
+
+
+    def test_a_quarter_of_wrong_pairs_does_no_harm(scene_of, workspace_of):
+        scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
+        workspace = workspace_of(scene, WorkspaceOptions(model="rotations"))
+        found = locate(workspace / "sparse/0").reconstruction
+        assert_reconstruction_near(found, workspace / "truth", max_median_error=0.05, min_placed=0.9)
+
+
+    def test_exact_directions_give_exact_locations(random_graph):
+        problem = random_graph(30, p=0.5, q=0.1)
+        assert_locations_near(solve(problem.view_graph).locations, problem.locations, max_error=1e-6)
+
+What there is:
+
+| fixture | what it is |
+|---|---|
+| `scene_of` | `scene_of(shape, **changes)`: a `Scene`; changes are fields of `SceneOptions` |
+| `ring_scene`, `facade_scene`, `courtyard_scene`, `drive_scene` | 12 images, half a pixel of noise |
+| `rendered_scene_of` | `rendered_scene_of(shape, render=RenderOptions(), **changes)`: a scene to be drawn |
+| `workspace_of` | `workspace_of(scene, WorkspaceOptions())`: a folder with a scene of either kind |
+| `ring_workspace` | database and exact model of `ring_scene` |
+| `corrupted_workspace` | a courtyard's rotations and database, a fifth of its pairs wrong; `truth` |
+| `random_graph` | `random_graph(n, p, sigma=, q=, seed=, corruption=)`: the random model of the paper |
+| `graph_of` | `graph_of(family, n, ...)`: ring, trajectory, lawn, box, corridor, community, expander |
+| `street_graph` | `street_graph(num_cameras, ...)`: a straight street of cameras and points |
+
+Scenes and graphs are values that nobody changes: they are made once per session for the same arguments.
+Workspaces are folders of your own, in the test's `tmp_path`. Everything is the same on every run; another
+`seed` makes another one. COLMAP's images are named `0001.jpg` and so on; one unit is a metre.
+
+This module needs pytest, and no part of the package imports it.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.arrays import FloatArray
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from sfm_shapefit.synthetic import (
+        GraphProblem,
+        RenderedScene,
+        RenderOptions,
+        Scene,
+        StreetProblem,
+        WorkspaceOptions,
+    )
+
+__all__ = ["assert_locations_near", "assert_reconstruction_near"]
+
+_FAMILIES = ("ring", "trajectory", "lawn", "box", "corridor", "community", "expander")
+
+
+class SceneMaker(Protocol):
+    """Makes scenes by shape."""
+
+    def __call__(self, shape: str, **changes: Any) -> "Scene": ...
+
+
+class RenderedSceneMaker(Protocol):
+    """Makes scenes to be drawn, by shape."""
+
+    def __call__(
+        self, shape: str, render: "RenderOptions | None" = None, **changes: Any
+    ) -> "RenderedScene": ...
+
+
+class WorkspaceMaker(Protocol):
+    """Writes scenes as folders."""
+
+    def __call__(self, scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path: ...
+
+
+# --- comparisons -------------------------------------------------------------------------------------------
+
+
+def assert_reconstruction_near(
+    found: "pycolmap.Reconstruction | Path | str",
+    truth: "pycolmap.Reconstruction | Path | str",
+    *,
+    max_error: float | None = None,
+    max_median_error: float | None = None,
+    max_rotation_error_deg: float | None = None,
+    min_placed: float = 1.0,
+) -> None:
+    """Fail unless a reconstruction has the true camera poses, up to a similarity.
+
+    Cameras are matched by name; the alignment is robust, so that one camera far off does not hide in it. At
+    least one of the limits must be given.
+
+    Args:
+        found, truth: reconstructions or model folders.
+        max_error: of any placed camera's centre, in units of the truth.
+        max_median_error: of the median placed camera's centre, in units of the truth.
+        max_rotation_error_deg: of any placed camera's rotation.
+        min_placed: the fraction of the true cameras that must be placed.
+
+    Raises:
+        AssertionError: naming every limit that is exceeded, and the worst camera.
+        ValueError: if no limit is given.
+    """
+    if max_error is None and max_median_error is None and max_rotation_error_deg is None:
+        raise ValueError("give max_error, max_median_error or max_rotation_error_deg")
+    from sfm_shapefit import evaluate
+
+    errors = evaluate(found, truth)
+    placed = len(errors.names) / (len(errors.names) + len(errors.missing))
+    worst = errors.names[int(np.argmax(errors.position_errors))]
+    turned = errors.names[int(np.argmax(errors.rotation_errors_deg))]
+    complaints = []
+    if placed < min_placed:
+        complaints.append(
+            f"{placed:.0%} of the cameras are placed, not {min_placed:.0%}: {errors.missing} miss"
+        )
+    if max_error is not None and errors.position.max > max_error:
+        complaints.append(f"{worst} is {errors.position.max:.3g} off, limit {max_error:g}")
+    if max_median_error is not None and errors.position.median > max_median_error:
+        complaints.append(
+            f"the median camera is {errors.position.median:.3g} off, limit {max_median_error:g}"
+        )
+    if max_rotation_error_deg is not None and errors.rotation_deg.max > max_rotation_error_deg:
+        limit = f"limit {max_rotation_error_deg:g} deg"
+        complaints.append(f"{turned} is turned by {errors.rotation_deg.max:.3g} deg, {limit}")
+    assert not complaints, "; ".join(complaints)
+
+
+def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: float) -> None:
+    """Fail unless locations are the true ones up to shift and scale, as directions leave them.
+
+    Args:
+        found, truth: (n, d).
+        max_error: the paper's relative error: both centred and scaled to Frobenius norm 1, the norm of
+            their difference.
+
+    Raises:
+        AssertionError: with the error and the location that is farthest off.
+    """
+    assert found.shape == truth.shape, f"locations have shape {found.shape}, the truth has {truth.shape}"
+    one, two = (t - t.mean(axis=0) for t in (found, truth))
+    difference = one / np.linalg.norm(one) - two / np.linalg.norm(two)
+    error = float(np.linalg.norm(difference))
+    worst = int(np.argmax(np.linalg.norm(difference, axis=1)))
+    assert error <= max_error, f"relative error {error:.3g}, limit {max_error:g}; worst location {worst}"
+
+
+# --- scenes ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def scene_of() -> SceneMaker:
+    """Make photographed scenes: 12 images of 1200 points with 0.5 px of noise, if nothing else is said."""
+    made: dict[Any, Scene] = {}
+
+    def scene(shape: str, **changes: Any) -> "Scene":
+        from sfm_shapefit.synthetic import SceneOptions, make_scene
+
+        options = SceneOptions(**{"shape": shape, "num_images": 12, "num_points": 1200, **changes})
+        if options not in made:
+            made[options] = make_scene(options)
+        return made[options]
+
+    return scene
+
+
+@pytest.fixture(scope="session")
+def ring_scene(scene_of: SceneMaker) -> "Scene":
+    """Cameras around an object."""
+    return scene_of("ring")
+
+
+@pytest.fixture(scope="session")
+def facade_scene(scene_of: SceneMaker) -> "Scene":
+    """A grid of cameras before a wall."""
+    return scene_of("facade")
+
+
+@pytest.fixture(scope="session")
+def courtyard_scene(scene_of: SceneMaker) -> "Scene":
+    """Cameras around the inside of four facades."""
+    return scene_of("courtyard")
+
+
+@pytest.fixture(scope="session")
+def drive_scene(scene_of: SceneMaker) -> "Scene":
+    """Cameras that look ahead along a street."""
+    return scene_of("drive")
+
+
+@pytest.fixture(scope="session")
+def rendered_scene_of() -> RenderedSceneMaker:
+    """Make scenes to be drawn: 8 images of 640 x 480 pixels, if nothing else is said."""
+    made: dict[Any, RenderedScene] = {}
+
+    def scene(shape: str, render: "RenderOptions | None" = None, **changes: Any) -> "RenderedScene":
+        from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
+
+        default = {"num_images": 8, "image_width": 640, "image_height": 480, "focal_length_px": 560.0}
+        options = SceneOptions(**{"shape": shape, **default, **changes})
+        key = (options, render or RenderOptions())
+        if key not in made:
+            made[key] = make_rendered_scene(*key)
+        return made[key]
+
+    return scene
+
+
+# --- workspaces --------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def workspace_of(tmp_path: Path) -> WorkspaceMaker:
+    """Write scenes as COLMAP workspaces, each in a folder of its own."""
+
+    def workspace(scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path:
+        from sfm_shapefit.colmap.photographs import write_rendered_workspace
+        from sfm_shapefit.colmap.workspace import write_workspace
+        from sfm_shapefit.synthetic import Scene
+
+        folder = tmp_path / f"workspace{len(list(tmp_path.glob('workspace*'))) + 1}"
+        if isinstance(scene, Scene):
+            write_workspace(scene, folder, options)
+        else:
+            write_rendered_workspace(scene, folder, options)
+        return folder
+
+    return workspace
+
+
+@pytest.fixture
+def ring_workspace(ring_scene: "Scene", workspace_of: WorkspaceMaker) -> Path:
+    """Write the ring: database.db, and the exact model in sparse/0."""
+    return workspace_of(ring_scene)
+
+
+@pytest.fixture
+def corrupted_workspace(scene_of: SceneMaker, workspace_of: WorkspaceMaker) -> Path:
+    """Write a courtyard with a fifth of its pairs wrong: rotations only in sparse/0, the answer in truth."""
+    from sfm_shapefit.synthetic import WorkspaceOptions
+
+    scene = scene_of("courtyard", corrupted_pair_fraction=0.2)
+    return workspace_of(scene, WorkspaceOptions(model="rotations"))
+
+
+# --- graphs ------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def random_graph() -> "Callable[..., GraphProblem]":
+    """Make graphs of the paper's random model: see `random_graph_problem`."""
+    from sfm_shapefit.synthetic import random_graph_problem
+
+    return random_graph_problem
+
+
+@pytest.fixture(scope="session")
+def graph_of() -> "Callable[..., GraphProblem]":
+    """Make graphs by family, with `degree`, `sigma`, `q`, `seed` and `corruption` as keywords."""
+
+    def graph(family: str, n: int, **arguments: Any) -> "GraphProblem":
+        from sfm_shapefit import synthetic
+
+        if family not in _FAMILIES:
+            raise ValueError(f"family must be one of {', '.join(_FAMILIES)}, got {family!r}")
+        problem: GraphProblem = getattr(synthetic, f"{family}_graph_problem")(n, **arguments)
+        return problem
+
+    return graph
+
+
+@pytest.fixture(scope="session")
+def street_graph() -> "Callable[..., StreetProblem]":
+    """Make straight streets of cameras and points: see `street_problem`."""
+    from sfm_shapefit.synthetic import street_problem
+
+    return street_problem

@@ -1,0 +1,109 @@
+"""Two vehicles with a rig of three cameras each, which drive along a street: a scene whose scale is known.
+
+A vehicle carries a camera that looks ahead and two that look 40 degrees to the left and to the right, 1.6 m
+apart. The second vehicle's rig is higher and wider than the first's, and it drives 1.2 m to its left and half
+a step behind. A frame is what the three cameras of a vehicle see at once; frames of the vehicles alternate.
+Rotations are known; the metric offsets of the sensors in their rigs are what fixes the scale of the drive.
+
+A rig's axes are those of its first camera: x to the right, y down, z ahead.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.synthetic.layouts import LAYOUTS, Layout, looking_along, street
+from sfm_shapefit.synthetic.options import SceneOptions
+from sfm_shapefit.synthetic.scenes import Scene, scene_of
+
+NUM_RIGS, NUM_SENSORS = 2, 3
+
+_STEP_M = 1.5  # between two frames of a vehicle
+_YAW_DEG = np.array([0.0, 40.0, -40.0])  # to the left of ahead
+_OFFSETS_M = np.array(
+    [
+        [[0.0, 0.0, 0.0], [-0.8, 0.1, -0.3], [0.8, 0.1, -0.3]],
+        [[0.0, 0.0, 0.0], [-1.0, -0.3, -0.5], [1.0, -0.3, -0.5]],
+    ]
+)
+_LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RigScene:
+    """A photographed scene with the rigs that its images belong to."""
+
+    scene: Scene
+    """Image k is what sensor `sensor_of_image[k]` saw in frame `frame_of_image[k]`."""
+    rig_of_frame: IntArray
+    """(f,)"""
+    frame_of_image: IntArray
+    """(n,) ascending; each frame has all sensors of its rig."""
+    sensor_of_image: IntArray
+    """(n,) 0 is the reference sensor of the rig."""
+    sensor_rotations: FloatArray
+    """(rigs, sensors, 3, 3) sensor_from_rig."""
+    sensor_centers: FloatArray
+    """(rigs, sensors, 3) of each sensor in its rig, in metres; 0 for the reference."""
+
+
+def make_rig_drive(options: SceneOptions) -> RigScene:
+    """Return the drive of two rigs of three cameras.
+
+    Args:
+        options: `num_images` is rounded down to whole frames; `shape` is not read, and rotations are exact.
+
+    Raises:
+        ValueError: if there is not a frame for each rig, or rotations are to be wrong.
+        InputError: as `make_scene`.
+    """
+    num_frames = options.num_images // NUM_SENSORS
+    if num_frames < NUM_RIGS:
+        raise ValueError(f"num_images must be {NUM_RIGS * NUM_SENSORS} or more, got {options.num_images}")
+    if options.rotation_noise_deg:
+        raise ValueError("rotation_noise_deg must be 0: the frames of a rig turn as one")
+    layout_rng, *rngs = np.random.default_rng(options.seed).spawn(6)
+    frame_of_image = np.repeat(np.arange(num_frames), NUM_SENSORS)
+    sensor_of_image = np.tile(np.arange(NUM_SENSORS), num_frames)
+    rig_of_frame = np.arange(num_frames) % NUM_RIGS
+    rotations, centers = _frames(num_frames, rig_of_frame, layout_rng)
+    turns = _sensor_rotations()
+    rig_of_image = rig_of_frame[frame_of_image]
+    offsets = _OFFSETS_M[rig_of_image, sensor_of_image]
+    streets = LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng)
+    layout = Layout(
+        centers=centers[frame_of_image] + np.einsum("nji,nj->ni", rotations[frame_of_image], offsets),
+        rotations=turns[rig_of_image, sensor_of_image] @ rotations[frame_of_image],
+        points=streets.points,
+        normals=streets.normals,
+        colors=streets.colors,
+    )
+    return RigScene(
+        scene=scene_of(layout, options, rngs),
+        rig_of_frame=rig_of_frame,
+        frame_of_image=frame_of_image,
+        sensor_of_image=sensor_of_image,
+        sensor_rotations=turns,
+        sensor_centers=_OFFSETS_M,
+    )
+
+
+def _frames(
+    num_frames: int, rig_of_frame: IntArray, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return rig_from_world rotations (f, 3, 3) and centres (f, 3) of the frames along the street."""
+    at = _STEP_M / NUM_RIGS * np.arange(num_frames)
+    road, ahead, left = street(at)
+    centers = road + (_LANES_M[rig_of_frame] + 0.1 * rng.standard_normal(num_frames))[:, None] * left
+    centers[:, 2] = _HEIGHTS_M[rig_of_frame] + 0.05 * rng.standard_normal(num_frames)
+    return looking_along(normalized(ahead + 0.02 * rng.standard_normal((num_frames, 3)))), centers
+
+
+def _sensor_rotations() -> FloatArray:
+    """Return sensor_from_rig (rigs, sensors, 3, 3): turns about the rig's y axis, which points down."""
+    yaw = np.radians(_YAW_DEG)
+    cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    rows = [[cosine, zero, sine], [zero, one, zero], [-sine, zero, cosine]]
+    return np.tile(np.moveaxis(np.array(rows), 2, 0), (NUM_RIGS, 1, 1, 1))

@@ -1,0 +1,296 @@
+"""ShapeFit over rigid bodies: the program, its dual and certificate, what hangs free, and the refinement."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.bodies import Bodies, separate
+from sfm_shapefit.body_placement import place_bodies
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.bodies import certify_bodies, largest_tied, lud_over_bodies, solve_bodies
+from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.options import Status
+from sfm_shapefit.solver.program import adjoint, scale_functional
+from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def rig_problem(seed, frames=8, sensors=3, wrong=0.2, noise=0.0, share=0.5):
+    """Frames turned at random with sensors 0.7 from their origin, 4 apart; a share of all pairs."""
+    rng = np.random.default_rng(seed)
+    turns = np.linalg.qr(rng.normal(size=(frames, 3, 3)))[0]
+    own = 0.7 * rng.normal(size=(sensors, 3))
+    centres = 4.0 * rng.normal(size=(frames, 3))
+    labels = np.repeat(np.arange(frames), sensors)
+    offsets = np.einsum("fab,sb->fsa", turns, own).reshape(-1, 3)
+    t = centres[labels] + offsets
+    n = len(t)
+    edges = np.stack(np.triu_indices(n, 1), axis=1)
+    edges = edges[rng.random(len(edges)) < share]
+    v = normalized(t[edges[:, 0]] - t[edges[:, 1]])
+    v = normalized(v + noise * rng.normal(size=v.shape))
+    bad = rng.random(len(edges)) < wrong
+    v[bad] = normalized(rng.normal(size=v.shape))[bad]
+    graph = ViewGraph(n, edges, v, rng.uniform(0.5, 2.0, len(edges)))
+    return graph, Bodies(body_of=labels, offsets=offsets), t
+
+
+def outer(graph, bodies):
+    """The graph without the pairs inside a body."""
+    kept = bodies.joins(graph.edges)
+    return ViewGraph(graph.num_cameras, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
+
+
+def centred(t):
+    return t - t.mean(axis=0)
+
+
+# --- the value ---------------------------------------------------------------------------------------
+
+
+def test_reducing_is_the_adjoint_of_expanding():
+    bodies = rig_problem(0)[1]
+    rng = np.random.default_rng(1)
+    x, g = rng.normal(size=bodies.num_unknowns), rng.normal(size=bodies.offsets.shape)
+    assert np.vdot(bodies.expand(x), g) == pytest.approx(np.vdot(x, bodies.reduce(g)), rel=1e-13)
+
+
+def test_fitting_finds_the_unknowns_and_how_far_a_node_is_off():
+    bodies = rig_problem(0)[1]
+    x = np.random.default_rng(1).normal(size=bodies.num_unknowns)
+    t = bodies.expand(x)
+    found, apart = bodies.fit(t)
+    np.testing.assert_allclose(found, x, atol=1e-13)
+    assert apart < 1e-13
+    t[4] += [0.3, 0.0, 0.0]  # of a body of three: the mean takes up a third, the scale a little
+    assert 0.1 < bodies.fit(t)[1] < 0.25
+
+
+def test_bodies_with_fixed_nodes_become_one_whole_frames_with_them():
+    bodies = Bodies(body_of=[0, 0, 1, 1, 2], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 0]])
+    centers = np.array([[5.0, 0, 0], [6.0, 0, 0], [9.0, 9, 9], [8.0, 1, 0], [7.0, 7, 7]])
+    joined = bodies.with_fixed(np.array([True, False, False, True, False]), centers)
+    np.testing.assert_array_equal(joined.body_of, [0, 0, 0, 0, 1])
+    # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own centre.
+    expected = np.array([[5.0, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, 0]])
+    np.testing.assert_allclose(centred(joined.offsets[:4]), centred(expected), atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("labels", "offsets", "message"),
+    [
+        ([0, 2], np.zeros((2, 3)), "without gaps"),
+        ([0, 1], np.zeros((3, 3)), "one row per node"),
+        ([0, 1], np.full((2, 3), np.nan), "offset of node 0 is not finite"),
+    ],
+)
+def test_bodies_that_make_no_sense_are_refused(labels, offsets, message):
+    with pytest.raises(InputError, match=message):
+        Bodies(body_of=labels, offsets=offsets)
+
+
+# --- the program -------------------------------------------------------------------------------------
+
+
+def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
+    graph, bodies, t = rig_problem(1)
+    result = solve_bodies(graph, bodies)
+    x, apart = bodies.fit(result.locations)
+    assert result.status is Status.CONVERGED
+    assert result.unique
+    assert apart < 1e-12
+    # Certified to 1e-8 in an objective of 0.1; errors are of that order.
+    np.testing.assert_allclose(centred(result.locations) / x[-1], centred(t), atol=1e-6)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05])
+def test_the_answer_is_that_of_the_conic_program_over_the_same_bodies(noise):
+    graph, bodies, _ = rig_problem(2, noise=noise)
+    result = solve_bodies(graph, bodies)
+    locations, dual, _ = solve_conic(outer(graph, bodies)[0], 1e-9, 200, bodies)
+    every = np.zeros_like(graph.directions)
+    every[bodies.joins(graph.edges)] = dual
+    reference = certify_bodies(graph, bodies, centred(locations), every)
+    assert reference.gap < 1e-9  # so the two optima agree to the sum of both gaps
+    assert result.objective == pytest.approx(reference.objective, abs=1e-8)
+    # The objective is sharp here: locations agree to a few times its error.
+    np.testing.assert_allclose(result.locations, centred(locations), atol=1e-6)
+
+
+def test_bodies_of_one_node_are_the_plain_program_and_s_stays_zero():
+    graph, _, _ = rig_problem(3, noise=0.01)
+    result = solve_bodies(graph, separate(graph.num_cameras, 3))
+    plain = solve(graph)
+    assert result.objective == pytest.approx(plain.objective, abs=2e-8)
+    np.testing.assert_allclose(result.locations, plain.locations, atol=1e-6)
+
+
+def test_admitting_fewer_locations_raises_the_optimum():
+    graph, bodies, _ = rig_problem(4, noise=0.05)
+    between = outer(graph, bodies)[0]
+    assert solve_bodies(graph, bodies).dual_bound > solve(between).objective + 1e-4
+
+
+def test_the_dual_balances_over_each_body_and_for_the_scale():
+    graph, bodies, _ = rig_problem(5, noise=0.02)
+    result = solve_bodies(graph, bodies)
+    between, kept = outer(graph, bodies)
+    y, w = result.dual[kept], between.weights
+    total = bodies.reduce(adjoint(y, between.edges, graph.num_cameras))
+    wanted = result.dual_bound * bodies.reduce(scale_functional(between))
+    assert np.linalg.norm(y, axis=1).max() <= w.max() * (1 + 1e-14)
+    assert (np.linalg.norm(y, axis=1) <= w * (1 + 1e-14)).all()
+    assert np.abs(np.sum(y * between.directions, axis=1)).max() < 1e-13
+    # The solver leaves 1e-13 of the degree at most; one camera alone is not balanced.
+    np.testing.assert_allclose(total, wanted, atol=1e-11 * np.abs(wanted).max())
+    alone = adjoint(y, between.edges, graph.num_cameras) - result.dual_bound * scale_functional(between)
+    assert np.abs(alone).max() > 1e-3
+    assert not result.dual[~kept].any()
+
+
+def test_any_dual_gives_a_bound_below_the_optimum_and_a_near_one_a_close_bound():
+    graph, bodies, _ = rig_problem(6, noise=0.02)
+    result = solve_bodies(graph, bodies)
+    rng = np.random.default_rng(0)
+    for size, loss in ((1e-4, 1e-2), (1.0, np.inf)):
+        spoilt = result.dual + size * rng.normal(size=result.dual.shape)
+        found = certify_bodies(graph, bodies, result.locations, spoilt)
+        assert found.dual_bound <= result.objective
+        assert found.equality_residual < 1e-11
+        assert result.dual_bound - found.dual_bound < loss
+    assert certify_bodies(graph, bodies, result.locations, 0.0 * result.dual).dual_bound == 0.0
+
+
+def test_locations_that_are_not_those_of_the_bodies_are_not_certified():
+    graph, bodies, _ = rig_problem(7)
+    result = solve_bodies(graph, bodies)
+    moved = result.locations.copy()
+    moved[3] += 1e-3
+    with pytest.raises(InputError, match="not those of rigid bodies"):
+        certify_bodies(graph, bodies, moved, result.dual)
+    with pytest.raises(InputError, match="L\\(T\\) <= 0"):
+        certify_bodies(graph, bodies, -result.locations, result.dual)
+
+
+def test_the_same_problem_gives_the_same_bits():
+    graph, bodies, _ = rig_problem(8, noise=0.02)
+    first, second = solve_bodies(graph, bodies), solve_bodies(graph, bodies)
+    np.testing.assert_array_equal(first.locations, second.locations)
+    np.testing.assert_array_equal(first.dual, second.dual)
+
+
+# --- what hangs free -----------------------------------------------------------------------------------
+
+
+def test_a_body_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
+    graph, bodies, _ = rig_problem(9, frames=6, share=1.0)
+    ends = bodies.body_of[graph.edges]
+    to_last = np.flatnonzero((ends == 5).any(axis=1) & (ends[:, 0] != ends[:, 1]))
+    sizes = np.bincount(bodies.body_of)
+    for count, expected in ((1, 5), (2, 6)):
+        # Pairs of different sensors: in three dimensions two directions fix a body whose scale is known.
+        dropped = np.delete(to_last, [0, 7][:count])
+        kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
+        assert len(largest_tied(graph.edges[kept], bodies, sizes)) == expected
+
+
+def test_without_offsets_nothing_is_tied_for_the_scale_is_open():
+    graph, bodies, _ = rig_problem(10)
+    flat = Bodies(body_of=bodies.body_of, offsets=np.zeros_like(bodies.offsets))
+    assert len(largest_tied(graph.edges, flat, np.bincount(flat.body_of))) == 1
+    with pytest.raises(UnsolvableError, match="nothing determines the scale"):
+        place_bodies(graph, flat)
+
+
+def test_the_set_around_a_body_is_found_even_where_another_is_larger():
+    first, bodies, _ = rig_problem(11, frames=5, share=1.0)
+    second = rig_problem(12, frames=3, share=1.0)[0]
+    n = first.num_cameras
+    edges = np.concatenate([first.edges, second.edges + n])
+    both = Bodies(
+        body_of=np.repeat(np.arange(8), 3),
+        offsets=np.concatenate([bodies.offsets, rig_problem(12, frames=3)[1].offsets]),
+    )
+    sizes = np.full(8, 3)
+    np.testing.assert_array_equal(largest_tied(edges, both, sizes), range(5))
+    np.testing.assert_array_equal(largest_tied(edges, both, sizes, around=6), [5, 6, 7])
+
+
+def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_one_does_not():
+    # Two frames, displaced along the line on which both sensors of each stand: all directions are equal.
+    bodies = Bodies(body_of=[0, 0, 1, 1], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
+    t = bodies.expand(np.array([0.0, 0, 0, 5, 0, 0, 1]))
+    edges = np.array([[0, 2], [0, 3], [1, 2], [1, 3]])
+    sizes = np.array([2, 2])
+    assert len(largest_tied(edges, bodies, sizes)) == 2
+    assert len(largest_tied(edges, bodies, sizes, t)) == 1
+
+
+# --- starts, refinement, judgement -----------------------------------------------------------------------
+
+
+def test_lud_over_bodies_stays_with_the_bodies_and_near_the_truth():
+    graph, bodies, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
+    between = outer(graph, bodies)[0]
+    locations = lud_over_bodies(between, bodies)
+    x, apart = bodies.fit(locations)
+    assert apart < 1e-9 * np.abs(locations).max()
+    errors = np.linalg.norm(locations / x[-1] - centred(t), axis=1)
+    assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centred(t), axis=1))
+
+
+def test_the_placement_has_the_errors_that_it_states():
+    noise, errors, stated = 0.003, [], []
+    for seed in range(3):
+        graph, bodies, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
+        placed = place_bodies(graph, bodies)
+        errors.append(centred(placed.locations / placed.unit) - centred(t))
+        stated.append(placed.assessment.sigmas / placed.unit)
+        assert placed.finish.refined
+        assert placed.assessment.trust.min() > 0.9
+        assert bodies.fit(placed.locations)[1] < 1e-9
+    rms, said = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, stated))
+    # 180 coordinates, not independent within a frame: 60 give the ratio to about 10 %, twice that is allowed.
+    assert 0.8 < rms / said < 1.25
+
+
+def test_a_frame_whose_pairs_are_wrong_is_not_trusted_as_a_whole():
+    graph, bodies, _ = rig_problem(30, frames=10, wrong=0.05, noise=0.002)
+    rng = np.random.default_rng(0)
+    v = graph.directions.copy()
+    touched = (bodies.body_of[graph.edges] == 4).any(axis=1)
+    v[touched] = normalized(rng.normal(size=v.shape))[touched]
+    placed = place_bodies(ViewGraph(graph.num_cameras, graph.edges, v, graph.weights), bodies)
+    trust = placed.assessment.trust
+    spoilt = bodies.body_of[placed.cameras] == 4
+    assert len(set(trust[spoilt])) == 1  # one judgement for all cameras of a frame
+    assert trust[spoilt].max() < 0.5
+    assert trust[~spoilt].min() > 0.9
+
+
+def test_fixed_nodes_keep_their_shape_and_the_others_find_their_scale():
+    rng = np.random.default_rng(5)
+    t = 3.0 * rng.normal(size=(24, 3)) + [1e4, 0.0, 0.0]  # far from the origin, as in a national grid
+    edges = np.stack(np.triu_indices(24, 1), axis=1)
+    edges = edges[rng.random(len(edges)) < 0.5]
+    v = normalized(normalized(t[edges[:, 0]] - t[edges[:, 1]]) + 0.002 * rng.normal(size=(len(edges), 3)))
+    wrong = rng.random(len(edges)) < 0.2
+    v[wrong] = normalized(rng.normal(size=v.shape))[wrong]
+    fixed = np.arange(24) < 8
+    placed = place_bodies(ViewGraph(24, edges, v), separate(24, 3).with_fixed(fixed, t), held=0)
+    still = fixed[placed.cameras]
+    found = placed.locations / placed.unit
+    found = found + (t[placed.cameras][still] - found[still]).mean(axis=0)
+    errors = np.linalg.norm(found - t[placed.cameras], axis=1)
+    assert errors[still].max() < 1e-9  # roundings of numbers of 1e4
+    assert errors.max() < 0.05  # 2e-3 rad over 5, with several pairs each
+    assert placed.solve.gap <= 1e-8
+    # Variances that cancel leave their rounding, and its root is 1e-8.
+    assert placed.assessment.sigmas[still].max() < 1e-6 * placed.assessment.sigmas[~still].min()
+
+
+def test_offsets_that_the_directions_contradict_are_an_error_not_a_scale():
+    graph, bodies, _ = rig_problem(14, wrong=0.0)
+    mirrored = Bodies(body_of=bodies.body_of, offsets=-bodies.offsets)
+    with pytest.raises(UnsolvableError, match="contradict the known offsets"):
+        place_bodies(graph, mirrored)

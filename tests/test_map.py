@@ -1,0 +1,208 @@
+"""`map`: from a database alone to models, one for each component, with rotations the matches agree with."""
+
+import json
+import sqlite3
+from contextlib import closing
+
+import numpy as np
+import pytest
+from scenes import COURTYARD, RING, copied, fingerprint
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+import sfm_shapefit
+from sfm_shapefit.cli import app
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.relative import RelativeRotations, relative_rotations
+from sfm_shapefit.colmap.unposed import read_images
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.mapping.averaging import averaged
+
+PAIR = 2147483647
+FAST = {"points": "never", "refine_rotations": False}
+
+
+def changed(scene, folder, *statements):
+    """A copy of a scene's database after some SQL."""
+    path = copied(scene, folder) / "database.db"
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for statement in statements:
+            connection.execute(statement)
+    return path
+
+
+def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
+    before = fingerprint(COURTYARD)
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", sfm_shapefit.MapOptions(points="never"))
+    assert fingerprint(COURTYARD) == before
+    (model,) = found.models
+    assert (found.num_placed, found.left_out, found.warnings) == (25, {}, ())
+    errors = sfm_shapefit.evaluate(model.located.reconstruction, COURTYARD / "truth")
+    assert errors.position.max < 0.005 * errors.extent  # measured 0.0007; a quarter of the pairs is false
+    assert errors.rotation_deg.max < 0.2
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert read_model(tmp_path / "out" / "0").num_images == 25
+    assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
+    facts = json.loads((tmp_path / "out" / "map.json").read_text())
+    assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
+
+
+def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
+    out, run = str(tmp_path / "out"), CliRunner().invoke
+    arguments = ["map", str(RING / "database.db"), out, "--bundle-adjust", "--points", "never", "--json"]
+    result = run(app, arguments)
+    assert result.exit_code == 0, result.output
+    facts = json.loads(result.stdout)
+    assert facts["models"][0]["located"]["bundle_adjustment"]["final_error_px"] < 1.0
+    errors = sfm_shapefit.evaluate(tmp_path / "out" / "0", RING / "sparse" / "0")
+    assert len(errors.names) == 8
+    assert errors.position.max < 0.005 * errors.extent
+    assert run(app, arguments).exit_code == 3
+    assert run(app, [*arguments, "--overwrite"]).exit_code == 0
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("precious")
+    assert run(app, ["map", str(RING / "database.db"), str(tmp_path / "mine"), "--overwrite"]).exit_code == 3
+    assert run(app, ["map", str(tmp_path / "missing.db"), str(tmp_path / "o")]).exit_code == 3
+    assert not (tmp_path / "o").exists()
+
+
+def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):
+    groups = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
+    lonely = f"pair_id / {PAIR} = 8 OR pair_id % {PAIR} = 8"
+    path = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {groups} OR {lonely}")
+    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST, min_trust=0.0))
+    assert [model.names for model in found.models] == [
+        tuple(f"{k:04d}.jpg" for k in group) for group in ((1, 2, 3, 4), (5, 6, 7))
+    ]
+    assert list(found.left_out) == ["0008.jpg"]
+    assert "no matches" in found.left_out["0008.jpg"]
+    assert any("1 images are in no model" in warning for warning in found.warnings)
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
+
+
+def test_inlier_matches_are_enough(tmp_path):
+    path = changed(
+        RING,
+        tmp_path,
+        "UPDATE two_view_geometries SET E = NULL, F = NULL, H = NULL, qvec = NULL, tvec = NULL",
+    )
+    images = read_images(path)
+    unposed, truth = read_model(images.reconstruction), read_model(RING / "sparse" / "0")
+    found = relative_rotations(path, unposed, 15)
+    i, j = found.pairs.T
+    true = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
+    assert len(found.pairs) > 10
+    assert found.sound.all()
+    # Half a pixel of noise at f = 1000 px, over hundreds of matches.
+    assert np.median(rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ true)) < 0.2
+    parallel = relative_rotations(path, unposed, 15, threads=3)
+    np.testing.assert_array_equal(parallel.rotations, found.rotations)
+    with pytest.raises(UnsolvableError, match="has 15 inlier matches and a relative rotation"):
+        sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(relative="stored"))
+
+
+def test_guessed_focal_lengths_are_told(tmp_path):
+    path = changed(RING, tmp_path, "UPDATE cameras SET prior_focal_length = 0")
+    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST))
+    assert any("1 cameras have a guessed focal length" in warning for warning in found.warnings)
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE cameras SET params = x'00'", "camera with id 1 is damaged"),
+        ("UPDATE cameras SET model = 99", "has the model 99, which pycolmap does not know"),
+        (
+            "UPDATE images SET camera_id = 7 WHERE image_id = 2",
+            "image with id 2 has no valid name and camera",
+        ),
+        ("DELETE FROM images", "has 0 images, but two or more"),
+    ],
+)
+def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
+    with pytest.raises(InputError, match=message):
+        sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", statement))
+
+
+# --- averaging ---------------------------------------------------------------------------------------
+
+
+def problem(num_false=0, seed=5, n=14):
+    """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
+    rng = np.random.default_rng(seed)
+    truth = Rotation.random(n, random_state=rng).as_matrix()
+    pairs = np.column_stack(np.triu_indices(n, 1))
+    noise = Rotation.from_rotvec(np.radians(0.1) * rng.normal(size=(len(pairs), 3))).as_matrix()
+    rotations = noise @ truth[pairs[:, 1]] @ truth[pairs[:, 0]].transpose(0, 2, 1)
+    counts = np.full(len(pairs), 100)
+    false = rng.permutation(np.flatnonzero((pairs < n // 2).sum(axis=1) == 1))[:num_false]
+    turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]).as_matrix()
+    i, j = pairs[false].T
+    rotations[false], counts[false] = truth[j] @ turn @ truth[i].transpose(0, 2, 1), 16
+    sound = np.ones(len(pairs), dtype=np.bool_)
+    return truth, RelativeRotations(pairs=pairs, rotations=rotations, num_matches=counts, sound=sound)
+
+
+def worst_error_deg(answer, truth):
+    difference = answer.rotations.transpose(0, 2, 1) @ truth
+    return rotation_angles_deg(difference @ mean_rotation_l1(difference).T).max()
+
+
+def test_the_most_consistent_of_several_averagings_is_kept():
+    truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
+    misled = averaged(14, relative, min_matches=15)
+    assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
+    answer = averaged(14, relative)
+    assert answer.registered.all()
+    assert answer.min_matches == 20
+    assert worst_error_deg(answer, truth) < 0.5
+    weights = np.sqrt(relative.num_matches)
+    right = relative.num_matches == 100
+    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
+
+
+def test_a_camera_whose_pairs_disagree_shows_in_its_agreement():
+    truth, relative = problem()
+    bad = (relative.pairs == 3).any(axis=1)
+    rotations = relative.rotations.copy()
+    rotations[bad] = Rotation.random(int(bad.sum()), random_state=np.random.default_rng(1)).as_matrix()
+    answer = averaged(
+        14,
+        RelativeRotations(
+            pairs=relative.pairs,
+            rotations=rotations,
+            num_matches=relative.num_matches,
+            sound=relative.sound,
+        ),
+    )
+    others = np.delete(np.arange(14), 3)
+    assert answer.agreements[3] < 0.25
+    assert answer.agreements[others].min() > 0.8
+    assert truth.shape == answer.rotations.shape
+
+
+def test_pairs_that_contradict_known_focal_lengths_are_left_out_where_they_can_be():
+    truth, relative = problem()
+    sound = np.random.default_rng(3).permutation(len(relative.pairs)) >= 30
+    rotations = relative.rotations.copy()
+    rotations[~sound] = Rotation.random(30, random_state=np.random.default_rng(2)).as_matrix()
+    answer = averaged(
+        14,
+        RelativeRotations(
+            pairs=relative.pairs, rotations=rotations, num_matches=relative.num_matches, sound=sound
+        ),
+    )
+    assert answer.sound_only
+    assert answer.share > 0.99
+    assert worst_error_deg(answer, truth) < 0.5
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="min_matches must be 0 or at least 15"):
+        sfm_shapefit.MapOptions(min_matches=5)
+    with pytest.raises(ValueError, match="a database has no tracks"):
+        sfm_shapefit.MapOptions(directions="tracks")
+    with pytest.raises(ValueError, match="relative must be one of"):
+        sfm_shapefit.MapOptions(relative="guessed")

@@ -1,0 +1,350 @@
+"""Rigs and fixed cameras in `locate`: metric scale, poses that stay, and what is refused."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import InputError, LocateOptions, UnsolvableError
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.seed import build_seed
+from sfm_shapefit.colmap.workspace import write_workspace
+from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.results import summary, write_result
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+from tests.scenes import RING, copied
+
+
+def drive(num_images, seed=0, **options):
+    return make_rig_drive(
+        SceneOptions(num_images=num_images, num_points=1500, max_pairs_per_image=12, seed=seed, **options)
+    )
+
+
+@pytest.fixture(scope="module")
+def rigs():
+    """Twelve frames of two rigs, a fifth of the pairs wrong."""
+    return drive(36, corrupted_pair_fraction=0.2)
+
+
+@pytest.fixture(scope="module")
+def workspace(rigs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"), rigs)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def found(workspace):
+    return sfm_shapefit.locate(workspace / "sparse" / "0")
+
+
+def centres(reconstruction):
+    """Ids and centres of the posed images, ascending."""
+    ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
+    return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
+
+
+# --- the scene and its model ---------------------------------------------------------------------------
+
+
+def test_a_written_drive_has_its_rigs_and_its_true_poses(rigs, workspace):
+    truth = pycolmap.Reconstruction(workspace / "truth")
+    assert truth.num_rigs() == 2
+    assert truth.num_frames() == 12
+    assert truth.num_cameras() == 6
+    np.testing.assert_allclose(centres(truth)[1], rigs.scene.centers, atol=1e-12)
+    assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
+    with pycolmap.Database.open(workspace / "database.db") as database:
+        assert database.num_rigs() == 2
+        assert database.num_frames() == 12
+
+
+def test_offsets_of_frames_are_read_in_world_axes(rigs, workspace):
+    model = read_model(workspace / "truth")
+    first = rigs.sensor_of_image == 0
+    expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
+    np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
+    assert not model.frame_offsets[first].any()
+    np.testing.assert_array_equal(model.bodies.body_of, rigs.frame_of_image)
+    assert model.has_rigs
+
+
+def test_a_sensor_without_a_pose_in_its_rig_is_refused_by_name(workspace):
+    model = pycolmap.Reconstruction(workspace / "truth")
+    sensor = model.camera(2).sensor_id
+    model.rig(1).reset_sensor_from_rig(sensor)
+    with pytest.raises(InputError, match=r"camera 2 has no pose in rig 1 \(sensor_from_rig\)"):
+        read_model(model)
+
+
+def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
+    model = read_model(workspace / "truth")
+    before = [model.reconstruction.frame(f).rig_from_world.matrix() for f in range(1, 13)]
+    centers = 2.0 * (model.centers - model.frame_offsets) + [1.0, 2.0, 3.0] + model.frame_offsets
+    placed = model.frame_ids != 5
+    placed[1:3] = False  # of a frame whose first image is placed: they come with it
+    seed = build_seed(model, placed, centers)
+    ids, found = centres(seed)
+    expected = model.frame_ids != 5
+    assert ids == model.image_ids[expected].tolist()
+    np.testing.assert_allclose(found, centers[expected], atol=1e-12)
+    assert_rigs_equal(seed, model.reconstruction)
+    for frame, matrix in enumerate(before, start=1):  # the input is not touched
+        np.testing.assert_array_equal(model.reconstruction.frame(frame).rig_from_world.matrix(), matrix)
+
+
+def assert_rigs_equal(a, b, atol=0.0):
+    assert set(a.rigs) == set(b.rigs)
+    for rig_id, rig in a.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            other = b.rig(rig_id).sensor_from_rig(sensor)
+            # Bundle adjustment normalises quaternions anew; nothing else changes a bit.
+            np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
+
+
+# --- rigs in locate ------------------------------------------------------------------------------------
+
+
+def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
+    ids, centers = centres(found.reconstruction)
+    assert ids == list(range(1, 37))
+    fit = fit_similarity(centers, rigs.scene.centers, rotate=False)
+    assert abs(fit.scale - 1.0) < 1e-3
+    errors = np.linalg.norm(fit.apply(centers) - rigs.scene.centers, axis=1)
+    assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
+    assert found.solve.gap <= 1e-8
+    assert found.gauge.statement.startswith("rig: ")
+    assert_rigs_equal(found.reconstruction, found.model.reconstruction)
+
+
+def test_images_stand_where_their_frames_and_sensors_put_them(found):
+    for image in found.reconstruction.images.values():
+        frame = found.reconstruction.frame(image.frame_id)
+        rig = found.reconstruction.rig(frame.rig_id)
+        sensor = image.camera.sensor_id
+        pose = frame.rig_from_world
+        if not rig.is_ref_sensor(sensor):
+            pose = rig.sensor_from_rig(sensor) * pose
+        np.testing.assert_allclose(image.cam_from_world().matrix(), pose.matrix(), atol=1e-12)
+
+
+def test_tables_say_what_moved_together(found, tmp_path):
+    write_result(found, tmp_path / "out")
+    facts = json.loads((tmp_path / "out" / "locate.json").read_text())
+    inner = facts["bodies"].pop("num_inner_pairs")
+    assert facts["bodies"] == {"num_bodies": 12, "num_placed": 12, "num_fixed": 0}
+    assert sum("inside a frame" in row.reason for row in found.pairs) == inner
+    assert facts["num_placed"] == 36
+    again = pycolmap.Reconstruction(tmp_path / "out")
+    assert_rigs_equal(again, found.model.reconstruction)
+    assert summary(found)["num_placed"] == again.num_reg_images()
+
+
+def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
+    images = rigs.scene
+    kept = ~(images.pairs == 4).any(axis=1)
+    counts = np.diff(images.match_offsets)
+    rows = np.repeat(kept, counts)
+    lonely = type(images)(
+        **{name: getattr(images, name) for name in images.__slots__}
+        | {
+            "pairs": images.pairs[kept],
+            "match_offsets": np.append(0, np.cumsum(counts[kept])),
+            "matches": images.matches[rows],
+            "match_is_wrong": images.match_is_wrong[rows],
+            "pair_is_corrupted": images.pair_is_corrupted[kept],
+            "relative_rotations": images.relative_rotations[kept],
+            "relative_translations": images.relative_translations[kept],
+        }
+    )
+    out = workspace.parent / "lonely"
+    write_workspace(lonely, out, WorkspaceOptions(model="rotations"), rigs)
+    located = sfm_shapefit.locate(out / "sparse" / "0", options=LocateOptions(points="never"))
+    row = located.cameras[4]
+    assert row.placed
+    assert row.reason == "placed with its frame; no pair of its own takes part"
+    offsets = [np.subtract(x.cameras[4].center, x.cameras[3].center) for x in (located, found)]
+    np.testing.assert_allclose(*offsets, atol=1e-9)
+    assert located.reconstruction.num_reg_images() == 36
+
+
+def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
+    located = sfm_shapefit.locate(
+        workspace / "sparse" / "0", options=LocateOptions(bundle_adjust=True, points="never")
+    )
+    assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
+    fit = fit_similarity(centres(located.reconstruction)[1], rigs.scene.centers, rotate=False)
+    assert abs(fit.scale - 1.0) < 1e-3
+
+
+def test_what_rigs_rule_out_is_said(workspace):
+    model = workspace / "sparse" / "0"
+    with pytest.raises(InputError, match="the scale is that of the rigs; leave out"):
+        sfm_shapefit.locate(model, options=LocateOptions(scale="unit"))
+    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
+        sfm_shapefit.locate(model, options=LocateOptions(objective="linf"))
+    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
+        sfm_shapefit.locate(model, options=LocateOptions(filter="1dsfm"))
+    with pytest.raises(InputError, match="turn as one"):
+        sfm_shapefit.locate(model, options=LocateOptions(refine_rotations=True))
+    with pytest.raises(InputError, match="no rig of several cameras"):
+        sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(scale="rig"))
+
+
+def test_inspecting_says_how_many_frames_hang_together(workspace):
+    seen = sfm_shapefit.inspect(workspace / "sparse" / "0", options=LocateOptions(points="never"))
+    assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
+    assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
+
+
+def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
+    model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "sparse" / "0")
+    for rig in model.rigs.values():
+        for sensor, pose in rig.non_ref_sensors.items():
+            rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
+    with pytest.raises(UnsolvableError, match="nothing determines the scale"):
+        sfm_shapefit.locate(model, options=LocateOptions(points="never"))
+
+
+def write_and_return(rigs, folder):
+    write_workspace(rigs.scene, folder, WorkspaceOptions(database=False), rigs)
+    return folder
+
+
+# --- fixed cameras -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def moved_ring(tmp_path):
+    """The ring with true centres of five cameras, in a unit of 0.37 m, and the others at the origin."""
+    truth = read_model(RING / "truth") if (RING / "truth").exists() else read_model(RING / "sparse" / "0")
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]
+    for k, image_id in enumerate(truth.image_ids.tolist()):
+        frame = model.frame(model.image(image_id).frame_id)
+        rotation = frame.rig_from_world.rotation
+        center = centers[k] if k < 5 else np.zeros(3)
+        frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    names = tmp_path / "names.txt"
+    names.write_text("# solved last week\n" + "\n".join(truth.names[:5]) + "\n\n")
+    return model, centers, names, truth.names
+
+
+def poses(reconstruction):
+    return {
+        image.name: image.cam_from_world().matrix()
+        for image in reconstruction.images.values()
+        if image.has_pose
+    }
+
+
+@pytest.mark.parametrize("bundle_adjust", [False, True])
+def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(moved_ring, bundle_adjust):
+    model, centers, names, all_names = moved_ring
+    given = poses(model)
+    options = LocateOptions(fix=str(names), bundle_adjust=bundle_adjust)
+    found = sfm_shapefit.locate(model, RING / "database.db", options)
+    after = poses(found.reconstruction)
+    for name in all_names[:5]:
+        np.testing.assert_array_equal(after[name], given[name])
+    errors = np.linalg.norm(centres(found.reconstruction)[1] - centers, axis=1) * 0.37
+    assert errors.max() < 0.02  # metres; half a pixel at 4 m is 2 mm
+    assert summary(found)["bodies"]["num_fixed"] == 5
+    assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
+    assert found.solve.gap <= 1e-8
+
+
+def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
+    model, _, names, all_names = moved_ring
+    names.write_text(all_names[2])
+    given = poses(model)[all_names[2]]
+    options = LocateOptions(fix=str(names), scale="unit")
+    found = sfm_shapefit.locate(model, RING / "database.db", options)
+    np.testing.assert_array_equal(poses(found.reconstruction)[all_names[2]], given)
+    own = centres(found.reconstruction)[1]
+    assert np.median(np.linalg.norm(own - own.mean(axis=0), axis=1)) == pytest.approx(1.0)
+    assert f"shifted so that {all_names[2]} stays where it is" in found.gauge.statement
+
+
+def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
+    model, _, names, all_names = moved_ring
+    solved = sfm_shapefit.locate(model, RING / "database.db", LocateOptions(fix=str(names))).reconstruction
+    new = all_names[-1]
+    for image in list(solved.images.values()):  # one image has never been placed: a rotation, no points
+        if image.name == new:
+            for index in [k for k, point in enumerate(image.points2D) if point.has_point3D()]:
+                solved.delete_observation(image.image_id, index)
+            frame = solved.frame(image.frame_id)
+            frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
+    given = poses(solved)
+    found = sfm_shapefit.locate(solved, RING / "database.db", LocateOptions(fix="solved"))
+    after = poses(found.reconstruction)
+    assert summary(found)["bodies"]["num_fixed"] == len(all_names) - 1
+    for name in all_names[:-1]:
+        np.testing.assert_array_equal(after[name], given[name])
+    assert np.abs(after[new] - given[new]).max() > 1.0
+
+
+def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(rigs, workspace, tmp_path):
+    model = pycolmap.Reconstruction(workspace / "truth")
+    names = tmp_path / "names.txt"
+    names.write_text("0008.jpg\n")
+    found = sfm_shapefit.locate(
+        model, workspace / "database.db", LocateOptions(fix=str(names), points="never")
+    )
+    for image_id in (7, 8, 9):
+        np.testing.assert_array_equal(
+            found.reconstruction.image(image_id).cam_from_world().matrix(),
+            model.image(image_id).cam_from_world().matrix(),
+        )
+    errors = np.linalg.norm(centres(found.reconstruction)[1] - rigs.scene.centers, axis=1)
+    assert np.median(errors) < 0.02  # grows with the distance from the frame that is held
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
+        ("# nobody\n", "names no image"),
+        (None, "cannot be read; give a text file"),
+    ],
+)
+def test_a_file_of_names_that_fits_nothing_is_refused(tmp_path, text, message):
+    names = tmp_path / "names.txt"
+    if text is not None:
+        names.write_text(text)
+    with pytest.raises(InputError, match=message):
+        sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(fix=str(names)))
+
+
+def test_fixed_cameras_without_positions_are_refused(tmp_path):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    names = tmp_path / "names.txt"
+    names.write_text("\n".join(sorted(image.name for image in model.images.values())[:3]))
+    for frame in model.frames.values():
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
+    with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
+        sfm_shapefit.locate(model, RING / "database.db", LocateOptions(fix=str(names)))
+
+
+def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
+    from typer.testing import CliRunner
+
+    from sfm_shapefit.cli import app
+
+    scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
+    names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
+    arguments = ["locate", str(scene / "sparse" / "0"), str(tmp_path / "out"), "--fix", str(names)]
+    done = CliRunner().invoke(app, arguments)
+    assert done.exit_code == 0, done.output
+    assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
+        done.output.replace("│", " ").split()
+    )
+    given, after = (poses(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
+    for k in (1, 2, 3):
+        np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
+    refused = CliRunner().invoke(app, [*arguments[:-1], str(tmp_path / "none.txt"), "--overwrite"])
+    assert refused.exit_code == 3

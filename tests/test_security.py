@@ -1,0 +1,184 @@
+"""What a stranger's files and a curious neighbour must not be able to do."""
+
+import ast
+import os
+import sqlite3
+import stat
+import subprocess
+import sys
+import tomllib
+
+import pytest
+
+from sfm_shapefit.colmap import database as database_module
+from sfm_shapefit.colmap.check import check_model_files
+from sfm_shapefit.colmap.database import open_database
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import read_graph
+from tests.scenes import RING, ROOT, copied
+
+SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
+FORBIDDEN_IMPORTS = {
+    *("pickle", "marshal", "shelve", "dill", "joblib", "subprocess", "pty", "code", "codeop"),
+    *("socket", "ssl", "http", "urllib.request", "ftplib", "smtplib", "requests", "telnetlib", "xmlrpc"),
+}
+FORBIDDEN_CALLS = {
+    *("eval", "exec", "compile", "__import__", "input", "os.system", "os.popen", "os.execv", "os.fork"),
+    *("np.load", "numpy.load", "pickle.load", "pickle.loads", "yaml.load", "tempfile.mktemp"),
+}
+
+
+def imported(tree):
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module
+
+
+def offences(text):
+    tree = ast.parse(text)
+    for name in imported(tree):
+        if name in FORBIDDEN_IMPORTS or name.split(".")[0] in FORBIDDEN_IMPORTS:
+            yield f"imports {name}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            if ast.unparse(node.func) in FORBIDDEN_CALLS:
+                yield f"calls {ast.unparse(node.func)}"
+            if any(k.arg == "shell" and ast.unparse(k.value) != "False" for k in node.keywords):
+                yield "starts a shell"
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_nothing_is_unpickled_evaluated_executed_or_sent_out(path):
+    assert list(offences(path.read_text(encoding="utf-8"))) == []
+
+
+def test_the_scan_sees_what_it_looks_for():
+    text = "import pickle\nfrom urllib.request import urlopen\neval('1')\nrun('ls', shell=True)"
+    assert sorted(offences(text)) == [
+        "calls eval",
+        "imports pickle",
+        "imports urllib.request",
+        "starts a shell",
+    ]
+
+
+def test_locate_opens_no_socket_and_starts_no_process(tmp_path):
+    script = f"""
+import sys
+def refuse(event, arguments):
+    if event.startswith(("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn")):
+        print(event, arguments, file=sys.stderr)
+        sys.stderr.flush()
+        raise SystemExit(99)
+import sfm_shapefit.pipeline
+sys.addaudithook(refuse)
+from sfm_shapefit.cli import main
+sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]
+main()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+# --- databases -----------------------------------------------------------------------------------------
+
+
+def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
+    with open_database(RING / "database.db", read_model(RING / "sparse" / "0")) as database:
+        connection = database._connection
+        assert connection.execute("PRAGMA trusted_schema").fetchone() == (0,)
+        assert connection.execute("PRAGMA query_only").fetchone() == (1,)
+        for limit, value in database_module._LIMITS.items():
+            assert connection.getlimit(limit) == value
+        with pytest.raises(sqlite3.OperationalError, match="readonly"):
+            connection.execute("DELETE FROM images")
+        with pytest.raises(sqlite3.Error):
+            connection.execute("ATTACH ':memory:' AS other")
+
+
+COMPUTED = {
+    "a view": "CREATE VIEW {0} AS SELECT * FROM real",
+    "an endless view": "CREATE VIEW {0} AS WITH RECURSIVE n(x) AS "
+    "(VALUES (1) UNION ALL SELECT x + 1 FROM n) SELECT x AS image_id, x AS name FROM n",
+    "a virtual table": "CREATE VIRTUAL TABLE {0} USING fts5(image_id, name)",
+    "a computed column": "CREATE TABLE {0} (image_id, name GENERATED ALWAYS AS (zeroblob(1000000000)))",
+}
+
+
+@pytest.mark.parametrize("kind", COMPUTED)
+def test_a_table_whose_rows_are_computed_is_refused(tmp_path, kind):
+    scene = copied(RING, tmp_path)
+    with sqlite3.connect(scene / "database.db") as connection:
+        connection.execute("ALTER TABLE images RENAME TO real")
+        connection.execute(COMPUTED[kind].format("images"))
+    connection.close()
+    with (
+        pytest.raises(InputError, match="is not a COLMAP database: its images"),
+        open_database(scene / "database.db", read_model(scene / "sparse" / "0")),
+    ):
+        pytest.fail("it must not be opened")
+
+
+def test_private_copies_of_a_database_are_private(tmp_path, monkeypatch):
+    scene = copied(RING, tmp_path)
+    writer = sqlite3.connect(scene / "database.db")
+    writer.execute("PRAGMA journal_mode = WAL")
+    writer.execute("UPDATE images SET name = name")
+    writer.commit()
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(database_module.tempfile, "tempdir", str(tmp_path / "tmp"))
+    with open_database(scene / "database.db", read_model(scene / "sparse" / "0")):
+        (folder,) = (tmp_path / "tmp").iterdir()
+        assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+    assert list((tmp_path / "tmp").iterdir()) == []
+    writer.close()
+
+
+# --- what is no file -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["pipe", "endless device"])
+def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, kind):
+    scene = copied(RING, tmp_path)
+    model, graph = scene / "sparse" / "0", tmp_path / "graph.txt"
+    sound = read_model(model)
+    for path in (graph, model / "points3D.bin", scene / "database.db"):
+        path.unlink(missing_ok=True)
+        os.mkfifo(path) if kind == "pipe" else path.symlink_to("/dev/zero")
+    with pytest.raises(InputError, match=r"graph\.txt cannot be read: it is a pipe or a device"):
+        read_graph(graph)
+    with pytest.raises(InputError, match=r"points3D\.bin cannot be read: it is a pipe or a device"):
+        check_model_files(model)
+    with (
+        pytest.raises(InputError, match="it is a pipe or a device"),
+        open_database(scene / "database.db", sound),
+    ):
+        pytest.fail("it must not be opened")
+
+
+# --- packaging -----------------------------------------------------------------------------------------
+
+
+def test_every_dependency_has_a_lower_and_an_upper_bound():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for line in project["dependencies"]:
+        assert ">=" in line, line
+        assert "<" in line, line
+
+
+def test_the_lock_file_of_ci_pins_every_package_and_names_no_place():
+    lines = (ROOT / "requirements" / "ci.lock").read_text().splitlines()
+    pins = [line for line in lines if line and not line.startswith("#")]
+    assert all(line.count("==") == 1 and "/" not in line and ":" not in line for line in pins)
+    pinned = {line.split("==")[0].strip().lower().replace("_", "-") for line in pins}
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
+    names = {
+        line.split(">")[0].split("=")[0].split("[")[0].strip().lower().replace("_", "-") for line in wanted
+    }
+    assert names <= pinned

@@ -1,0 +1,144 @@
+"""The viewer and the two commands that look at what an earlier run wrote."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.request
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from sfm_shapefit.cli import app
+from sfm_shapefit.visual.scene import PairClass
+from sfm_shapefit.visual.sources import read_output
+from sfm_shapefit.visual.viewer import Thresholds, drawn_pairs, input_centers, serve
+from tests.made_scenes import made_scene
+from tests.scenes import BUNDLED, FACADE, ROOT
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+
+@pytest.fixture(scope="module")
+def located(tmp_path_factory):
+    out = tmp_path_factory.mktemp("located") / "out"
+    result = CliRunner().invoke(app, ["locate", str(FACADE / "sparse" / "0"), str(out), "--scene", "-q"])
+    assert result.exit_code == 0, result.output
+    return out
+
+
+def test_locate_writes_the_report_and_the_scenes_that_are_asked_for(located, tmp_path):
+    pictures = {"report.html", "scene.glb", "scene.ply"}
+    assert pictures <= {path.name for path in located.iterdir()}
+    model = str(FACADE / "sparse" / "0")
+    result = CliRunner().invoke(app, ["locate", model, str(tmp_path / "out"), "--no-report"])
+    assert result.exit_code == 0
+    assert "report.html" not in result.stdout
+    assert not pictures & {path.name for path in (tmp_path / "out").iterdir()}
+
+
+def test_a_bare_graph_has_its_report_too(tmp_path):
+    result = CliRunner().invoke(
+        app, ["solve", str(BUNDLED / "graph40.txt"), str(tmp_path / "out"), "--scene"]
+    )
+    assert result.exit_code == 0
+    assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
+    assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    scene, _ = read_output(tmp_path / "out")
+    assert np.isfinite(scene.cameras.centers).all()
+
+
+def test_a_folder_is_read_back_as_it_was_written(located):
+    scene, facts = read_output(located)
+    assert facts == json.loads((located / "locate.json").read_text())
+    assert int(scene.cameras.placed.sum()) == facts["num_placed"]
+    assert int(np.sum(scene.pairs.classes == PairClass.CONTRADICTS)) == facts["pairs"]["outlier"]
+    assert np.isfinite(scene.cameras.poses.rotations[scene.cameras.placed]).all()
+    assert len(scene.points.positions) > 0
+
+
+def test_the_report_can_be_made_again(located):
+    before = (located / "report.html").read_text(encoding="utf-8")
+    (located / "report.html").unlink()
+    result = CliRunner().invoke(app, ["report", str(located)])
+    assert result.exit_code == 0, result.output
+    after = (located / "report.html").read_text(encoding="utf-8")
+    summaries = [re.search(r'"summary":(\[.*?\])', text).group(1) for text in (before, after)]
+    assert summaries[0] == summaries[1]
+
+
+@pytest.mark.parametrize("command", ["report", "view"])
+def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, command):
+    result = CliRunner().invoke(app, [command, str(tmp_path)])
+    assert result.exit_code == 3
+    assert "give a folder that locate or solve wrote" in result.stderr
+    (tmp_path / "locate.json").write_text("{}")
+    result = CliRunner().invoke(app, [command, str(tmp_path)])
+    assert result.exit_code == 3
+    assert "damaged or of another version" in result.stderr
+    assert "Traceback" not in result.output
+
+
+def test_thresholds_decide_which_pairs_are_drawn():
+    scene, _ = made_scene()
+    everything = Thresholds(residual_deg=180.0, min_support=0, min_trust=0.0, camera=None)
+    drawn = drawn_pairs(scene, everything)
+    placed = scene.cameras.placed[scene.pairs.cameras].all(axis=1) & np.isfinite(scene.pairs.residuals_deg)
+    assert len(drawn.rows) == int(placed.sum())
+    assert not drawn.contradicts.any()
+
+    strict = Thresholds(residual_deg=4.0, min_support=50, min_trust=0.7, camera=3)
+    drawn = drawn_pairs(scene, strict)
+    assert len(drawn.rows) > 0
+    assert (scene.pairs.support[drawn.rows] >= 50).all()
+    assert (scene.pairs.cameras[drawn.rows] == 3).any(axis=1).all()
+    assert (scene.cameras.trust[scene.pairs.cameras[drawn.rows]] >= 0.7).all()
+    np.testing.assert_array_equal(drawn.contradicts, scene.pairs.residuals_deg[drawn.rows] > 4.0)
+
+
+def test_the_inputs_centres_are_brought_into_the_outputs_units():
+    from dataclasses import replace
+
+    scene, _ = made_scene()
+    poses = replace(scene.cameras.poses, centers=100.0 * scene.cameras.centers + 7.0)
+    other = replace(scene, cameras=replace(scene.cameras, poses=poses), input_is_aligned=False)
+    placed = scene.cameras.placed
+    np.testing.assert_allclose(input_centers(other)[placed], scene.cameras.centers[placed], atol=1e-6)
+    same = replace(poses, centers=np.zeros_like(poses.centers))
+    assert input_centers(replace(other, cameras=replace(other.cameras, poses=same))) is None
+
+
+def test_moving_a_control_redraws():
+    scene, facts = made_scene()
+    server = serve(scene, facts, "127.0.0.1", 8765)
+    try:
+        controls = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
+        before = controls["pairs drawn"].value
+        controls["least matches"].value = 100
+        assert controls["pairs drawn"].value != before
+        assert "input's poses (grey)" in controls
+    finally:
+        server.stop()
+
+
+def test_view_serves_a_page_on_this_machine_only_and_ends_when_told(located):
+    with subprocess.Popen(
+        [sys.executable, "-m", "sfm_shapefit.cli", "view", str(located), "--port", "8790"],
+        stdout=subprocess.PIPE,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        text=True,
+    ) as process:
+        try:
+            address = process.stdout.readline().split()[0]
+            assert address.startswith("http://127.0.0.1:")
+            with urllib.request.urlopen(address, timeout=30) as answer:
+                assert answer.status == 200
+                assert b"<html" in answer.read().lower()
+        finally:
+            process.send_signal(signal.SIGINT)
+        process.wait(timeout=60)
+    assert process.returncode == 0
