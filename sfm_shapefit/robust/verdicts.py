@@ -17,8 +17,10 @@ camera say together is `trust`.
 """
 
 import enum
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -139,9 +141,10 @@ def assess(
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
-    errors = None if errors is None else errors / scale
+    errors = None if evidence is None else evidence.errors
+    sampled = None if errors is None else _Sampled(errors, excess, scale)
     propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
-    covariances, leverages = propagated(graph, locations, inliers, information, k, errors)
+    covariances, leverages = propagated(graph, locations, inliers, information, k, sampled)
     covariances = scale**2 * covariances
     sigmas = _standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k)
@@ -257,6 +260,17 @@ class _Sampled(NamedTuple):
             yield whole[chosen - start] @ bases / self.scale
 
 
+def _standard_deviations(covariances: FloatArray) -> FloatArray:
+    """Return the roots of the diagonals, (n, d)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
+
+
+def _unheld(locations: FloatArray) -> FloatArray:
+    """Return the covariances (n, d, d) of locations that nothing holds."""
+    n, d = locations.shape
+    return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
+
+
 def _propagated(
     graph: ViewGraph,
     locations: FloatArray,
@@ -317,7 +331,7 @@ def _propagated_over(
         return covariances, leverages
     nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
     share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
-    samples = None if errors is None else errors[rows]
+    samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
     part = bodies.restricted_to(nodes)
     try:
         found = propagate_bodies(
