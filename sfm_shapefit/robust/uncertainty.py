@@ -54,20 +54,15 @@ class Uncertainty:
 
     covariances: FloatArray
     """(n, d, d) covariance of each location, in squared units of the locations; centroid and scale of the
-    cameras in `gauge` held fixed."""
+    cameras in `gauge` held fixed; from samples, where the errors of the directions are given as such."""
     leverages: FloatArray
     """(m,) in [0, 1]."""
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
 
-    samples: FloatArray | None = None
-    """(n, d, s) errors of the locations for samples of correlated direction errors."""
-
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations along the axes, (n, d)."""
-        if self.samples is not None:
-            return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
         variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
         return np.sqrt(np.maximum(variances, 0.0))
 
@@ -112,13 +107,16 @@ def propagate(
     leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _held(factor, inverse, locations, is_camera)
-    samples = None
     if errors is not None:
         pulls = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None]
-        samples = _moved(factor, locations, _right_side(edges, pulls, errors, n), gauge)
-    return Uncertainty(
-        covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge, samples=samples
-    )
+        covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
+    return Uncertainty(covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge)
+
+
+def scatter(samples: FloatArray) -> FloatArray:
+    """Return the covariances (n, d, d) of samples (n, d, s) of mean zero."""
+    covariances: FloatArray = samples @ samples.transpose(0, 2, 1) / samples.shape[2]
+    return covariances
 
 
 def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray], n: int) -> FloatArray:
