@@ -35,6 +35,7 @@ LAYERS = [
     "synthetic",
     "colmap",
     "tracks",
+    "forecast",
     "diagnosis",
     "options",
     "report",

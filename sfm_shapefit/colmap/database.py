@@ -153,6 +153,23 @@ class MatchDatabase:
         """Number of pairs of posed images with verified inlier matches."""
         return int(self._pairs.has_matches.sum())
 
+    def limit_rays(self, num_bytes: int) -> None:
+        """Keep no more bytes than these of the rays of keypoints that may be needed again."""
+        self._cache_bytes = num_bytes
+
+    @property
+    def num_matches(self) -> int:
+        """Number of these pairs' inlier matches."""
+        return int(self._pairs.num_inliers[self._pairs.has_matches].sum())
+
+    def num_keypoints(self) -> int:
+        """Return the number of keypoints of all images, posed or not; what damaged rows say is not counted."""
+        with _sqlite_errors(self.path):
+            counts = self._connection.execute(
+                "SELECT rows FROM keypoints WHERE typeof(rows) = 'integer' AND rows BETWEEN 0 AND 2147483647"
+            )
+            return sum(count for (count,) in counts)
+
     def keypoints(self, image: int) -> FloatArray:
         """Return the pixels of the keypoints of one image.
 

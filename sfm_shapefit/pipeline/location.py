@@ -12,6 +12,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.economy import within_memory
 from sfm_shapefit.pipeline.gauging import chosen_gauge, read_priors
 from sfm_shapefit.pipeline.measurement import (
     evidence_of,
@@ -68,11 +69,12 @@ def locate(
     if options.refine_rotations:
         with clock("rotations"):
             model, turned_deg = refined_rotations(model, inputs, options, clock)
-    with open_source(model, inputs) as source:
+    with open_source(model, inputs, options.max_memory) as source:
         with clock("directions"):
             directions = measure_directions(source, options, clock)
         with clock("solve"):
             joint = joint_graph(source, directions, options)
+            source, joint, options = within_memory(source, directions, joint, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
             placement = placed(joint, rigid, evidence, options)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
@@ -112,6 +114,8 @@ def _warnings(
     yield from trust_warnings(placement, kept)
     if gauge.warning:
         yield gauge.warning
+    if source.economy.statement:
+        yield f"to stay below max_memory, {source.economy.statement}"
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if source.database is not None and source.database.unmatched_names:

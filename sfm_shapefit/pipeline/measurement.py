@@ -92,7 +92,7 @@ def joint_graph(source: MatchSource, directions: PairDirections, options: Locate
     """Return the view graph, with 3D points as further nodes if the options want them."""
     model = source.model
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
-    if not options.uses_points(model.num_images):
+    if not (options.uses_points(model.num_images) and source.economy.points):
         return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
     pixel_angles = 1.0 / model.focal_lengths_px
     tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
@@ -100,13 +100,29 @@ def joint_graph(source: MatchSource, directions: PairDirections, options: Locate
     return join_points(graph, covariance, chosen, pixel_angles)
 
 
+def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
+    """Return whether the errors of the directions are sampled together."""
+    if source.kind == "relative-poses" or not source.economy.samples:
+        return False
+    return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
+
+
+def without_points(joint: JointGraph) -> JointGraph:
+    """Return the pairs of cameras alone; they stand before the rays to points."""
+    graph, k = joint.graph, joint.num_cameras
+    rows = np.flatnonzero((graph.edges < k).all(axis=1))
+    names = None if graph.names is None else graph.names[:k]
+    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
+    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k)
+
+
 def shared_errors(
     source: MatchSource, directions: PairDirections, options: LocateOptions
 ) -> FloatArray | None:
     """Return samples of the usable directions' errors, which share keypoints; None if not known."""
-    usable = directions.usable()
-    if source.kind == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
+    if not samples_errors(source, directions):
         return None
+    usable = directions.usable()
     row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
     errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
     for batch in source.batches():

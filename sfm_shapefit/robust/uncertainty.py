@@ -73,6 +73,7 @@ def propagate(
     information: FloatArray,
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
+    max_bytes: int = _MAX_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
@@ -83,9 +84,10 @@ def propagate(
         num_cameras: the first so many nodes may decide the gauge; all if None.
         errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
             only one is held at a time; independent errors of that information if None.
+        max_bytes: of the factor.
 
     Returns:
-        None if the factor would take more than 2 GB: about a hundred thousand cameras in space.
+        None if the factor would take more: than 2 GB from about a hundred thousand cameras in space on.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
@@ -97,7 +99,7 @@ def propagate(
     across = _across(information, units)
     blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
     plan = analyse(n, edges, coordinates=locations)
-    if plan.num_bytes(d) > _MAX_BYTES:
+    if plan.num_bytes(d) > max_bytes:
         return None
     factor = _grounded_factor(plan, blocks, units, lengths)
     inverse = selected_inverse(factor, edges)

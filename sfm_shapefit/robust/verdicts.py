@@ -110,6 +110,7 @@ def assess(
     num_cameras: int | None = None,
     bodies: Bodies | None = None,
     held: int | None = None,
+    factor_memory: int = 2000,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -123,6 +124,7 @@ def assess(
         num_cameras: k, the first so many nodes are cameras and the others points; all if None.
         bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
         held: the body that stays where it is; the mean of the cameras does if None.
+        factor_memory: MB that the factor for standard deviations may take; of bodies it is small.
     """
     freedom = graph.dimension - 1
     k = graph.num_cameras if num_cameras is None else num_cameras
@@ -143,7 +145,8 @@ def assess(
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if evidence is None else evidence.errors
     sampled = None if errors is None else _Sampled(errors, excess, scale)
-    propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
+    separately = partial(_propagated, factor_memory * 1_000_000)
+    propagated = separately if bodies is None else partial(_propagated_over, bodies, held)
     covariances, leverages = propagated(graph, locations, inliers, information, k, sampled)
     covariances = scale**2 * covariances
     sigmas = _standard_deviations(covariances)
@@ -272,6 +275,7 @@ def _unheld(locations: FloatArray) -> FloatArray:
 
 
 def _propagated(
+    max_bytes: int,
     graph: ViewGraph,
     locations: FloatArray,
     inliers: BoolArray,
@@ -294,7 +298,7 @@ def _propagated(
     unknown = np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
     try:
         samples = None if sampled is None else sampled.parts(graph.directions, rows)
-        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
+        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes)
     except UnsolvableError:  # singular in spite of the ridge
         return unknown
     if found is None:
