@@ -211,7 +211,9 @@ def _times(work: Workload, economy: Economy) -> dict[str, float]:
     times = {
         "reading": 2.5 + 4.5e-7 * work.num_keypoints,
         "measuring directions": 0.2 + 1.4e-6 * work.num_matches,
-        "placing": 0.5 + 8e-5 * edges + _STEPS * work.factor_flops * 27 / 8e9 * (2.0 if economy.factor else 1.0),
+        "placing": 0.5
+        + 8e-5 * edges
+        + _STEPS * work.factor_flops * 27 / 8e9 * (2.0 if economy.factor else 1.0),
         "triangulating": 3.2e-6 * work.num_matches,
         "writing": 1.0 + 5e-5 * work.num_pairs,
     }

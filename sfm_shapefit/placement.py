@@ -231,9 +231,7 @@ def _place_piece(
     )
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
-    assessment = assess(
-        piece, finished.locations, known, heard, placed, factor_memory=options.factor_memory
-    )
+    assessment = assess(piece, finished.locations, known, heard, placed, factor_memory=options.factor_memory)
     rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,

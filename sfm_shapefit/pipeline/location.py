@@ -4,6 +4,7 @@ Each stage is one function from values to a new value; the input is never change
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -39,6 +40,7 @@ def locate(
     options: LocateOptions | None = None,
     progress: Progress | None = None,
     priors: Path | str | None = None,
+    executor: Executor | None = None,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -51,6 +53,8 @@ def locate(
         progress: called as stages advance.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
+        executor: shares out the pairs of a database among its workers, which must see its file; the
+            answer is the same to the bit. None: they are measured here.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
@@ -71,7 +75,7 @@ def locate(
             model, turned_deg = refined_rotations(model, inputs, options, clock)
     with open_source(model, inputs, options.max_memory) as source:
         with clock("directions"):
-            directions = measure_directions(source, options, clock)
+            directions = measure_directions(source, options, clock, executor)
         with clock("solve"):
             joint = joint_graph(source, directions, options)
             source, joint, options = within_memory(source, directions, joint, options)

@@ -1,5 +1,6 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,12 @@ from sfm_shapefit.directions import (
     DirectionStatus,
     PairDirections,
     concatenate,
-    estimate_directions,
     from_relative_poses,
 )
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.execution import directions_of, shared_out
 from sfm_shapefit.pipeline.sources import MatchSource
 from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
@@ -33,8 +34,10 @@ _ADVICE = {
 """What to do where no pair has a direction, by the most frequent reason."""
 
 
-def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock) -> PairDirections:
-    """Return the direction of every pair that the source has."""
+def measure_directions(
+    source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
+) -> PairDirections:
+    """Return the direction of every pair that the source has; an executor shares them out, if it can."""
     model = source.model
     if source.database is not None and source.kind == "relative-poses":
         poses = source.database.relative_poses()
@@ -47,21 +50,15 @@ def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock
             poses.num_inliers,
             options.for_directions(),
         )
-    parts: list[PairDirections] = []
-    for batch in source.batches():
-        focal_lengths = model.focal_lengths_px[batch.pairs].min(axis=1)
-        parts.append(
-            estimate_directions(
-                batch.pairs,
-                batch.offsets,
-                batch.rays_i,
-                batch.rays_j,
-                1.0 / focal_lengths,
-                options.for_directions(),
-                threads=options.num_threads(),
+    if executor is not None and source.database is not None:
+        parts = shared_out(source.database, model, options.for_directions(), executor, clock.advance)
+    else:
+        parts = []
+        for batch in source.batches():
+            parts.append(
+                directions_of(batch, model.focal_lengths_px, options.for_directions(), options.num_threads())
             )
-        )
-        clock.advance(sum(len(part.pairs) for part in parts), source.total)
+            clock.advance(sum(len(part.pairs) for part in parts), source.total)
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"

@@ -165,9 +165,7 @@ def finish(
     )
 
 
-def _plan(
-    graph: ViewGraph, bodies: Bodies | None, max_bytes: int
-) -> SymbolicFactor | ReducedFactor | None:
+def _plan(graph: ViewGraph, bodies: Bodies | None, max_bytes: int) -> SymbolicFactor | ReducedFactor | None:
     """Return what the refinement factors with, or None if its factor would be too large."""
     if bodies is None:
         return plan_refinement(graph, max_bytes)

@@ -298,7 +298,9 @@ def _propagated(
     unknown = np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
     try:
         samples = None if sampled is None else sampled.parts(graph.directions, rows)
-        found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes)
+        found = propagate(
+            locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
+        )
     except UnsolvableError:  # singular in spite of the ridge
         return unknown
     if found is None:
