@@ -1,17 +1,19 @@
 """How much memory and time `locate` will take, told from the counts of its input and its graph.
 
-Every stage is linear in what it works on: keypoints, matches, pairs, edges of the graph, entries of the factor
-and multiplications of the factorisation, which the symbolic analysis knows beforehand. The rates below were
-fitted to runs on six sets of 25 to 10,000 images (scripts/results.md, Reliability). Memory is counted in bytes
-per item, time in multiples of a small kernel that is timed on the machine at hand: some sorting, which is bound
-by the scalar processor and the caches, and some multiplication of matrices, as the stages are.
+Every stage is linear in what it works on: keypoints, matches, pairs, edges of the graph, entries of the
+factor and multiplications of the factorisation, which the symbolic analysis knows beforehand. The rates
+below were fitted to runs on six sets of 25 to 10,000 images (scripts/results.md, Reliability). Memory is
+counted in bytes per item, time in multiples of a small kernel that is timed on the machine at hand: some
+sorting, which is bound by the scalar processor and the caches, and some multiplication of matrices, as the
+stages are.
 
-The peak is that of the worst stage, for memory is handed back between stages. What can be saved is listed in
-`ECONOMIES`, the cheapest first; `choose_economy` takes the first that fits.
+The peak is that of the worst stage, for memory is handed back between stages. What can be saved is listed
+in `ECONOMIES`, the cheapest first; `choose_economy` takes the first that fits.
 """
 
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -77,31 +79,30 @@ class Economy:
     """Whether there is a factor for the refinement and the standard deviations."""
 
 
-_SMALL = {"batch": 200_000, "rays_bytes": 50_000_000}
-ECONOMIES = (
-    Economy(statement=""),
-    Economy(statement="matches are read in small batches", **_SMALL),
-    Economy(
-        statement="matches are read in small batches, and directions count as independent in standard deviations",
-        samples=False,
-        **_SMALL,
-    ),
-    Economy(
-        statement="matches are read in small batches, directions count as independent in standard deviations, and "
-        "no 3D points join the view graph",
-        samples=False,
-        points=False,
-        **_SMALL,
-    ),
-    Economy(
-        statement="matches are read in small batches, no 3D points join the view graph, and neither are locations "
-        "refined nor have they standard deviations",
-        samples=False,
-        points=False,
-        factor=False,
-        **_SMALL,
-    ),
-)
+_SMALL_BATCH, _FEW_RAYS_BYTES = 200_000, 50_000_000
+_BATCHES = "matches are read in small batches"
+_INDEPENDENT = "directions count as independent in standard deviations"
+_NO_POINTS = "no 3D points join the view graph"
+_UNREFINED = "locations are neither refined nor have they standard deviations"
+
+
+def _economies() -> Iterator[Economy]:
+    """Yield what can be given up, the cheapest first."""
+    economy = Economy(statement="")
+    yield economy
+    given_up: list[str] = []
+    for what, changes in (
+        (_BATCHES, {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
+        (_INDEPENDENT, {"samples": False}),
+        (_NO_POINTS, {"points": False}),
+        (_UNREFINED, {"factor": False}),
+    ):
+        given_up.append(what)
+        economy = replace(economy, statement=", ".join(given_up), **changes)  # type: ignore[arg-type]
+        yield economy
+
+
+ECONOMIES = tuple(_economies())
 """The cheapest first."""
 
 
@@ -205,7 +206,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
 
 def _times(work: Workload, economy: Economy) -> dict[str, float]:
     """Return the processor seconds of each stage on the machine of reference."""
-    edges, nodes = _graph_size(work, economy)
+    edges, _ = _graph_size(work, economy)
     samples = work.num_sampled if economy.samples else 0
     has_points = work.has_points and economy.points
     times = {

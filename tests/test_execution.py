@@ -1,4 +1,4 @@
-"""Directions measured by other processes equal those of one; a worker that dies is no harm, or is reported."""
+"""Directions measured by other processes equal those of one; a worker that dies is replaced or reported."""
 
 import dataclasses
 import os

@@ -164,7 +164,7 @@ class MatchDatabase:
         return int(self._pairs.num_inliers[self._pairs.has_matches].sum())
 
     def num_keypoints(self) -> int:
-        """Return the number of keypoints of all images, posed or not; what damaged rows say is not counted."""
+        """Return the number of keypoints of all images, posed or not; damaged rows do not count."""
         with _sqlite_errors(self.path):
             counts = self._connection.execute(
                 "SELECT rows FROM keypoints WHERE typeof(rows) = 'integer' AND rows BETWEEN 0 AND 2147483647"

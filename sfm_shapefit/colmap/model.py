@@ -127,7 +127,7 @@ def posed_cameras(model: PosedModel) -> PosedCameras:
 
 
 def from_posed_cameras(table: PosedCameras) -> PosedModel:
-    """Return a model of these images with all centres at the origin, without points; the rotations to the bit."""
+    """Return a model of these images, with the same rotations to the bit, centres at the origin, no points."""
     reconstruction = pycolmap.Reconstruction()
     for k, camera in enumerate(table.cameras):
         made = pycolmap.Camera(

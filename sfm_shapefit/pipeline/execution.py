@@ -1,10 +1,10 @@
 """Directions measured by other processes or machines, through any `concurrent.futures` executor.
 
-The pairs of a database are cut into parts of a few hundred thousand matches. A task names the database file and
-carries the posed cameras, without which rays have no world axes: names, rotations, intrinsics. Its worker opens
-the file read-only for itself, reads its part, and sends the directions back. Every pair is estimated by itself
-with draws of its own, and the parts are put together in their order: the answer is that of one process, to the
-bit, whichever worker did what, and however often.
+The pairs of a database are cut into parts of a few hundred thousand matches. A task names the database file
+and carries the posed cameras, without which rays have no world axes: names, rotations, intrinsics. Its
+worker opens the file read-only for itself, reads its part, and sends the directions back. Every pair is
+estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
+of one process, to the bit, whichever worker did what, and however often.
 
 A worker that dies is the executor's business: a pool of processes breaks, which is reported; dask gives the
 task to another one.
@@ -19,7 +19,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras

@@ -73,12 +73,12 @@ def locate(
     if options.refine_rotations:
         with clock("rotations"):
             model, turned_deg = refined_rotations(model, inputs, options, clock)
-    with open_source(model, inputs, options.max_memory) as source:
+    with open_source(model, inputs, options.max_memory) as opened:
         with clock("directions"):
-            directions = measure_directions(source, options, clock, executor)
+            directions = measure_directions(opened, options, clock, executor)
         with clock("solve"):
-            joint = joint_graph(source, directions, options)
-            source, joint, options = within_memory(source, directions, joint, options)
+            joint = joint_graph(opened, directions, options)
+            source, joint, options = within_memory(opened, directions, joint, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
             placement = placed(joint, rigid, evidence, options)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
