@@ -28,6 +28,7 @@ from scipy.sparse import coo_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.baselines.triangles import triangle_scores
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.forecast import Forecast
 from sfm_shapefit.placement import count_large, ordered_pieces, refuse_without_triangle
 from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
 from sfm_shapefit.robust.conditioning import FEW_PAIRS
@@ -140,6 +141,8 @@ class Inspection:
     diagnosis: Diagnosis
     theory: Theory | None
     """None if not asked for."""
+    expected: Forecast | None = None
+    """What `locate` will take on this machine; None for a bare graph."""
     rigs: str = "none: every image is a frame of its own"
     """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
 

@@ -85,6 +85,12 @@ class LocateOptions:
     min_trust: float = 0.6
     """Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. See the
     column trust of cameras.csv."""
+    factor_memory: int = 2000
+    """What one sparse factor may take, in MB. Larger ones are replaced by iterations in the solve, and left
+    out where only they serve: in the refinement and for standard deviations."""
+    max_memory: int = 0
+    """Peak memory in MB to stay below, 0 for no limit: smaller batches, then fewer helpers, see `inspect`. If
+    nothing is enough, the run is refused with the number needed."""
     threads: int = 0
     """Threads to use, at most 256; 0 means one per core. The answer does not depend on it."""
 
@@ -111,6 +117,8 @@ class LocateOptions:
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if not 0 <= self.threads <= MAX_THREADS:
             raise ValueError(f"threads must lie in [0, {MAX_THREADS}], got {self.threads}")
+        if self.max_memory < 0:
+            raise ValueError(f"max_memory must be 0 or more, got {self.max_memory}")
         self.for_placement()
         self.for_directions()
         self.for_structure()
@@ -165,6 +173,7 @@ class LocateOptions:
         return PlacementOptions(
             method=self.solver,
             tol=self.tol,
+            factor_memory=self.factor_memory,
             threads=self.num_threads(),
             objective=self.objective,
             filter=self.filter,

@@ -239,7 +239,8 @@ def _place_piece(
         solved = solve_baseline(piece, options.objective)
     finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
-    assessment = assess(piece, finished.locations, known, heard, placed, unheld=finished.put_back)
+    memory, back = options.factor_memory, finished.put_back
+    assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory=memory)
     rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,

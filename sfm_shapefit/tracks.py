@@ -26,8 +26,9 @@ from sfm_shapefit.viewgraph import ViewGraph
 _PER_CAMERA = 20  # about 3 tracks started per camera, of 6 views each: what determines a straight road
 _IN_ALL, _PER_CAMERA_OF_FEW = 800, 60  # observations that a small scene can afford
 _MIN_VIEWS = 3
-_MAX_MATCHES = 10_000_000  # held at a time: 0.8 GB
+_MAX_MATCHES = 10_000_000  # held at a time: 0.6 GB
 _WIDEST_RAD = 0.5  # rays farther apart than this gain nothing more, and are often wrong
+_KEYPOINTS = 1 << 32  # more than an image may have
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -97,7 +98,8 @@ def build_tracks(
     share = min(1.0, max_matches / max(float(directions.num_inliers[usable].sum()), 1.0))
     pairs = map(tuple, directions.pairs[usable].tolist())
     rows = dict(zip(pairs, usable.tolist(), strict=True))
-    ends: list[tuple[IntArray, FloatArray]] = []
+    keys: list[IntArray] = []
+    rays: list[FloatArray] = []
     for batch in batches:
         row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
         counts = np.diff(batch.offsets)
@@ -107,11 +109,11 @@ def build_tracks(
         angle = pixel_angles[batch.pairs[pair]].max(axis=1)
         agrees = _sampson_px(batch.rays_i[kept], batch.rays_j[kept], d, angle) <= threshold_px
         chosen = np.flatnonzero(kept)[agrees]
-        observed = np.stack([batch.pairs[pair[agrees]], batch.keypoints[chosen]], axis=2)
-        ends.append((observed, np.stack([batch.rays_i[chosen], batch.rays_j[chosen]], axis=1)))
-    if not ends:
+        keys.append(batch.pairs[pair[agrees]] * _KEYPOINTS + batch.keypoints[chosen])
+        rays.append(np.stack([batch.rays_i[chosen], batch.rays_j[chosen]], axis=1).reshape(-1, 3))
+    if not keys:
         return _no_tracks()
-    return _components(np.concatenate([end for end, _ in ends]), np.concatenate([ray for _, ray in ends]))
+    return _components(np.concatenate(keys), rays)
 
 
 def _sampled(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
@@ -139,16 +141,17 @@ def _no_tracks() -> Tracks:
     )
 
 
-def _components(ends: IntArray, rays: FloatArray) -> Tracks:
-    """Return the tracks of matches: ends (k, 2, 2) hold (image, keypoint) of both observations."""
-    flat, flat_rays = ends.reshape(-1, 2), rays.reshape(-1, 3)
-    keys, first, index = np.unique(
-        flat[:, 0] * (1 << 32) + flat[:, 1], return_index=True, return_inverse=True
-    )
+def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
+    """Return the tracks of matches from keys image * 2^32 + keypoint of both observations, (k, 2).
+
+    `rays` are those of the observations, (2 k, 3) in all, in parts.
+    """
+    keys, first, index = np.unique(ends.ravel(), return_index=True, return_inverse=True)
     index = index.reshape(-1, 2)
-    links = coo_array((np.ones(len(index)), (index[:, 0], index[:, 1])), shape=(len(keys), len(keys)))
+    present = np.ones(len(index), dtype=np.int8)
+    links = coo_array((present, (index[:, 0], index[:, 1])), shape=(len(keys), len(keys)))
     track = connected_components(links, directed=False)[1]  # numbered by first observation: keys are sorted
-    camera = keys >> 32
+    camera = keys // _KEYPOINTS
     order = np.lexsort((camera, track))
     track, camera, seen = track[order], camera[order], first[order]
     repeated = np.zeros(int(track.max()) + 1, dtype=np.bool_)
@@ -160,8 +163,19 @@ def _components(ends: IntArray, rays: FloatArray) -> Tracks:
     return Tracks(
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         cameras=camera[kept].astype(np.int64),
-        rays=flat_rays[seen[kept]],
+        rays=_gathered(rays, seen[kept]),
     )
+
+
+def _gathered(parts: list[FloatArray], rows: IntArray) -> FloatArray:
+    """Return the given rows of arrays (., 3) that follow one another, without joining these."""
+    found = np.empty((len(rows), 3))
+    start = 0
+    for part in parts:
+        inside = np.flatnonzero((rows >= start) & (rows < start + len(part)))
+        found[inside] = part[rows[inside] - start]
+        start += len(part)
+    return found
 
 
 def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None) -> IntArray:

@@ -35,6 +35,7 @@ LAYERS = [
     "synthetic",
     "colmap",
     "tracks",
+    "forecast",
     "diagnosis",
     "options",
     "report",
@@ -50,6 +51,7 @@ LAYERS = [
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
+    "distributed": {"pipeline/execution.py"},
     "cv2": {"synthetic"},
     "trimesh": {"synthetic/surfaces.py", "visual/mesh.py"},
     "pycolmap": {"colmap"},

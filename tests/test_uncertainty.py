@@ -86,7 +86,9 @@ def test_independent_samples_scatter_like_the_inverse():
     bases = tangent_bases(normalized(differences(problem.locations, problem.edges)))
     draws = SIGMA * np.random.default_rng(6).standard_normal((len(problem.edges), 2000, 2))
     information = isotropic(len(problem.edges))
-    sampled = propagate(problem.locations, problem.edges, information, None, draws @ bases.transpose(0, 2, 1))
+    sampled = propagate(
+        problem.locations, problem.edges, information, None, [draws @ bases.transpose(0, 2, 1)]
+    )
     exact = propagate(problem.locations, problem.edges, information)
     np.testing.assert_allclose(sampled.sigmas, exact.sigmas, rtol=0.065)  # 1.6 % at one sigma; four of those
 

@@ -5,6 +5,7 @@ import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.robust.conditioning import Looseness
+from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.robust.verdicts import Verdict, assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -172,3 +173,21 @@ def test_nodes_that_nothing_is_said_to_hold_hold_no_others():
     np.testing.assert_allclose(np.delete(found.sigmas, 5, axis=0), alone.sigmas, rtol=0.1)
     assert np.delete(found.trust, 5).min() > 0.9
     assert assess(graph, t, unheld=np.empty(0, dtype=np.int64)).trust[5] > 0.9
+
+
+def test_errors_that_pairs_share_widen_the_standard_deviations():
+    t, edges, v = measured(seed=3)
+    graph = ViewGraph(len(t), edges, v)
+    where = fitted(t, edges, v)
+    unit = np.random.default_rng(0).standard_normal((len(edges), 96, 2))
+
+    def sigmas(size):
+        evidence = Evidence(
+            support=np.full(len(edges), 50, dtype=np.int64),
+            contradicting=np.zeros((0, 2), dtype=np.int64),
+            contradicting_support=np.zeros(0, dtype=np.int64),
+            errors=size * SIGMA * unit,
+        )
+        return assess(graph, where, covariances(len(edges)), evidence).sigmas
+
+    np.testing.assert_allclose(sigmas(6.0), 3.0 * sigmas(2.0), rtol=0.25)  # 1 if only the excess counted

@@ -92,6 +92,7 @@ def _inspection_table(found: "Inspection") -> Rows:
         ("wrong pairs", seen.corruption.statement),
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
+        *([("will take", found.expected.statement)] if found.expected else []),
         *([("theory", found.theory.statement)] if found.theory else []),
     ]
 

@@ -1,7 +1,7 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -48,6 +48,14 @@ def locate_command(
             help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
         ),
     ] = None,
+    executor: Annotated[
+        Literal["serial", "processes", "dask"],
+        typer.Option("--executor", help="Who measures the directions: this process, others, or a cluster."),
+    ] = "serial",
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
+    ] = None,
     overwrite: Overwrite = False,
     config: Config = None,
     report: Report = True,
@@ -69,12 +77,17 @@ def locate_command(
         with claimed_output(target, overwrite=overwrite, protect=protect):
             from sfm_shapefit.colmap.quiet import pycolmap_heard
             from sfm_shapefit.pipeline import locate
+            from sfm_shapefit.pipeline.execution import open_executor
             from sfm_shapefit.report import dumps
             from sfm_shapefit.results import summary, write_result
 
             catch_termination()
-            with shown_progress(not quiet, verbose) as progress, pycolmap_heard(verbose):
-                found = locate(source, database, options, progress, priors)
+            with (
+                open_executor(executor, options.num_threads(), scheduler) as workers,
+                shown_progress(not quiet, verbose) as progress,
+                pycolmap_heard(verbose),
+            ):
+                found = locate(source, database, options, progress, priors, workers)
                 write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
     with reported("interrupted; the output is complete"):
         if as_json:

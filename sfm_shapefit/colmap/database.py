@@ -14,6 +14,7 @@ Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc
 to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
 """
 
+import itertools
 import os
 import secrets
 import shutil
@@ -153,6 +154,23 @@ class MatchDatabase:
         """Number of pairs of posed images with verified inlier matches."""
         return int(self._pairs.has_matches.sum())
 
+    def limit_rays(self, num_bytes: int) -> None:
+        """Keep no more bytes than these of the rays of keypoints that may be needed again."""
+        self._cache_bytes = num_bytes
+
+    @property
+    def num_matches(self) -> int:
+        """Number of these pairs' inlier matches."""
+        return int(self._pairs.num_inliers[self._pairs.has_matches].sum())
+
+    def num_keypoints(self) -> int:
+        """Return the number of keypoints of all images, posed or not; damaged rows do not count."""
+        with _sqlite_errors(self.path):
+            counts = self._connection.execute(
+                "SELECT rows FROM keypoints WHERE typeof(rows) = 'integer' AND rows BETWEEN 0 AND 2147483647"
+            )
+            return sum(count for (count,) in counts)
+
     def keypoints(self, image: int) -> FloatArray:
         """Return the pixels of the keypoints of one image.
 
@@ -184,8 +202,20 @@ class MatchDatabase:
             )
         return xy
 
+    def parts(self, max_matches: int) -> list[tuple[int, int]]:
+        """Return the ranges (first, stop) of pairs, in their order, of about so many matches each."""
+        totals = np.append(0, np.cumsum(self._pairs.num_inliers[self._pairs.has_matches]))
+        count = max(-(-int(totals[-1]) // max(max_matches, 1)), 1)
+        bounds = np.unique(np.searchsorted(totals, np.linspace(0, totals[-1], count + 1)))
+        bounds[-1] = len(totals) - 1
+        return list(itertools.pairwise(bounds.tolist()))
+
     def iter_matches(
-        self, min_matches: int, max_matches_per_batch: int = 2_000_000, among: IntArray | None = None
+        self,
+        min_matches: int,
+        max_matches_per_batch: int = 2_000_000,
+        among: IntArray | None = None,
+        part: tuple[int, int] | None = None,
     ) -> Iterator[MatchBatch]:
         """Yield the verified inlier matches of all pairs, in the order of pairs (i, j), in batches.
 
@@ -195,11 +225,15 @@ class MatchDatabase:
             min_matches: pairs with fewer matches are left out; at least 1.
             max_matches_per_batch: bounds the memory; only a single pair may exceed it.
             among: only pairs of these images, by their index; all if None.
+            part: only this range of the pairs, one of `parts`; all if None.
 
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
         """
         enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
+        if part is not None:
+            rank = np.cumsum(self._pairs.has_matches) - 1
+            enough &= (rank >= part[0]) & (rank < part[1])
         if among is not None:
             enough &= np.isin(self._pairs.pairs, among).all(axis=1)
         chosen = np.flatnonzero(enough)

@@ -15,6 +15,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -82,6 +83,74 @@ class PosedModel:
     def num_images(self) -> int:
         """Number of posed images, n."""
         return len(self.image_ids)
+
+
+class CameraTable(NamedTuple):
+    """An intrinsic camera as plain values."""
+
+    model: str
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedCameras:
+    """What of a model rays in world axes need, as plain values that other processes understand."""
+
+    names: tuple[str, ...]
+    """Of the n posed images."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    focal_lengths_px: FloatArray
+    """(n,)"""
+    cameras: tuple[CameraTable, ...]
+    """The different cameras."""
+    camera_of: IntArray
+    """(n,) index into `cameras`."""
+
+
+def posed_cameras(model: PosedModel) -> PosedCameras:
+    """Return the posed images without their points and centres."""
+    reconstruction = model.reconstruction
+    ids = [reconstruction.image(i).camera_id for i in model.image_ids.tolist()]
+    different, camera_of = np.unique(ids, return_inverse=True)
+    cameras = [reconstruction.camera(i) for i in different.tolist()]
+    return PosedCameras(
+        names=model.names,
+        rotations=np.array(model.rotations),
+        focal_lengths_px=np.array(model.focal_lengths_px),
+        cameras=tuple(CameraTable(c.model.name, c.width, c.height, tuple(c.params)) for c in cameras),
+        camera_of=camera_of.astype(np.int64),
+    )
+
+
+def from_posed_cameras(table: PosedCameras) -> PosedModel:
+    """Return a model of these images: the same rotations to the bit, centres at the origin, no points."""
+    reconstruction = pycolmap.Reconstruction()
+    for k, camera in enumerate(table.cameras):
+        made = pycolmap.Camera(
+            camera_id=k + 1,
+            model=camera.model,
+            width=camera.width,
+            height=camera.height,
+            params=list(camera.params),
+        )
+        reconstruction.add_camera_with_trivial_rig(made)
+    n = len(table.names)
+    for k, (name, camera) in enumerate(zip(table.names, table.camera_of.tolist(), strict=True)):
+        image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=k + 1)
+        reconstruction.add_image_with_trivial_frame(image)
+    return PosedModel(
+        reconstruction=reconstruction,
+        image_ids=np.arange(1, n + 1),
+        names=table.names,
+        rotations=table.rotations,
+        centers=np.zeros((n, 3)),
+        focal_lengths_px=table.focal_lengths_px,
+        frame_ids=np.arange(1, n + 1),
+        frame_offsets=np.zeros((n, 3)),
+    )
 
 
 def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:

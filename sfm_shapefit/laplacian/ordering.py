@@ -74,7 +74,7 @@ def metis_order(graph: Adjacency) -> IntArray:
 
     if graph.num_nodes == 0 or len(graph.neighbours) == 0:
         return np.arange(graph.num_nodes)
-    unique = _without_repeats(graph)
+    unique = without_repeats(graph)
     csr = pymetis.CSRAdjacency(unique[0].astype(np.int32), unique[1])
     return np.asarray(pymetis.nested_dissection(adjacency=csr)[0], dtype=np.int64)
 
@@ -128,7 +128,7 @@ def widest_level(graph: Adjacency) -> int:
     return int(np.bincount(distance[queue[:reached]].astype(np.int64)).max())
 
 
-def _without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
+def without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
     """Return row pointers and neighbours with each neighbour once, as METIS demands."""
     n = graph.num_nodes
     entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)

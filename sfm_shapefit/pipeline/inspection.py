@@ -7,10 +7,12 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.diagnosis import Inspection, Theory, diagnose, theory_of
 from sfm_shapefit.directions import DirectionStatus
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.forecast import forecast, measure_speed
 from sfm_shapefit.formats import read_graph
 from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.economy import known_workload
 from sfm_shapefit.pipeline.measurement import evidence_of, joint_graph, measure_directions, view_graph
 from sfm_shapefit.pipeline.rigid_bodies import rigs_statement
 from sfm_shapefit.pipeline.sources import choose_inputs, open_source
@@ -71,6 +73,9 @@ def inspect(
                     evidence_of(directions).contradicting,
                 ),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+                expected=forecast(
+                    known_workload(matches, directions, joint, options), matches.economy, measure_speed()
+                ),
                 rigs=rigs_statement(model, joint),
             )
 

@@ -4,6 +4,7 @@ Each stage is one function from values to a new value; the input is never change
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,6 +13,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
+from sfm_shapefit.pipeline.economy import within_memory
 from sfm_shapefit.pipeline.gauging import chosen_gauge, read_priors
 from sfm_shapefit.pipeline.measurement import (
     evidence_of,
@@ -38,6 +40,7 @@ def locate(
     options: LocateOptions | None = None,
     progress: Progress | None = None,
     priors: Path | str | None = None,
+    executor: Executor | None = None,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -55,6 +58,8 @@ def locate(
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
+        executor: shares out the pairs of a database among its workers, which must see its file; the
+            answer is the same to the bit. None: they are measured here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -103,11 +108,12 @@ def locate(
     if options.refine_rotations:
         with clock("rotations"):
             model, turned_deg = refined_rotations(model, inputs, options, clock)
-    with open_source(model, inputs) as source:
+    with open_source(model, inputs, options.max_memory) as opened:
         with clock("directions"):
-            directions = measure_directions(source, options, clock)
+            directions = measure_directions(opened, options, clock, executor)
         with clock("solve"):
-            joint = joint_graph(source, directions, options)
+            joint = joint_graph(opened, directions, options)
+            source, joint, options = within_memory(opened, directions, joint, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
             placement = placed(joint, rigid, evidence, options, clock)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
@@ -147,6 +153,8 @@ def _warnings(
     yield from trust_warnings(placement, kept)
     if gauge.warning:
         yield gauge.warning
+    if source.economy.statement:
+        yield f"to stay below max_memory, {source.economy.statement}"
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if source.database is not None and source.database.unmatched_names:

@@ -1,5 +1,6 @@
 """From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
 
+from concurrent.futures import Executor
 from dataclasses import replace
 
 import numpy as np
@@ -11,12 +12,12 @@ from sfm_shapefit.directions import (
     DirectionStatus,
     PairDirections,
     concatenate,
-    estimate_directions,
     from_relative_poses,
 )
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.execution import directions_of, shared_out
 from sfm_shapefit.pipeline.sources import MatchSource
 from sfm_shapefit.robust.shared_noise import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.robust.trust import Evidence
@@ -33,8 +34,10 @@ _ADVICE = {
 """What to do where no pair has a direction, by the most frequent reason."""
 
 
-def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock) -> PairDirections:
-    """Return the direction of every pair that the source has."""
+def measure_directions(
+    source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
+) -> PairDirections:
+    """Return the direction of every pair that the source has; an executor shares them out, if it can."""
     model = source.model
     if source.database is not None and source.kind == "relative-poses":
         poses = source.database.relative_poses()
@@ -47,20 +50,12 @@ def measure_directions(source: MatchSource, options: LocateOptions, clock: Clock
             poses.num_inliers,
             options.for_directions(),
         )
-    parts: list[PairDirections] = []
-    for batch in source.counted(source.batches(), clock.advance):
-        focal_lengths = model.focal_lengths_px[batch.pairs].min(axis=1)
-        parts.append(
-            estimate_directions(
-                batch.pairs,
-                batch.offsets,
-                batch.rays_i,
-                batch.rays_j,
-                1.0 / focal_lengths,
-                options.for_directions(),
-                threads=options.num_threads(),
-            )
-        )
+    if executor is not None and source.database is not None:
+        parts = shared_out(source.database, model, options.for_directions(), executor, clock.advance)
+    else:
+        wanted, threads = options.for_directions(), options.num_threads()
+        batches = source.counted(source.batches(), clock.advance)
+        parts = [directions_of(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
@@ -91,7 +86,7 @@ def joint_graph(source: MatchSource, directions: PairDirections, options: Locate
     """Return the view graph, with 3D points as further nodes if the options want them."""
     model = source.model
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
-    if not options.uses_points(model.num_images):
+    if not (options.uses_points(model.num_images) and source.economy.points):
         return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
     pixel_angles = 1.0 / model.focal_lengths_px
     tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
@@ -99,13 +94,29 @@ def joint_graph(source: MatchSource, directions: PairDirections, options: Locate
     return join_points(graph, covariance, chosen, pixel_angles)
 
 
+def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
+    """Return whether the errors of the directions are sampled together."""
+    if source.kind == "relative-poses" or not source.economy.samples:
+        return False
+    return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
+
+
+def without_points(joint: JointGraph) -> JointGraph:
+    """Return the pairs of cameras alone; they stand before the rays to points."""
+    graph, k = joint.graph, joint.num_cameras
+    rows = np.flatnonzero((graph.edges < k).all(axis=1))
+    names = None if graph.names is None else graph.names[:k]
+    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
+    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k)
+
+
 def shared_errors(
     source: MatchSource, directions: PairDirections, options: LocateOptions
 ) -> FloatArray | None:
     """Return samples of the usable directions' errors, which share keypoints; None if not known."""
-    usable = directions.usable()
-    if source.kind == "relative-poses" or len(usable) > _MAX_SAMPLED_PAIRS:
+    if not samples_errors(source, directions):
         return None
+    usable = directions.usable()
     row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
     errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
     for batch in source.batches():

@@ -19,11 +19,11 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
+from sfm_shapefit.pipeline.measurement import without_points
 from sfm_shapefit.placement import Placement, place
 from sfm_shapefit.robust.trust import Evidence
 from sfm_shapefit.solver.bodies import largest_tied
 from sfm_shapefit.tracks import JointGraph
-from sfm_shapefit.viewgraph import ViewGraph
 
 _COINCIDENT = 1e-9  # extent of the fixed centres, of their distance from the origin, that counts as none
 
@@ -140,12 +140,9 @@ def _placed_bodies(joint: JointGraph, evidence: Evidence, rigid: Rigid, options:
 
 def _without_points(joint: JointGraph, evidence: Evidence) -> tuple[JointGraph, Evidence]:
     """Return the pairs of cameras alone; they stand before the rays."""
-    graph, k = joint.graph, joint.num_cameras
-    rows = np.flatnonzero((graph.edges < k).all(axis=1))
-    names = None if graph.names is None else graph.names[:k]
-    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
-    heard = evidence.restricted_to(rows, np.arange(k), graph.num_cameras)
-    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k), heard
+    k = joint.num_cameras
+    rows = np.flatnonzero((joint.graph.edges < k).all(axis=1))
+    return without_points(joint), evidence.restricted_to(rows, np.arange(k), joint.graph.num_cameras)
 
 
 def _num_held(placement: Placement) -> int:

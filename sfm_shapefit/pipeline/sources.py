@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,6 +11,7 @@ from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_data
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedModel, track_matches
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.forecast import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.options import Source
 from sfm_shapefit.results import Inputs
 
@@ -27,12 +28,14 @@ class MatchSource:
     """What directions are made from; never "auto"."""
     database: MatchDatabase | None
     """The open database; None where the model's own tracks serve."""
+    economy: Economy = ECONOMIES[0]
+    """What is given up for memory."""
 
     def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
         """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
         if self.database is None:
             return track_matches(self.model, 1)
-        return self.database.iter_matches(1, among=among)
+        return self.database.iter_matches(1, self.economy.batch, among)
 
     def counted(
         self, batches: Iterator[MatchBatch], advance: Callable[[int, int], None]
@@ -47,15 +50,48 @@ class MatchSource:
             advance(min(done, total), total)
         advance(total, total)
 
+    def workload(self) -> Workload:
+        """Return what is known of the work before any direction is measured."""
+        database, model = self.database, self.model
+        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        seen = sum(image.num_points2D() for image in images)
+        num_pairs = 0 if database is None else database.num_pairs
+        return Workload(
+            num_images=model.num_images,
+            num_keypoints=seen if database is None else max(seen, database.num_keypoints()),
+            num_pairs=num_pairs,
+            num_matches=0 if database is None else database.num_matches,
+            num_edges=num_pairs,
+            num_nodes=model.num_images,
+            num_sampled=0,
+            has_points=False,
+            factor_entries=0,
+            factor_flops=0.0,
+        )
+
 
 @contextmanager
-def open_source(model: PosedModel, inputs: Inputs) -> Iterator[MatchSource]:
-    """Open the matches that were chosen, and close them in the end."""
+def open_source(model: PosedModel, inputs: Inputs, max_memory: int = 0) -> Iterator[MatchSource]:
+    """Open the matches that were chosen, and close them in the end.
+
+    Args:
+        model: whose images they belong to.
+        inputs: what was chosen.
+        max_memory: limit of the peak memory in MB, which decides the economy; 0 for none.
+
+    Raises:
+        InputError: if the matches cannot be read, or there is no way to stay below the limit.
+    """
     if inputs.database is None:
         yield MatchSource(model=model, kind=inputs.source, database=None)
         return
     with open_database(inputs.database, model) as database:
-        yield MatchSource(model=model, kind=inputs.source, database=database)
+        source = MatchSource(model=model, kind=inputs.source, database=database)
+        if max_memory:
+            economy = choose_economy(source.workload(), max_memory)
+            database.limit_rays(economy.rays_bytes)
+            source = replace(source, economy=economy)
+        yield source
 
 
 def choose_inputs(

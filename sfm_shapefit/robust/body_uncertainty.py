@@ -13,7 +13,7 @@ from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import selected_inverse
-from sfm_shapefit.robust.uncertainty import Uncertainty
+from sfm_shapefit.robust.uncertainty import Uncertainty, scatter
 from sfm_shapefit.solver.program import differences
 
 _RIDGE = 1e-12  # of each block's trace
@@ -65,15 +65,13 @@ def propagate_bodies(
     relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
     leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     covariances = _with_fixed_mean(factor, inverse.nodes, share)
-    samples = None
     if errors is not None:
         forces = (across @ errors.transpose(0, 2, 1)) / lengths[:, None, None]
-        samples = _moved(factor, ends, forces, share)[bodies.body_of]
+        covariances = scatter(_moved(factor, ends, forces, share))
     return Uncertainty(
         covariances=covariances[bodies.body_of],
         leverages=np.clip(leverages, 0.0, 1.0),
         gauge=share[bodies.body_of] > 0.0,
-        samples=samples,
     )
 
 

@@ -140,7 +140,7 @@ def finish(
     if solved.status is Status.NOT_SOLVED:
         return _as_located(graph, solved, metric)
     lud, second = _second_start(graph, classes, options.threads, bodies)
-    plan = _plan(graph, bodies) if options.refines else None
+    plan = _plan(graph, bodies, options.factor_memory * 1_000_000) if options.refines else None
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
     candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
@@ -173,9 +173,11 @@ def finish(
     )
 
 
-def _plan(graph: ViewGraph, bodies: Bodies | None) -> SymbolicFactor | ReducedFactor | None:
+def _plan(graph: ViewGraph, bodies: Bodies | None, max_bytes: int) -> SymbolicFactor | ReducedFactor | None:
     """Return what the refinement factors with, or None if its factor would be too large."""
-    return plan_refinement(graph) if bodies is None else ReducedFactor(graph.edges, bodies.normalised())
+    if bodies is None:
+        return plan_refinement(graph, max_bytes)
+    return ReducedFactor(graph.edges, bodies.normalised())
 
 
 def _second_start(

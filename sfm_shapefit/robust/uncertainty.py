@@ -26,6 +26,7 @@ over d - 1. Where it is 1 no other direction checks it, and its residual is 0 wh
 (Cook and Weisberg 1982, "Residuals and Influence in Regression", section 2.1).
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,20 +54,15 @@ class Uncertainty:
 
     covariances: FloatArray
     """(n, d, d) covariance of each location, in squared units of the locations; centroid and scale of the
-    cameras in `gauge` held fixed."""
+    cameras in `gauge` held fixed; from samples, where the errors of the directions are given as such."""
     leverages: FloatArray
     """(m,) in [0, 1]."""
     gauge: BoolArray
     """(n,) the nodes whose centroid and scale are held fixed."""
 
-    samples: FloatArray | None = None
-    """(n, d, s) errors of the locations for samples of correlated direction errors."""
-
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations along the axes, (n, d)."""
-        if self.samples is not None:
-            return np.asarray(np.sqrt(np.mean(self.samples**2, axis=2)))
         variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
         return np.sqrt(np.maximum(variances, 0.0))
 
@@ -76,7 +72,8 @@ def propagate(
     edges: IntArray,
     information: FloatArray,
     num_cameras: int | None = None,
-    errors: FloatArray | None = None,
+    errors: Iterable[FloatArray] | None = None,
+    max_bytes: int = _MAX_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
@@ -85,11 +82,12 @@ def propagate(
         edges: (m, 2) pairs that make the nodes rigid, none of length 0.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
         num_cameras: the first so many nodes may decide the gauge; all if None.
-        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
-            information if None.
+        errors: samples (m, s, d) of the errors of the directions in radians, in consecutive parts, of which
+            only one is held at a time; independent errors of that information if None.
+        max_bytes: of the factor.
 
     Returns:
-        None if the factor would take more than 2 GB: about a hundred thousand cameras in space.
+        None if the factor would take more: than 2 GB from about a hundred thousand cameras in space on.
 
     Raises:
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
@@ -101,7 +99,7 @@ def propagate(
     across = _across(information, units)
     blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
     plan = analyse(n, edges, coordinates=locations)
-    if plan.num_bytes(d) > _MAX_BYTES:
+    if plan.num_bytes(d) > max_bytes:
         return None
     factor = _grounded_factor(plan, blocks, units, lengths)
     inverse = selected_inverse(factor, edges)
@@ -111,30 +109,38 @@ def propagate(
     leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _held(factor, inverse, locations, is_camera)
-    samples = None
     if errors is not None:
-        forces = (across @ errors.transpose(0, 2, 1)) / np.maximum(lengths, _SHORTEST * lengths.max())[
-            :, None, None
-        ]
-        samples = _moved(factor, locations, edges, forces, gauge)
-    return Uncertainty(
-        covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge, samples=samples
-    )
+        pulls = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None]
+        covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
+    return Uncertainty(covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge)
 
 
-def _moved(
-    factor: CholeskyFactor, locations: FloatArray, edges: IntArray, forces: FloatArray, gauge: BoolArray
-) -> FloatArray:
-    """Return S A^-1 D^T f for each of the samples in the forces f (m, d, s), shape (n, d, s)."""
-    n, d = locations.shape
-    right = np.zeros((n, d, forces.shape[2]))
-    flat = apply_incidence_transposed(edges, np.ascontiguousarray(forces.reshape(len(edges), -1)), n)
-    right[:] = flat.reshape(right.shape)
+def scatter(samples: FloatArray) -> FloatArray:
+    """Return the covariances (n, d, d) of samples (n, d, s) of mean zero."""
+    covariances: FloatArray = samples @ samples.transpose(0, 2, 1) / samples.shape[2]
+    return covariances
+
+
+def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray], n: int) -> FloatArray:
+    """Return D^T (Lambda theta / l) of each sample, (n, d, s), from theta in consecutive parts."""
+    total, start = np.zeros((n, pulls.shape[1], 1)), 0
+    for part in errors:
+        stop = start + len(part)
+        forces = pulls[start:stop] @ part.transpose(0, 2, 1)
+        flat = apply_incidence_transposed(edges[start:stop], forces.reshape(len(part), -1), n)
+        total = total + flat.reshape(n, *forces.shape[1:])
+        start = stop
+    return total
+
+
+def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gauge: BoolArray) -> FloatArray:
+    """Return S A^-1 of the right sides (n, d, s), in the gauge of those nodes."""
     moved = factor.solve(right)
     null, fixed = _gauge_pair(locations, gauge)
     drift = np.einsum("nak,nas->ks", fixed, moved)
-    result: FloatArray = moved - np.einsum("nak,ks->nas", null, drift)
-    return result
+    for a in range(moved.shape[1]):  # axis by axis: the samples are large
+        moved[:, a] -= null[:, a] @ drift
+    return moved
 
 
 def _across(information: FloatArray, units: FloatArray) -> FloatArray:

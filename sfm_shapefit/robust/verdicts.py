@@ -17,8 +17,10 @@ camera say together is `trust`.
 """
 
 import enum
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -45,6 +47,7 @@ _MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
 _LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
 _BISECTIONS = 50
 _SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
+_PART = 10_000  # directions whose error samples are worked on at a time
 _LOOSENING_RAD = 1e-4
 """Noise for which it is asked at least which nodes are loose: with none, none would be."""
 _REACHES = (np.inf, 1e3, 30.0)
@@ -111,6 +114,7 @@ def assess(
     bodies: Bodies | None = None,
     held: int | None = None,
     unheld: IntArray | None = None,
+    factor_memory: int = 2000,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -126,6 +130,7 @@ def assess(
         held: the body that stays where it is; the mean of the cameras does if None.
         unheld: nodes that stand where they do for want of anything better, such as those that the finish put
             back: their standard deviations are infinite, and they hold no others; none if None.
+        factor_memory: MB that the factor for standard deviations may take; of bodies it is small.
     """
     freedom = graph.dimension - 1
     k = graph.num_cameras if num_cameras is None else num_cameras
@@ -139,18 +144,17 @@ def assess(
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
     bases = tangent_bases(graph.directions)
-    errors = None
-    if evidence is not None and evidence.errors is not None:
-        errors = _with_excess(evidence.errors, excess) @ bases.transpose(0, 2, 1)
     angles = np.linalg.norm(residuals, axis=1)
     sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
-    errors = None if errors is None else errors / scale
-    propagated = _propagated if bodies is None else partial(_propagated_over, bodies, held)
+    errors = None if evidence is None else evidence.errors
+    sampled = None if errors is None else _Sampled(errors, excess, scale)
+    separately = partial(_propagated, factor_memory * 1_000_000)
+    propagated = separately if bodies is None else partial(_propagated_over, bodies, held)
     holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
-    covariances, leverages = propagated(graph, locations, holding, information, k, errors)
+    covariances, leverages = propagated(graph, locations, holding, information, k, sampled)
     leverages[inliers & ~holding] = np.nan
     covariances = scale**2 * covariances
     sigmas = _standard_deviations(covariances)
@@ -245,9 +249,26 @@ def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wa
     return high
 
 
-def _with_excess(errors: FloatArray, excess: float) -> FloatArray:
-    """Add independent normal errors of the excess to samples (m, s, d - 1)."""
-    return errors + excess * np.random.default_rng(0).standard_normal(errors.shape)
+class _Sampled(NamedTuple):
+    """Samples of the errors of the directions."""
+
+    errors: FloatArray
+    """(m, s, d - 1) that sharing keypoints explains, in tangent bases, radians."""
+    excess: float
+    """Standard deviation of what it does not explain."""
+    scale: float
+    """By which the errors are divided."""
+
+    def parts(self, directions: FloatArray, rows: IntArray) -> Iterator[FloatArray]:
+        """Yield the errors (., s, d) of the given rows in world axes, a part at a time."""
+        random = np.random.default_rng(0)
+        for start in range(0, len(self.errors), _PART):
+            own = self.errors[start : start + _PART]
+            whole = own + self.excess * random.standard_normal(own.shape)
+            first, last = np.searchsorted(rows, (start, start + _PART))
+            chosen = rows[first:last]
+            bases = tangent_bases(directions[chosen]).transpose(0, 2, 1)
+            yield whole[chosen - start] @ bases / self.scale
 
 
 def _standard_deviations(covariances: FloatArray) -> FloatArray:
@@ -262,12 +283,13 @@ def _unheld(locations: FloatArray) -> FloatArray:
 
 
 def _propagated(
+    max_bytes: int,
     graph: ViewGraph,
     locations: FloatArray,
     inliers: BoolArray,
     information: FloatArray,
     num_cameras: int,
-    errors: FloatArray | None,
+    sampled: _Sampled | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, d, d) and the leverages (m,).
 
@@ -286,8 +308,10 @@ def _propagated(
         if cameras < _SMALLEST_RIGID:
             return covariances, leverages
         try:
-            samples = None if errors is None else errors[rows]
-            found = propagate(locations[held], edges.reshape(-1, 2), information[rows], cameras, samples)
+            samples = None if sampled is None else sampled.parts(graph.directions, rows)
+            found = propagate(
+                locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
+            )
         except UnsolvableError:  # singular in spite of the ridge
             continue
         if found is None:
@@ -320,7 +344,7 @@ def _propagated_over(
     inliers: BoolArray,
     information: FloatArray,
     num_cameras: int,
-    errors: FloatArray | None,
+    sampled: _Sampled | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, d, d) and the leverages (m,) of rigid bodies, their scale held.
 
@@ -337,7 +361,7 @@ def _propagated_over(
         return covariances, leverages
     nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
     share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
-    samples = None if errors is None else errors[rows]
+    samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
     part = bodies.restricted_to(nodes)
     try:
         found = propagate_bodies(

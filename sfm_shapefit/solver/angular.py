@@ -92,14 +92,14 @@ class AngularResult:
     """Factorisations."""
 
 
-def plan_refinement(graph: ViewGraph) -> SymbolicFactor | None:
+def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFactor | None:
     """Return the plan of the refinement's factor, or None if it would be too large to be worth it."""
     neighbours = adjacency(graph.num_cameras, graph.edges)
     tree = best_order(neighbours)
     if tree.flops * graph.dimension**3 > _MAX_FLOPS:
         return None
     plan = plan_factorisation(neighbours, graph.edges, tree)
-    return plan if plan.num_bytes(graph.dimension, np.float64) <= _MAX_BYTES else None
+    return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
 
 def refine_angles(

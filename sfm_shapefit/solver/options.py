@@ -58,6 +58,9 @@ class SolverOptions:
     """Hard limit; None: the method's own. Reaching it is reported in `SolverResult.status`, never silent."""
     uniqueness: bool = True
     """Also examine whether the certificate proves the optimum unique; costs one sparse factorisation."""
+    factor_memory: int = 2000
+    """What one sparse factor may take, in MB. Larger ones are replaced by iterations in the solve, and left
+    out where only they serve: in the refinement and for standard deviations."""
     threads: int = 1
     """Threads of the passes over edges; the answer does not depend on it."""
 
@@ -66,7 +69,7 @@ class SolverOptions:
             raise ValueError(f"SolverOptions.method must be one of {get_args(Method)}, got {self.method!r}")
         if not 0.0 < self.tol < 1.0:
             raise ValueError(f"SolverOptions.tol must lie in (0, 1), got {self.tol}")
-        for name in ("max_iterations", "threads"):
+        for name in ("max_iterations", "factor_memory", "threads"):
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise ValueError(f"SolverOptions.{name} must be >= 1, got {value}")

@@ -166,7 +166,13 @@ def _run_admm(
     prediction: Prediction | None = None,
 ) -> Run:
     found = solve_hybrid(
-        graph, options.tol, limit, threads=options.threads, prediction=prediction, on_iteration=watch
+        graph,
+        options.tol,
+        limit,
+        threads=options.threads,
+        memory_bytes=options.factor_memory * 1_000_000,
+        prediction=prediction,
+        on_iteration=watch,
     )
     note = "" if found.finish is Finish.CERTIFIED else found.finish.value
     return Run(found.locations, found.certificate.dual, found.iterations, note)

@@ -38,6 +38,8 @@ class SceneOptions:
     either of its images asks for it."""
     min_matches: int = 30
     """Images that share fewer points than this are no pair."""
+    max_matches_per_pair: int | None = None
+    """So many of a pair's matches are kept, drawn at random; all if not given."""
     max_keypoints_per_image: int = 1000
     """The points that appear largest (nearest and most frontal) are kept."""
     image_width: int = 1200
@@ -55,6 +57,11 @@ class SceneOptions:
         for name, least in _SMALLEST_INTEGERS.items():
             if getattr(self, name) < least:
                 raise ValueError(f"SceneOptions.{name} must be >= {least}, got {getattr(self, name)}")
+        most = self.max_matches_per_pair
+        if most is not None and most < self.min_matches:
+            raise ValueError(
+                f"SceneOptions.max_matches_per_pair must be >= min_matches = {self.min_matches}, got {most}"
+            )
         for name in ("pixel_noise_px", "rotation_noise_deg"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"SceneOptions.{name} must be finite and >= 0, got {getattr(self, name)}")

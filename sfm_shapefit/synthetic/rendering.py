@@ -42,6 +42,7 @@ _OF_POINTS_ONLY = (
     "wrong_match_fraction",
     "corrupted_pair_fraction",
     "max_pairs_per_image",
+    "max_matches_per_pair",
 )
 
 

@@ -16,6 +16,7 @@ World axes: z is up; one unit is a metre. OpenCV is imported when a scene is pro
 not before.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -121,13 +122,16 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
         rngs: five streams, one for each kind of draw.
     """
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
-    images = [_photograph(layout, image, options, pixel_rng) for image in range(options.num_images)]
+    thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
+    candidates = _candidates(layout, options)
+    images = [_photograph(layout, image, ids, options, pixel_rng) for image, ids in enumerate(candidates)]
     keypoint_points = [ids for ids, _ in images]
     keypoints = [xy for _, xy in images]
     pairs = _pairs(keypoint_points, options)
 
     false_lists = _false_lists(layout, keypoint_points, pairs, options, corruption_rng)
     lists = _match_lists(keypoints, keypoint_points, pairs, false_lists)
+    lists = [_thinned(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
     scrambled = [_scrambled(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
     relative_rotations, relative_translations = _relative_poses(
@@ -185,16 +189,35 @@ def project_points(
 # --- keypoints -------------------------------------------------------------------------------------------
 
 
+def _candidates(layout: Layout, options: SceneOptions) -> Iterator[IntArray]:
+    """Yield for each image the points, ascending, near enough to be shown: those in a ball about its view.
+
+    A view is a pyramid of height h = `FARTHEST_M` and half diagonal r at its end; the smallest ball about it
+    touches its tip and its corners, or only the corners where r > h.
+    """
+    from scipy.spatial import KDTree
+
+    half_diagonal_px = 0.5 * np.hypot(options.image_width, options.image_height)
+    r = FARTHEST_M * float(half_diagonal_px) / options.focal_length_px
+    ahead_m = min(0.5 * (FARTHEST_M + r * r / FARTHEST_M), FARTHEST_M)
+    radius_m = max(ahead_m, r) * (1.0 + 1e-9)
+    tree = KDTree(layout.points)
+    for center, axis in zip(layout.centers, layout.rotations[:, 2], strict=True):
+        found = tree.query_ball_point(center + ahead_m * axis, radius_m, return_sorted=True)
+        yield np.asarray(found, dtype=np.int64)
+
+
 def _photograph(
-    layout: Layout, image: int, options: SceneOptions, rng: np.random.Generator
+    layout: Layout, image: int, candidates: IntArray, options: SceneOptions, rng: np.random.Generator
 ) -> tuple[IntArray, FloatArray]:
-    """Return the points that an image shows, ascending, and their noisy pixels, all inside the image.
+    """Return which of the candidates an image shows, ascending, and their noisy pixels, all inside the image.
 
     A point shows when it is in front, near enough, inside the image, and faces the camera. Every surface
     here is convex towards its cameras, so that facing also decides occlusion.
     """
     center, cam_from_world = layout.centers[image], layout.rotations[image]
-    ids = np.flatnonzero(_in_view_from(layout.points, center[None], cam_from_world, options)[0])
+    points = layout.points[candidates]
+    ids = candidates[_in_view_from(points, center[None], cam_from_world, options)[0]]
     sight = layout.points[ids] - center
     squared_distance = np.einsum("pa,pa->p", sight, sight)
     frontality = -np.einsum("pa,pa->p", sight, layout.normals[ids]) / np.sqrt(squared_distance)
@@ -292,6 +315,13 @@ def _shared_keypoints(points_i: IntArray, points_j: IntArray) -> IntArray:
     """Return the (k, 2) keypoints of two images that show the same point."""
     _, in_i, in_j = np.intersect1d(points_i, points_j, assume_unique=True, return_indices=True)
     return np.stack([in_i, in_j], axis=1).astype(np.int64)
+
+
+def _thinned(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
+    """Return a random share of the matches, in their order; all, if they are few enough."""
+    if most is None or len(matches) <= most:
+        return matches
+    return matches[np.sort(rng.choice(len(matches), most, replace=False))]
 
 
 def _scrambled(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:

@@ -1,0 +1,49 @@
+"""The normal equations of the angular refinement without a factor: conjugate gradients, for graphs too large.
+
+A step need not be exact, for the next one starts where it ends. The preconditioner is an approximate Cholesky
+factor of the scalar Laplacian whose weights are the mean eigenvalues of the blocks.
+"""
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.viewgraph import ViewGraph
+
+_REDUCTION = 1e-2  # of the residual of a step
+_MAX_STEPS = 80
+_SEED = 1
+
+
+class IterativeNormal:
+    """What `angular.refine_angles` takes in place of a factor's plan; memory is linear in the edges."""
+
+    def __init__(self, graph: ViewGraph) -> None:
+        self._edges = graph.edges
+        self._neighbours = adjacency(graph.num_cameras, graph.edges)
+        self._blocks: FloatArray = np.zeros((0, graph.dimension, graph.dimension))
+        self._preconditioner: Preconditioner | None = None
+
+    def refactor(self, weights: FloatArray, /) -> None:
+        """Take the matrix of edge blocks (m, d, d)."""
+        self._blocks = weights
+        mean = np.trace(weights, axis1=1, axis2=2) / weights.shape[1]
+        self._preconditioner = approximate_cholesky(self._neighbours, mean, _SEED)
+
+    def solve(self, rhs: FloatArray, /) -> FloatArray:
+        """Return the step of the locations, (n, d), to a hundredth of the residual."""
+        assert self._preconditioner is not None
+        return conjugate_gradients(
+            self._apply,
+            self._preconditioner,
+            rhs,
+            tol=_REDUCTION,
+            max_iterations=_MAX_STEPS,
+            coupled=True,
+        ).x
+
+    def _apply(self, x: FloatArray) -> FloatArray:
+        pulled = (self._blocks @ differences(np.ascontiguousarray(x), self._edges)[:, :, None])[:, :, 0]
+        return np.asarray(adjoint(pulled, self._edges, len(x)))

@@ -1,0 +1,151 @@
+"""Directions measured by other processes equal those of one; a worker that dies is replaced or reported."""
+
+import dataclasses
+import os
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from functools import partial
+from multiprocessing import get_context
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.colmap.database import open_database
+from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras, read_model
+from sfm_shapefit.colmap.workspace import write_workspace
+from sfm_shapefit.directions import DirectionOptions, concatenate
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.pipeline.execution import (
+    DirectionTask,
+    WorkerError,
+    measure_task,
+    open_executor,
+    shared_out,
+)
+from sfm_shapefit.synthetic import SceneOptions, make_scene
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    """A small ring as a COLMAP workspace."""
+    out = tmp_path_factory.mktemp("execution") / "ring"
+    write_workspace(make_scene(SceneOptions(num_images=16, num_points=600, wrong_match_fraction=0.1)), out)
+    return out
+
+
+@pytest.fixture(scope="module")
+def model(workspace):
+    return read_model(workspace / "sparse" / "0")
+
+
+def serial(workspace, model):
+    cameras = posed_cameras(model)
+    with open_database(workspace / "database.db", model) as database:
+        whole = (0, database.num_pairs)
+    task = DirectionTask(
+        database=workspace / "database.db", part=whole, cameras=cameras, options=DirectionOptions()
+    )
+    (found,) = measure_task(task)
+    return found
+
+
+def shared(workspace, model, executor, matches_per_task=700):
+    seen = []
+    with open_database(workspace / "database.db", model) as database:
+        parts = shared_out(
+            database, model, DirectionOptions(), executor, lambda *done: seen.append(done), matches_per_task
+        )
+    return concatenate(parts), seen
+
+
+def assert_same_bits(a, b):
+    for field in dataclasses.fields(a):
+        ours, theirs = getattr(a, field.name), getattr(b, field.name)
+        if field.name == "status":
+            assert list(ours) == list(theirs)
+        else:
+            np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
+
+
+def test_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
+    with open_database(workspace / "database.db", model) as database:
+        ours = list(database.iter_matches(1))
+    with open_database(workspace / "database.db", from_posed_cameras(posed_cameras(model))) as database:
+        theirs = list(database.iter_matches(1))
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a.rays_i, b.rays_i)
+        np.testing.assert_array_equal(a.rays_j, b.rays_j)
+
+
+def test_parts_cover_all_pairs_once(workspace, model):
+    with open_database(workspace / "database.db", model) as database:
+        whole = np.concatenate([batch.pairs for batch in database.iter_matches(1)])
+        for size in (1, 700, 10**9):
+            parts = database.parts(size)
+            pieces = [b.pairs for part in parts for b in database.iter_matches(1, part=part)]
+            np.testing.assert_array_equal(np.concatenate(pieces), whole)
+        assert len(database.parts(700)) > 3
+        assert len(database.parts(10**9)) == 1
+
+
+def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):
+    with ThreadPoolExecutor(2) as pool:
+        found, seen = shared(workspace, model, pool)
+    assert_same_bits(found, serial(workspace, model))
+    assert seen[-1] == (len(found.pairs), len(found.pairs))
+
+
+@pytest.mark.slow
+def test_directions_of_processes_equal_those_of_one_pass_to_the_bit(workspace, model):
+    with open_executor("processes", 2) as pool:
+        found, _ = shared(workspace, model, pool)
+    assert_same_bits(found, serial(workspace, model))
+
+
+def _die(_task):
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", _die)
+    with (
+        ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
+        pytest.raises(WorkerError, match=r"a worker failed .* run again"),
+    ):
+        shared(workspace, model, pool)
+
+
+def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
+    def refuse(_task):
+        raise InputError("the database is damaged")
+
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", refuse)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
+        shared(workspace, model, pool)
+
+
+def _die_once(flag, task):
+    """Kill the first worker that comes here, in the middle of the work."""
+    try:
+        os.close(os.open(flag, os.O_CREAT | os.O_EXCL))
+    except FileExistsError:
+        time.sleep(0.05)
+        return measure_task(task)
+    os._exit(1)
+
+
+@pytest.mark.slow
+def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
+    pytest.importorskip("distributed")
+    flag = tmp_path / "killed"
+    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", partial(_die_once, str(flag)))
+    with open_executor("dask", 2) as pool:
+        found, _ = shared(workspace, model, pool)
+    assert flag.exists()
+    assert_same_bits(found, serial(workspace, model))
+
+
+def test_a_scheduler_without_dask_is_refused():
+    with pytest.raises(InputError, match="belongs to the executor dask"), open_executor("serial", 1, "a:1"):
+        pass
