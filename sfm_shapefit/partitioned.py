@@ -14,7 +14,8 @@ map would tear there. Pieces outside the largest body of tied ones start at thei
 pieces' certificates prove their own optima, not one of the whole. Where one machine holds the factor of the
 graph the whole solve is better: as exact and in less time in all (`is_worth_it`).
 
-Partition and merge follow Zhu et al., "Very large-scale global SfM by distributed motion averaging", CVPR 2018.
+Partition and merge follow Zhu et al., "Very large-scale global SfM by distributed motion averaging", CVPR
+2018.
 """
 
 import resource

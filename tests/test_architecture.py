@@ -29,6 +29,7 @@ LAYERS = [
     "epipolar",
     "rotations",
     "placement",
+    "partitioned",
     "body_placement",
     "gauge",
     "evaluation",
