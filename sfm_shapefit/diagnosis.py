@@ -149,6 +149,8 @@ class Inspection:
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         facts = asdict(self)
+        if self.expected is not None:
+            facts["expected"] |= {"peak_mb": self.expected.peak_mb, "total_s": self.expected.total_s}
         if self.theory is not None and self.theory.conditions is not None:
             conditions = self.theory.conditions
             facts["theory"]["conditions"] |= {

@@ -5,7 +5,6 @@ import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
-from sfm_shapefit.robust import uncertainty
 from sfm_shapefit.robust.shared_noise import sample_direction_errors
 from sfm_shapefit.robust.uncertainty import propagate
 from sfm_shapefit.solver.program import differences
@@ -75,10 +74,10 @@ def test_points_are_judged_with_the_cameras_but_do_not_hold_the_gauge():
     assert np.isfinite(found.sigmas).all()
 
 
-def test_a_factor_beyond_the_limit_is_not_tried(monkeypatch):
+def test_a_factor_beyond_the_limit_is_not_tried():
     problem = box_graph_problem(40, 12.0, seed=5)
-    monkeypatch.setattr(uncertainty, "_MAX_BYTES", 1000)
-    assert propagate(problem.locations, problem.edges, isotropic(len(problem.edges))) is None
+    given = problem.locations, problem.edges, isotropic(len(problem.edges))
+    assert propagate(*given, max_bytes=1000) is None
 
 
 def test_independent_samples_scatter_like_the_inverse():
