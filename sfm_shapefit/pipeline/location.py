@@ -93,6 +93,8 @@ def locate(
         min_triangulation_angle_deg     1.5         filter of points
         bundle_adjust                   False       adjust poses and points; intrinsics stay
         min_trust                       0.6         cameras of less trust are left out; 0 keeps all
+        factor_memory                   2000        MB that one sparse factor may take, or it is left out
+        max_memory                      0           peak memory in MB to stay below; 0 for no limit
         threads                         0           one per core; the answer does not depend on it
 
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
