@@ -19,7 +19,7 @@ _UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
 
 def quality_warnings(placement: Placement) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if placement.solve.status is Status.NOT_SOLVED:
+    if not placement.solve.status.has_certificate:
         yield placement.solve.status.value
     elif placement.solve.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"
