@@ -68,6 +68,9 @@ class Report:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first case: to go on where a run ended"
+    )
     parser.add_argument("--only", type=int, help="run this case alone, and keep its folder")
     parser.add_argument("--work", type=Path, help="where cases are made; a temporary folder by default")
 
@@ -78,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         work = (args.work or Path(temporary)).resolve()
         base = make_base(work / "base")
         expected = warm(base)
-        numbers = range(args.cases) if args.only is None else [args.only]
+        numbers = range(args.first, args.first + args.cases) if args.only is None else [args.only]
         start = time.perf_counter()
         codes: collections.Counter[tuple[str, int]] = collections.Counter()
         slowest = largest = failed = 0.0
