@@ -195,7 +195,8 @@ class MatchDatabase:
         rows, cols, data = row
         if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
-        xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
         if not np.isfinite(xy).all():
             raise InputError(
                 f"{self.path}: image {name} has a keypoint that is not finite; extract them again"
