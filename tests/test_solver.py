@@ -11,6 +11,7 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     across,
     adjoint,
+    along,
     differences,
     normalized_locations,
     objective,
@@ -61,6 +62,21 @@ def test_exact_directions_have_objective_zero():
     assert result.objective < 1e-10
     assert result.dual_bound == pytest.approx(0.0, abs=1e-10)
     assert np.linalg.norm(shape(result.locations) - truth) < 1e-8
+
+
+def test_objective_and_lengths_are_those_of_the_formulas():
+    drawn = random_graph_problem(9, 0.8, d=3, sigma=0.1, q=0.2, seed=3)
+    weights = np.random.default_rng(3).uniform(0.2, 3.0, len(drawn.edges))
+    graph, v = ViewGraph(9, drawn.edges, drawn.directions, weights), drawn.directions
+    baselines = differences(drawn.locations, drawn.edges)
+    lengths = np.sum(baselines * v, axis=1)
+    np.testing.assert_allclose(along(baselines, v), lengths, rtol=1e-13)
+    residuals = np.linalg.norm(baselines - lengths[:, None] * v, axis=1)
+    assert projected_length(graph, drawn.locations) == pytest.approx(weights @ lengths, rel=1e-13)
+    expected = weights @ residuals / (weights @ lengths)
+    assert objective(graph, drawn.locations) == pytest.approx(expected, rel=1e-13)
+    assert objective(graph, -drawn.locations) == np.inf  # all pairs point the wrong way
+    assert objective(graph, np.zeros_like(drawn.locations)) == np.inf
 
 
 @settings(max_examples=25, deadline=None)
