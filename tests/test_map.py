@@ -137,6 +137,13 @@ UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RE
         (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
         (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
         (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
+        ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
+        (
+            "ALTER TABLE cameras RENAME TO c; CREATE VIEW cameras AS WITH RECURSIVE n(x) AS "
+            "(VALUES (1) UNION ALL SELECT x + 1 FROM n) SELECT x AS camera_id, 1 AS model, 1 AS width, "
+            "1 AS height, x'' AS params, 1 AS prior_focal_length FROM n",
+            "its cameras is a view",
+        ),
         (
             "UPDATE images SET camera_id = 7 WHERE image_id = 2",
             "image with id 2 has no valid name and camera",

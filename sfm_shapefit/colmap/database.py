@@ -118,9 +118,12 @@ def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -
         queries: what to select, by the columns of `table` that it needs.
 
     Raises:
-        InputError: if the file is missing, is no sqlite database, is locked or damaged.
+        InputError: if the file is missing, is no sqlite database, is locked or damaged, or if the rows of
+            the table, or of images, which queries join, are computed.
     """
     with _sqlite_errors(path), _readonly_connection(path) as connection:
+        for stored in (table, "images"):
+            _refuse_computed(path, connection, stored)
         columns = _columns(connection, table)
         for needed, query in queries.items():
             if columns.issuperset(needed):

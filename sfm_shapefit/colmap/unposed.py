@@ -62,6 +62,8 @@ def read_images(path: Path) -> UnposedImages:
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
+        if any("\ud800" <= letter <= "\udfff" for letter in name):  # what is no UTF-8 is read as these
+            raise InputError(f"{path}: the name {name!r} of an image is no UTF-8; rename that image")
         if model.exists_image(image_id):
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
