@@ -7,9 +7,9 @@ from graph_families import FAMILIES
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.solver import certificate
+from sfm_shapefit.solver import certificate, hybrid
 from sfm_shapefit.solver.admm import solve_admm
-from sfm_shapefit.solver.admm.linear import IterativeSolver
+from sfm_shapefit.solver.admm.linear import IterativeSolver, laplacian_factor
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_sparse
@@ -259,13 +259,16 @@ def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
-def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
+def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
     graph = drawn("seq", 300, 36, q=0.1)
     result = solve_hybrid(graph, 1e-8, 2000)
     assert result.finish is Finish.NEWTON
     assert result.factorisations > 0
     assert result.certificate.gap <= 1e-8
     assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).finish is Finish.TOO_LARGE
+    flops = laplacian_factor(graph).symbolic.flops  # of one scalar factor; blocks of 3 take 27 times as many
+    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 20.0 * flops)
+    assert solve_hybrid(graph, 1e-8, 2000).finish is Finish.TOO_LARGE
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
