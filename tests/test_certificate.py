@@ -7,9 +7,9 @@ from graph_families import FAMILIES
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.solver import certificate
+from sfm_shapefit.solver import certificate, hybrid
 from sfm_shapefit.solver.admm import solve_admm
-from sfm_shapefit.solver.admm.linear import IterativeSolver
+from sfm_shapefit.solver.admm.linear import IterativeSolver, laplacian_factor
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_sparse
@@ -154,6 +154,71 @@ def test_exact_directions_need_no_more_than_the_zero_dual(n):
         assert certificate.equality_residual <= 1e-12
 
 
+def random_metric(d):
+    """Return a metric of 9 cameras whose dual lies inside some balls, on some and outside of others."""
+    rng = np.random.default_rng(d)
+    edges = np.array([(i, j) for i in range(9) for j in range(i)])[rng.permutation(36)[:20]]
+    v, y = rng.standard_normal((2, 20, d))
+    v /= np.linalg.norm(v, axis=1, keepdims=True)
+    y -= np.sum(y * v, axis=1, keepdims=True) * v
+    w, stiffness = rng.uniform(0.5, 2.0, (2, 20))
+    norms = np.repeat([0.3, 0.995, 1.7, 5.0], 5) * w
+    y *= (norms / np.linalg.norm(y, axis=1))[:, None]
+    normal = np.where(np.arange(20) % 2, np.sqrt(0.97) / norms, 0.0)
+    metric = certificate._Metric(edges, v, w, stiffness, y, normal, tuple(range(d)))
+    incidence = np.zeros((20, 9))
+    incidence[np.arange(20), edges[:, 0]], incidence[np.arange(20), edges[:, 1]] = 1.0, -1.0
+    return metric, incidence, rng
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_clipping_shortens_the_dual_to_its_balls_and_names_their_normals(d):
+    metric, _, _ = random_metric(d)
+    norms = np.linalg.norm(metric.y, axis=1)
+    clipped = metric.y * np.minimum(1.0, metric.w / norms)[:, None]
+    certificate._clip(metric)
+    np.testing.assert_allclose(metric.y, clipped, rtol=1e-14)
+    surface = np.sqrt(0.97) / np.linalg.norm(clipped, axis=1)
+    np.testing.assert_allclose(metric.normal, np.where(norms > 0.99 * metric.w, surface, 0.0), rtol=1e-14)
+
+
+@pytest.mark.parametrize("d", [2, 3, 5])
+def test_a_step_moves_the_dual_by_the_metric_and_leaves_it_orthogonal(d):
+    metric, incidence, rng = random_metric(d)
+    h, y, v = rng.standard_normal((9, d)), metric.y.copy(), metric.v
+    moved = incidence @ h
+    flat = moved - np.sum(moved * v, axis=1, keepdims=True) * v
+    u = metric.normal[:, None] * y
+    step = metric.stiffness[:, None] * (flat - np.sum(flat * u, axis=1, keepdims=True) * u)
+    total = np.empty((9, d))
+    certificate._apply(metric, 0, 20, h, total)
+    np.testing.assert_allclose(total, incidence.T @ step, atol=1e-13)
+
+    metric.y[:] += 1e-3 * v  # what rounding might have left along v goes, too
+    y += 1e-3 * v
+    along_y = np.sum(moved * y, axis=1) * metric.normal**2
+    expected = y - metric.stiffness[:, None] * (flat - along_y[:, None] * y)
+    worst = certificate._move(metric, h)
+    np.testing.assert_allclose(metric.y, expected - np.sum(expected * v, axis=1)[:, None] * v, atol=1e-13)
+    assert np.abs(np.sum(metric.y * v, axis=1)).max() < 1e-14
+    assert worst == pytest.approx(np.max(np.linalg.norm(metric.y, axis=1) / metric.w), rel=1e-14)
+
+
+@pytest.mark.parametrize("size", [0.2, 1.0])
+def test_projecting_a_dual_tells_its_sums_and_how_far_it_is_outside(size):
+    metric, incidence, rng = random_metric(3)
+    v, w = metric.v, metric.w
+    y = size * w[:, None] * rng.uniform(-0.5, 0.5, (20, 3)) + rng.standard_normal((20, 1)) * v
+    flat = y - np.sum(y * v, axis=1, keepdims=True) * v
+    c, total, degrees = np.zeros((9, 3)), np.zeros((9, 3)), np.zeros(9)
+    worst = certificate._project(metric.edges, v, w, y, c, total, degrees)
+    np.testing.assert_allclose(y, flat, atol=1e-14)
+    np.testing.assert_allclose(c, incidence.T @ (w[:, None] * v), atol=1e-14)
+    np.testing.assert_allclose(total, incidence.T @ flat, atol=1e-14)
+    np.testing.assert_allclose(degrees, np.abs(incidence).T @ w, rtol=1e-14)
+    assert worst == pytest.approx(np.max(np.linalg.norm(flat, axis=1) / w), rel=1e-12)
+
+
 def test_a_graph_in_two_pieces_is_refused():
     graph, t = complete(5)
     edges = np.concatenate([graph.edges, graph.edges + 5])
@@ -194,13 +259,16 @@ def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
-def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
+def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
     graph = drawn("seq", 300, 36, q=0.1)
     result = solve_hybrid(graph, 1e-8, 2000)
     assert result.finish is Finish.NEWTON
     assert result.factorisations > 0
     assert result.certificate.gap <= 1e-8
     assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).finish is Finish.TOO_LARGE
+    flops = laplacian_factor(graph).symbolic.flops  # of one scalar factor; blocks of 3 take 27 times as many
+    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 20.0 * flops)
+    assert solve_hybrid(graph, 1e-8, 2000).finish is Finish.TOO_LARGE
 
 
 def test_the_hybrid_ends_where_it_is_told_to():

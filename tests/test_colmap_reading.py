@@ -841,6 +841,10 @@ BROKEN_ROWS = {
         "UPDATE keypoints SET data = CAST(x'0000c07f' || substr(data, 5) AS BLOB)",
         "not finite",
     ),
+    "signalling NaN keypoint": (
+        "UPDATE keypoints SET data = CAST(x'0100807f' || substr(data, 5) AS BLOB)",
+        "not finite",
+    ),
     "no table": ("DROP TABLE keypoints", "has no table keypoints"),
     "no column": ("ALTER TABLE two_view_geometries DROP COLUMN config", "no column config in its table two_"),
     "no images": ("DELETE FROM images", "has no images"),

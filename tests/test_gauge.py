@@ -228,6 +228,8 @@ def test_latitudes_and_longitudes_become_metres_east_north_up(ring, tmp_path):
         ("0003.jpg 1 2", "line 2: expected a name"),
         ("0003.jpg 1 2 x", "line 2: expected a name"),
         ("0003.jpg 1 2 nan", "line 2: coordinates must be finite"),
+        ("0003.jpg 1 2 1e308", "line 2: coordinates must be finite .* below 1e"),
+        ("0003.jpg 1 2 3 1e-200", "line 2: coordinates must be finite and standard deviations positive"),
         ("0003.jpg 1 2 3 -1", "line 2: coordinates must be finite and standard deviations positive"),
         ("0001.jpg 1 2 3", "line 2: 0001.jpg stands twice"),
     ],

@@ -124,11 +124,26 @@ def test_guessed_focal_lengths_are_told(tmp_path):
     assert any("1 cameras have a guessed focal length" in warning for warning in found.warnings)
 
 
+UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RENAME TO {0};"
+
+
 @pytest.mark.parametrize(
     ("statement", "message"),
     [
         ("UPDATE cameras SET params = x'00'", "camera with id 1 is damaged"),
         ("UPDATE cameras SET model = 99", "has the model 99, which pycolmap does not know"),
+        ("UPDATE cameras SET height = -1", "camera with id 1 is damaged"),
+        ("UPDATE cameras SET camera_id = 4294967295", "camera with id 4294967295 is damaged"),
+        (UNTYPED.format("cameras") + "INSERT INTO cameras SELECT * FROM cameras", "camera 1 stands twice"),
+        (UNTYPED.format("images") + "INSERT INTO images SELECT * FROM images", "id 1 stands twice"),
+        (UNTYPED.format("images") + "UPDATE images SET camera_id = 'x'", "no valid name and camera"),
+        ("UPDATE images SET name = CAST(x'ff41' AS TEXT) WHERE image_id = 2", r"'\\udcffA' .* is no UTF-8"),
+        (
+            "ALTER TABLE cameras RENAME TO c; CREATE VIEW cameras AS WITH RECURSIVE n(x) AS "
+            "(VALUES (1) UNION ALL SELECT x + 1 FROM n) SELECT x AS camera_id, 1 AS model, 1 AS width, "
+            "1 AS height, x'' AS params, 1 AS prior_focal_length FROM n",
+            "its cameras is a view",
+        ),
         (
             "UPDATE images SET camera_id = 7 WHERE image_id = 2",
             "image with id 2 has no valid name and camera",
@@ -138,7 +153,7 @@ def test_guessed_focal_lengths_are_told(tmp_path):
 )
 def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, message):
     with pytest.raises(InputError, match=message):
-        sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", statement))
+        sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
 
 
 # --- averaging ---------------------------------------------------------------------------------------

@@ -219,6 +219,41 @@ def test_the_shortcuts_change_nothing(dimension, span, monkeypatch):
         np.testing.assert_array_equal(plain, label)
 
 
+def random_pairs(rng, n, m):
+    """Return m different pairs of n cameras, each in a random order."""
+    pairs = rng.permutation(np.array(complete(range(n))))[:m]
+    return np.where(rng.random((m, 1)) < 0.5, pairs, pairs[:, ::-1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_edges_are_joined_by_triangles_exactly_where_a_chain_of_them_leads(seed):
+    n, m = 12, 22
+    edges = random_pairs(np.random.default_rng(seed), n, m)
+    number = {frozenset(pair): e for e, pair in enumerate(edges.tolist())}
+    chain = np.arange(m)
+    for triangle in itertools.combinations(range(n), 3):
+        sides = [number.get(frozenset(pair), -1) for pair in complete(triangle)]
+        if min(sides) >= 0:
+            chain[np.isin(chain, chain[sides])] = chain[sides].min()
+    np.testing.assert_array_equal(chain, rigidity._triangle_bodies(n, edges))
+    assert 1 < len(np.unique(chain)) < m
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
+    n = 10
+    edges = random_pairs(np.random.default_rng(seed), n, 18 + seed)
+    members = set(edges[0].tolist())
+    for _ in range(n):
+        for camera in range(n):
+            partners = {int(i + j - camera) for i, j in edges if camera in (i, j)}
+            members |= {camera} if len(partners & members) >= 2 else set()
+    assert rigidity._grows_from_first_pair(n, edges) == (len(members) == n)
+    fan = np.array([(0, 1), *((i, k) for k in range(2, n) for i in (k - 2, k - 1))])
+    assert rigidity._grows_from_first_pair(n, fan)
+    assert not rigidity._grows_from_first_pair(n + 1, fan)
+
+
 def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():
     """A flat grid of squares, in 3D: each square is a rigid 4-cycle, and neighbours share two cameras."""
     side = 40
@@ -341,6 +376,7 @@ def test_a_rigid_graph_leaves_nobody_out_and_an_empty_one_everybody():
     assert left_out_reasons(empty, []) == {0: "no pair", 1: "no pair"}
     assert not is_parallel_rigid(2, empty.edges, 3)
     assert is_parallel_rigid(1, empty.edges, 3)
+    assert not is_parallel_rigid(0, empty.edges, 3)
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     across,
     adjoint,
+    along,
     differences,
     normalized_locations,
     objective,
@@ -61,6 +62,21 @@ def test_exact_directions_have_objective_zero():
     assert result.objective < 1e-10
     assert result.dual_bound == pytest.approx(0.0, abs=1e-10)
     assert np.linalg.norm(shape(result.locations) - truth) < 1e-8
+
+
+def test_objective_and_lengths_are_those_of_the_formulas():
+    drawn = random_graph_problem(9, 0.8, d=3, sigma=0.1, q=0.2, seed=3)
+    weights = np.random.default_rng(3).uniform(0.2, 3.0, len(drawn.edges))
+    graph, v = ViewGraph(9, drawn.edges, drawn.directions, weights), drawn.directions
+    baselines = differences(drawn.locations, drawn.edges)
+    lengths = np.sum(baselines * v, axis=1)
+    np.testing.assert_allclose(along(baselines, v), lengths, rtol=1e-13)
+    residuals = np.linalg.norm(baselines - lengths[:, None] * v, axis=1)
+    assert projected_length(graph, drawn.locations) == pytest.approx(weights @ lengths, rel=1e-13)
+    expected = weights @ residuals / (weights @ lengths)
+    assert objective(graph, drawn.locations) == pytest.approx(expected, rel=1e-13)
+    assert objective(graph, -drawn.locations) == np.inf  # all pairs point the wrong way
+    assert objective(graph, np.zeros_like(drawn.locations)) == np.inf
 
 
 @settings(max_examples=25, deadline=None)
@@ -278,6 +294,44 @@ def test_auto_says_what_it_chose_and_why():
     assert sparse.method == "newton"
     assert "Gflop for a sparse factor" in sparse.method_reason
     assert solve(box(60), SolverOptions(method="admm", tol=1e-3)).method_reason == "asked for"
+
+
+def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
+    from sfm_shapefit.solver import solve as module
+
+    def chosen(graph, method="auto"):
+        choice = module.choose_method(graph, SolverOptions(method=method))
+        run = getattr(choice.run, "func", choice.run)
+        return choice.method, run.__name__, choice.reason, getattr(choice.run, "keywords", {})
+
+    sparse, clique = box(300), problem(1, n=160, p=0.5)[0]
+    assert chosen(problem(15)[0])[:3] == ("newton", "_run_dense", "60 unknowns: dense")
+    assert chosen(clique)[:3] == ("newton", "_run_dense", "480 unknowns, dense graph")
+    assert chosen(sparse)[:2] == ("newton", "_run_sparse")
+    assert chosen(sparse, "newton")[:3] == ("newton", "_run_sparse", "asked for")
+    assert chosen(sparse, "conic")[:3] == ("conic", "_run_conic", "asked for")
+    assert chosen(sparse, "admm")[:3] == ("admm", "_run_admm", "asked for")
+    prediction = chosen(sparse)[3]["prediction"]
+    flops = prediction.flops * 27
+    assert chosen(sparse)[2] == f"{flops / 1e9:.2g} Gflop for a sparse factor"
+
+    monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", 0.99 * flops)
+    assert chosen(sparse)[:2] == ("admm", "_run_admm")
+    assert "splitting is faster" in chosen(sparse)[2]
+    assert chosen(sparse, "newton")[:2] == ("newton", "_run_sparse")
+    monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", flops)
+    assert chosen(sparse)[:2] == ("newton", "_run_sparse")
+
+    seen = []
+
+    def solved(*_, tree):
+        seen.append(tree)
+        return None, None, 0
+
+    monkeypatch.setattr(module, "solve_newton_sparse", solved)
+    module._run_sparse(sparse, SolverOptions(), 1, None, prediction)
+    module._run_sparse(sparse, SolverOptions(), 1, None)
+    assert seen == [prediction.tree, None]
 
 
 def test_auto_leaves_newton_where_its_factor_would_explode(monkeypatch):

@@ -20,7 +20,7 @@ _COLUMNS = {
     "keypoints": ("image_id", "rows", "cols", "data"),
     "two_view_geometries": ("pair_id", "rows", "cols", "data", "config", "qvec", "tvec"),
 }
-_ODD_VALUES = (
+ODD_VALUES = (
     None,
     -1,
     0,
@@ -141,7 +141,7 @@ def odd_values(path: Path, rng: Generator) -> bool:
         connection.execute(f"DROP TABLE {table}")
         connection.execute(f"ALTER TABLE untyped RENAME TO {table}")
         for _ in range(int(rng.integers(1, 4))):
-            column, value = str(pick(rng, _COLUMNS[table])), pick(rng, _ODD_VALUES)
+            column, value = str(pick(rng, _COLUMNS[table])), pick(rng, ODD_VALUES)
             only = pick(rng, ("", " WHERE rowid % 2", f" WHERE rowid = {int(rng.integers(1, 7))}"))
             connection.execute(f"UPDATE {table} SET {column} = ?{only}", (value,))
         if rng.random() < 0.3:

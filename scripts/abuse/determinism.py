@@ -1,4 +1,4 @@
-"""The same answer, byte by byte, for any number of threads, hash seed and repetition, and any order of input.
+"""The same answer, byte by byte, for any threads, executor, hash seed and repetition, and any order of input.
 
 Reordered input has the same images, matches and points under other ids and in another order: positions must
 agree to 1e-12 of the extent.
@@ -45,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
         with tempfile.TemporaryDirectory() as temporary:
             work = Path(temporary)
             different = list(differing_files(scene, work))
+            if (scene / "database.db").exists():
+                different += [f"map, {name}" for name in differing_files(scene, work / "map", command="map")]
             worst = max(
                 (
                     reordered_difference(scene, work, seed)
@@ -65,27 +67,31 @@ def run(args: argparse.Namespace) -> int:
 VARIANTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     "again": (("--threads", "1"), {"PYTHONHASHSEED": "0"}),
     "two threads": (("--threads", "2"), {"PYTHONHASHSEED": "0"}),
-    "hash seed 1": (("--threads", "1"), {"PYTHONHASHSEED": "1"}),
     "hash seed 4242, two threads": (("--threads", "2"), {"PYTHONHASHSEED": "4242"}),
+    "two processes": (("--threads", "2", "--executor", "processes"), {"PYTHONHASHSEED": "random"}),
 }
 
 
-def differing_files(scene: Path, work: Path) -> Iterator[str]:
-    """Yield which file differs in which variant of the run."""
-    first = contents(_located(scene, work / "first", ("--threads", "1"), {"PYTHONHASHSEED": "0"}))
+def differing_files(scene: Path, work: Path, command: str = "locate") -> Iterator[str]:
+    """Yield which file differs in which variant of the run, of those that the command has."""
+    once = {"PYTHONHASHSEED": "0"}
+    first = contents(_run(command, scene, work / "first", ("--threads", "1"), once))
     for name, (flags, environment) in VARIANTS.items():
-        other = contents(_located(scene, work / "other", flags, environment))
+        if command == "map" and "--executor" in flags:
+            continue
+        other = contents(_run(command, scene, work / "other", flags, environment))
         yield from (f"{name}: {file}" for file in sorted(first | other) if first.get(file) != other.get(file))
         shutil.rmtree(work / "other")
 
 
 def contents(out: Path) -> dict[str, object]:
-    """Return the bytes of every file of an output, and of locate.json all but times and threads."""
+    """Return the bytes of every file of an output, and of JSON files all but times and threads."""
     found: dict[str, object] = {
         str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()
     }
-    facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
-    found["locate.json"] = _without_times(facts)
+    for path in out.rglob("*.json"):
+        facts = json.loads(path.read_text(encoding="utf-8"))
+        found[str(path.relative_to(out))] = _without_times(facts)
     return found
 
 
@@ -96,19 +102,13 @@ def _without_times(value: Any) -> Any:
     return [_without_times(item) for item in value] if isinstance(value, list) else value
 
 
-def _located(scene: Path, out: Path, flags: tuple[str, ...], environment: dict[str, str]) -> Path:
-    command = [
-        sys.executable,
-        "-m",
-        "sfm_shapefit.cli",
-        "locate",
-        str(scene / "sparse" / "0"),
-        str(out),
-        "-q",
-        "--no-report",  # whose page shows how long each stage took
-    ]
+def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environment: dict[str, str]) -> Path:
+    """Run a command on a scene, without the report, whose page shows how long each stage took."""
+    source = scene / "sparse" / "0" if command == "locate" else scene / "database.db"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    words = (command, str(source), str(out), "-q", "--no-report", *flags)
     subprocess.run(
-        [*command, *flags],
+        [sys.executable, "-m", "sfm_shapefit.cli", *words],
         env={**os.environ, "PYTHONPATH": str(_PROJECT), **environment},
         cwd=_PROJECT,
         check=True,

@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from abuse import databases, mutations
+from abuse import databases, mutations, strangers
 from abuse.layouts import binary_fields
 from abuse.sandbox import Outcome, run_forked
 from abuse.verdicts import (
@@ -68,6 +68,9 @@ class Report:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cases", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument(
+        "--first", type=int, default=0, help="number of the first case: to go on where a run ended"
+    )
     parser.add_argument("--only", type=int, help="run this case alone, and keep its folder")
     parser.add_argument("--work", type=Path, help="where cases are made; a temporary folder by default")
 
@@ -78,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         work = (args.work or Path(temporary)).resolve()
         base = make_base(work / "base")
         expected = warm(base)
-        numbers = range(args.cases) if args.only is None else [args.only]
+        numbers = range(args.first, args.first + args.cases) if args.only is None else [args.only]
         start = time.perf_counter()
         codes: collections.Counter[tuple[str, int]] = collections.Counter()
         slowest = largest = failed = 0.0
@@ -114,7 +117,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def make_base(folder: Path) -> Path:
-    """Write a small sound scene in every form that is read: binary, without rigs, text, database, graph."""
+    """Write a small sound scene in every form that is read, of COLMAP and of others."""
     import pycolmap
 
     from sfm_shapefit.colmap.workspace import write_workspace
@@ -128,6 +131,8 @@ def make_base(folder: Path) -> Path:
         (folder / name).mkdir()
     model.write_text(folder / "text")
     model.write_binary(folder / "truth")
+    strangers.write_models(model, folder)
+    strangers.write_tables(model, folder)
     shutil.copytree(folder / "sparse" / "0", folder / "old")
     for name in ("rigs", "frames"):
         (folder / "old" / f"{name}.bin").unlink()
@@ -152,17 +157,26 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
         _command("locate", str(base / form), str(out), *extra, "--threads", "1", "-q")
         expected["database" if extra else form] = positions(out)
         shutil.rmtree(out)
+    again = ("locate", str(base / "old"), str(out), *database, "--overwrite", "-q")
     poses = (*database, "--directions", "relative-poses")
     for command in (
         ("locate", str(base / "old"), str(out), *poses, "--threads", "1", "-q"),
         ("locate", str(base / "old"), str(out), "--bundle-adjust", "--overwrite", "--threads", "1", "-q"),
-        ("locate", str(base / "old"), str(out), *database, "--overwrite", "--refine-rotations", "-q"),
+        (*again, "--refine-rotations"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
+        ("locate", str(base / "openmvg/sfm_data.json"), str(out), "--overwrite", "--threads", "1", "-q"),
+        (*again, "--priors", str(base / "priors.txt"), "--refine-with-priors"),
+        (*again, "--fix", str(base / "fix.txt")),
     ):
         _command(*command)
     shutil.rmtree(out)
-    for command in (("evaluate", str(base / "old"), str(base / "truth")), ("inspect", str(base / "old"))):
+    for command in (
+        ("evaluate", str(base / "opensfm/reconstruction.json"), str(base / "truth")),
+        ("inspect", str(base / "bundler/bundle.out")),
+        ("map", str(base / "database.db"), str(out), "--threads", "1", "-q"),
+    ):
         _command(*command)
+    shutil.rmtree(out)
     return expected
 
 
@@ -241,21 +255,30 @@ def _judge(
     if changed:
         yield f"changed its input {changed[0]}"
     new = sorted({Path(name).parts[0] for name in after.keys() - before.keys()})
-    writes = outcome.code == 0 and case.arguments[0] in ("locate", "solve")
-    if new != (["out"] if writes else []):
+    writes = outcome.code == 0 and case.arguments[0] in ("locate", "solve", "map", "convert")
+    if new != ([case.arguments[2]] if writes else []):
         yield f"left {', '.join(new) or 'nothing'} behind"
     strays = [name for name in after if name.startswith("tmp/")]
     if strays:
         yield f"left {strays[0]} behind"
-    if writes and (folder / "out").is_dir():
-        yield from faults_of_tables(folder / "out")
-        if case.arguments[0] == "locate":
-            yield from faults_of_model(folder / "out")
+    for out in _outputs(case, folder) if writes else ():
+        if case.arguments[0] != "convert":
+            yield from faults_of_tables(out)
+        if case.arguments[0] != "solve":
+            yield from faults_of_model(out)
     if case.same_answer:
         if outcome.code:
             yield f"refused what is sound: {outcome.stderr[:300]!r}"
         elif differs(positions(folder / "out"), expected[_form(case)]):
             yield "another answer"
+
+
+def _outputs(case: Case, folder: Path) -> list[Path]:
+    """Return the folders with a model or tables that a command wrote."""
+    out = folder / case.arguments[2]
+    if not out.is_dir():
+        return []
+    return [path for path in sorted(out.iterdir()) if path.is_dir()] if case.arguments[0] == "map" else [out]
 
 
 def _form(case: Case) -> str:
@@ -419,6 +442,13 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     return Case(label=f"records: {name}", arguments=_used("sparse/0", rng, database=False))
 
 
+def _of_others(base: Path, folder: Path, rng: Generator) -> Case:
+    """What other programs and people write."""
+    ways = (strangers.damaged_stranger, strangers.damaged_database, strangers.damaged_table)
+    label, arguments = mutations.pick(rng, ways)(base, folder, rng)
+    return Case(label=label, arguments=arguments, encoding=_encoding(rng))
+
+
 def _record_starts(name: str, data: bytes) -> list[int]:
     """Return where the records of a sound binary file start: at their ids, all of one kind."""
     return [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
@@ -426,5 +456,5 @@ def _record_starts(name: str, data: bytes) -> list[int]:
 
 _KINDS: tuple[Callable[[Path, Path, Generator], Case], ...] = (
     *(_binary, _binary, _binary, _text, _text, _database, _database, _database, _graph, _graph),
-    *(_names, _place, _several),
+    *(_names, _place, _several, _of_others, _of_others, _of_others, _of_others),
 )

@@ -57,7 +57,7 @@ def soak(base: Path, calls: int, *, show: bool = False) -> list[str]:
     if max(descriptors) != min(descriptors):
         problems.append(f"open files went from {descriptors[0]} to {descriptors[-1]}")
     if show:
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
         print(
             f"{calls} calls: resident {sizes[0] / 1e6:.1f} MB at first, {sizes[-1] / 1e6:.1f} MB at last "
             f"(median of quarters grew by {growth / 1e6:.2f} MB), peak "

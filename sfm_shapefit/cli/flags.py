@@ -113,9 +113,12 @@ def options_from(options_type: type[Options], given: dict[str, Any], config: Pat
 
 def _read_toml(path: Path, known: set[str]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options."""
+    from sfm_shapefit.formats import refuse_irregular_file
+
+    refuse_irregular_file(path)
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     for name in values:
         if name not in known:

@@ -118,9 +118,12 @@ def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -
         queries: what to select, by the columns of `table` that it needs.
 
     Raises:
-        InputError: if the file is missing, is no sqlite database, is locked or damaged.
+        InputError: if the file is missing, is no sqlite database, is locked or damaged, or if the rows of
+            the table, or of images, which queries join, are computed.
     """
     with _sqlite_errors(path), _readonly_connection(path) as connection:
+        for stored in (table, "images"):
+            _refuse_computed(path, connection, stored)
         columns = _columns(connection, table)
         for needed, query in queries.items():
             if columns.issuperset(needed):
@@ -195,7 +198,8 @@ class MatchDatabase:
         rows, cols, data = row
         if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
-        xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN
+            xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
         if not np.isfinite(xy).all():
             raise InputError(
                 f"{self.path}: image {name} has a keypoint that is not finite; extract them again"

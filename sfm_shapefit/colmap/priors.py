@@ -25,6 +25,7 @@ _WGS84, _CARTESIAN = 0, 1
 _SENSOR_IS_CAMERA = 0
 _TABLE_COLUMNS = (4, 5, 7)  # name and position, and one standard deviation or three
 _GEODETIC_NAMES = {"lat", "latitude"}
+_LARGEST = 1e30  # coordinate or standard deviation: sums of squares of squares must not overflow
 
 
 def database_priors(path: Path, model: PosedModel) -> PositionPriors:
@@ -42,7 +43,7 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
     for name, position, covariance, system in _prior_rows(path):
         index = index_of_name.get(name)
         xyz = _numbers(path, name, position, 3)
-        if index is None or system not in (_WGS84, _CARTESIAN) or not np.isfinite(xyz).all():
+        if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():
             continue
         found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3), system
     if not found:
@@ -145,9 +146,10 @@ def _parsed(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, Floa
             "or three"
         )
     values = np.array([float(cell) for cell in cells[1:]])
-    if not np.isfinite(values).all() or (values[3:] <= 0.0).any():
+    if not (np.abs(values) <= _LARGEST).all() or (values[3:] < 1.0 / _LARGEST).any():
         raise InputError(
-            f"{path}, line {number}: coordinates must be finite and standard deviations positive"
+            f"{path}, line {number}: coordinates must be finite and standard deviations positive, "
+            f"all below {_LARGEST:g}"
         )
     variances = np.broadcast_to(values[3:] ** 2 if len(values) > 3 else np.nan, 3)
     return values[:3], np.diag(variances) if len(values) > 3 else np.full((3, 3), np.nan)

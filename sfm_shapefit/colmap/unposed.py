@@ -12,8 +12,11 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.database import readonly_rows
+from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.errors import InputError
+
+_NO_ID = 2**32 - 1  # COLMAP's ids are 32-bit, and this one is none
+_LARGEST_SIDE = 2**31  # of an image, in px
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,12 +52,20 @@ def read_images(path: Path) -> UnposedImages:
         )
     model = pycolmap.Reconstruction()
     for row in cameras:
-        model.add_camera_with_trivial_rig(_camera(path, row))
+        camera = _camera(path, row)
+        if model.exists_camera(camera.camera_id):
+            raise InputError(f"{path}: camera {camera.camera_id} stands twice; remove one of them")
+        model.add_camera_with_trivial_rig(camera)
     for image_id, name, camera_id in images:
-        if not (isinstance(image_id, int) and isinstance(name, str) and model.exists_camera(camera_id)):
+        is_sound = _is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
+        if not (is_sound and _is_between(camera_id, 0, _NO_ID) and model.exists_camera(camera_id)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
+        if any("\ud800" <= letter <= "\udfff" for letter in name):  # what is no UTF-8 is read as these
+            raise InputError(f"{path}: the name {name!r} of an image is no UTF-8; rename that image")
+        if model.exists_image(image_id):
+            raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
     used = {row[2] for row in images}
@@ -86,10 +97,16 @@ def rotations_of(model: pycolmap.Reconstruction, image_ids: list[int]) -> tuple[
     return rotations, posed
 
 
+def _is_between(value: object, least: int, bound: int) -> bool:
+    """Return whether a value of a row is an integer from `least` to below `bound`."""
+    return isinstance(value, int) and least <= value < bound
+
+
 def _camera(path: Path, row: tuple[object, ...]) -> pycolmap.Camera:
     """Return the camera of a row of the table cameras."""
     camera_id, model_id, width, height, params, prior = row
-    sound = all(isinstance(value, int) for value in (camera_id, model_id, width, height))
+    sizes = _is_between(width, 0, _LARGEST_SIDE) and _is_between(height, 0, _LARGEST_SIDE)
+    sound = _is_between(camera_id, 0, _NO_ID) and isinstance(model_id, int) and sizes
     if not (sound and isinstance(params, bytes) and len(params) % 8 == 0):
         raise InputError(f"{path}: the camera with id {camera_id!r} is damaged; extract features again")
     values = np.frombuffer(params, dtype="<f8")

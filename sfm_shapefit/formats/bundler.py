@@ -24,6 +24,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import text_of
 from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile, is_rotation
 
 _HEADER = "# Bundle file v0.3"
@@ -102,11 +103,7 @@ class _Words:
 
     @classmethod
     def of(cls, file: Path) -> "_Words":
-        try:
-            text = file.read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{file} is not a readable text file ({error})") from error
-        first, _, rest = text.partition("\n")
+        first, _, rest = text_of(file).partition("\n")
         if first.strip() != _HEADER:
             raise InputError(f"{file}, line 1: expected {_HEADER!r}; other versions are not read")
         words, lines = [], []
@@ -194,11 +191,7 @@ def _names(file: Path, count: int) -> list[str]:
         file.with_name("list.txt"),
     ):
         if candidate.is_file():
-            try:
-                lines = candidate.read_text(encoding="utf-8").splitlines()
-            except (OSError, UnicodeDecodeError) as error:
-                raise InputError(f"{candidate} is not a readable text file ({error})") from error
-            names = [line.split()[0] for line in lines if line.split()]
+            names = [words[0] for line in text_of(candidate).splitlines() if (words := line.split())]
             if len(names) != count:
                 raise InputError(f"{candidate} has {len(names)} names, but {file} has {count} cameras")
             return names

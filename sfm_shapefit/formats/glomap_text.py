@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import first_words, node_indices, number_table, read_lines, refuse
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.geometry import normalized
@@ -24,13 +24,10 @@ _UNIT_TOLERANCE = 1e-3
 
 def is_relative_poses(source: Path | str) -> bool:
     """Return whether a path is a text file whose first line is one of GLOMAP's: 9 words, a quaternion."""
-    if not Path(source).is_file():  # a pipe would be read for ever
-        return False
+    first = first_words(Path(source))
     try:
-        with Path(source).open(encoding="utf-8") as stream:
-            first = next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
         values = np.array(first[2:], dtype=np.float64)
-    except (OSError, UnicodeDecodeError, ValueError):
+    except ValueError:
         return False
     if len(first) != _COLUMNS:
         return False

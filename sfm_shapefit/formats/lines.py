@@ -28,6 +28,30 @@ def refuse_irregular_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
 
 
+def text_of(file: Path) -> str:
+    """Return what an ordinary text file holds.
+
+    Raises:
+        InputError: if it is none, is missing, cannot be read, or is no UTF-8.
+    """
+    refuse_irregular_file(file)
+    try:
+        return file.read_text(encoding="utf-8")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} is not a readable text file ({error})") from error
+
+
+def first_words(file: Path) -> list[str]:
+    """Return the words of the first line that is not empty, or none if this is no ordinary text file."""
+    if not file.is_file():  # a pipe or a device would be read for ever
+        return []
+    try:
+        with file.open(encoding="utf-8") as stream:
+            return next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
+    except (OSError, ValueError):
+        return []
+
+
 def read_lines(file: Path, form: str) -> tuple[list[int], list[list[str]]]:
     """Return the numbers and the words of the lines that are not empty; `#` begins a comment.
 
@@ -38,13 +62,8 @@ def read_lines(file: Path, form: str) -> tuple[list[int], list[list[str]]]:
     Raises:
         InputError: if the file cannot be read or holds nothing.
     """
-    refuse_irregular_file(file)
-    try:
-        text = file.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{file} is not a readable text file ({error})") from error
     numbers, rows = [], []
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text_of(file).splitlines(), start=1):
         words = line.split("#", 1)[0].split()
         if words:
             numbers.append(number)

@@ -24,7 +24,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import first_words, node_indices, number_table, read_lines, refuse
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -85,11 +85,10 @@ def is_onedsfm(source: Path | str) -> bool:
     path = Path(source)
     if path.is_dir():
         return (path / _PAIRS_FILE).is_file()
+    first = first_words(path)
     try:
-        with path.open(encoding="utf-8") as stream:
-            first = next((words for line in stream if (words := line.split("#", 1)[0].split())), [])
         values = np.array(first[2:], dtype=np.float64)
-    except (OSError, ValueError):
+    except ValueError:
         return False
     return len(first) == _PAIR_COLUMNS and not _is_no_rotation(values[None, :9].reshape(1, 3, 3))[0]
 

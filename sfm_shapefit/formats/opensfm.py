@@ -21,6 +21,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import text_of
 from sfm_shapefit.formats.scene import JsonNode, SceneCamera, SceneFile, rotation_from_quaternion
 
 _TRACKS_FILE = "tracks.csv"
@@ -124,12 +125,8 @@ def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntA
     tracks = file.with_name(_TRACKS_FILE)
     observed, coordinates = [], []
     if tracks.is_file():
-        try:
-            lines = tracks.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as error:
-            raise InputError(f"{tracks} is not a readable text file ({error})") from error
         point_of, image_of = ({key: k for k, key in enumerate(keys)} for keys in (points, names))
-        for number, line in enumerate(lines, start=1):
+        for number, line in enumerate(text_of(tracks).splitlines(), start=1):
             words = line.split("\t")
             if line.startswith("OPENSFM_TRACKS_VERSION") or not line.strip():
                 continue

@@ -13,6 +13,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import text_of
 
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 """From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
@@ -60,13 +61,13 @@ def read_json(file: Path) -> Any:
         InputError: if it cannot be read, naming line and column of what is no JSON.
     """
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{file} is not a readable text file ({error})") from error
+        return json.loads(text_of(file))
     except json.JSONDecodeError as error:
         raise InputError(
             f"{file}, line {error.lineno}, column {error.colno}: no JSON ({error.msg}); write the file again"
         ) from error
+    except (ValueError, RecursionError) as error:  # a number of thousands of digits, endless brackets
+        raise InputError(f"{file} is not a readable JSON file ({error})") from error
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from sfm_shapefit.bodies import Bodies, separate
 from sfm_shapefit.body_placement import is_scaled, place_bodies
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.pipeline.clock import Clock
@@ -199,6 +200,7 @@ def _fixed_images(model: PosedModel, fix: str) -> BoolArray:
             )
         return solved
     path, index = Path(fix), {name: k for k, name in enumerate(model.names)}
+    refuse_irregular_file(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

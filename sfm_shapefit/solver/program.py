@@ -63,11 +63,6 @@ def scale_functional(graph: ViewGraph) -> FloatArray:
     return total
 
 
-def residual_sum(graph: ViewGraph, t: FloatArray) -> float:
-    """Return R(T), the weighted sum of the transverse residuals, in the units of `t`."""
-    return _sums(t, graph.edges, graph.directions, graph.weights)[0]
-
-
 def projected_length(graph: ViewGraph, t: FloatArray) -> float:
     """Return L(T), the weighted sum of the baselines' lengths along their directions."""
     return _sums(t, graph.edges, graph.directions, graph.weights)[1]

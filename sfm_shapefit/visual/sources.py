@@ -11,6 +11,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.output import MAP_MARKER, MARKER
 from sfm_shapefit.placement import Placement
 from sfm_shapefit.report import CameraRow, PairRow, axis_names
@@ -109,6 +110,7 @@ def _input_of(facts: dict[str, Any]) -> PosedModel | None:
 
 
 def _read_csv(path: Path) -> Iterator[dict[str, str]]:
+    refuse_irregular_file(path)
     with path.open(newline="", encoding="utf-8") as stream:
         yield from csv.DictReader(stream)
 
