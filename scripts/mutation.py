@@ -51,7 +51,7 @@ from cosmic_ray.operators.operator import Operator  # noqa: E402
 from sfm_shapefit import jit  # noqa: E402
 
 GROUPS = {
-    "rigidity": ["rigidity.py"],
+    "rigidity": [f"rigidity/{name}.py" for name in ("game", "growth", "pieces", "reasons")],
     "certificate": ["solver/certificate.py"],
     "newton": ["solver/newton/dense.py", "solver/newton/sparse.py", "solver/newton/steps.py"],
     "admm": [

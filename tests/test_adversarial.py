@@ -14,7 +14,7 @@ from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.diagnosis import diagnose
 from sfm_shapefit.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.placement import Placement, place, place_further
-from sfm_shapefit.results import camera_rows, quality_warnings
+from sfm_shapefit.results import camera_rows, graph_warnings, quality_warnings
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -50,6 +50,8 @@ def assert_only_the_bad_camera_is_distrusted(placement, t, noise):
     assert placement.cameras[trust < MIN_TRUST].tolist() == [BAD]
     assert placement.assessment.reasons[-1]
     assert any(str(BAD) in warning for warning in quality_warnings(placement))
+    (distrusted,) = set(graph_warnings(placement)) - set(quality_warnings(placement))
+    assert f"1 of {N} nodes have a trust below {MIN_TRUST}, above all {BAD} (" in distrusted
     # Eleven cameras of distance about 2 with ten directions each: an error of about noise * 2 / sqrt(10).
     assert np.max(errors_of(placement, t)) < 1e-6 + 10.0 * noise
 
@@ -61,6 +63,7 @@ def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbour(noise):
     rows = camera_rows(placement, placement.locations, 1.0)
     assert [row.reason for row in rows if not row.placed] == ["pendant: joined by a single pair to camera 0"]
     assert (placement.assessment.trust >= MIN_TRUST).all()
+    assert list(graph_warnings(placement)) == list(quality_warnings(placement))
 
 
 @pytest.mark.parametrize("noise", NOISE)

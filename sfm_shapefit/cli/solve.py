@@ -114,7 +114,7 @@ def solve_command(
 
 def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
     """Return what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.results import graph_summary, quality_warnings
+    from sfm_shapefit.results import graph_summary, graph_warnings
 
     placement, facts = found.placement, graph_summary(found)
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -134,7 +134,7 @@ def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
         ("residuals", _residuals_line(facts["residuals_deg"])),
         ("objective", objective_line(placement.solve)),
         ("locations", placement.finish.statement()),
-        *[("warning", warning) for warning in quality_warnings(placement)],
+        *[("warning", warning) for warning in graph_warnings(placement)],
         ("time", time_line(found.timings_s)),
         ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{pictures}"),
     ]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.directions import PairDirections
 from sfm_shapefit.gauge import Gauge
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.pipeline.clock import Clock, Progress
@@ -28,7 +29,7 @@ from sfm_shapefit.pipeline.rotation_refinement import refined_rotations
 from sfm_shapefit.pipeline.seeding import further_pieces, seeded_model, trusted
 from sfm_shapefit.pipeline.sources import MatchSource, choose_inputs, open_source
 from sfm_shapefit.placement import Placement
-from sfm_shapefit.results import LocateResult, quality_warnings, trust_warnings
+from sfm_shapefit.results import LocateResult, match_warnings, quality_warnings, trust_warnings
 
 if TYPE_CHECKING:
     import pycolmap
@@ -129,7 +130,7 @@ def locate(
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
         seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)
-        warnings = tuple(_warnings(source, placement, kept, gauge, seeded.num_points3D()))
+        warnings = tuple(_warnings(source, directions, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
         inputs=inputs,
@@ -149,9 +150,15 @@ def locate(
 
 
 def _warnings(
-    source: MatchSource, placement: Placement, kept: BoolArray, gauge: Gauge, num_points: int
+    source: MatchSource,
+    directions: PairDirections,
+    placement: Placement,
+    kept: BoolArray,
+    gauge: Gauge,
+    num_points: int,
 ) -> Iterator[str]:
     """Yield what the user should know beyond the tables."""
+    yield from match_warnings(directions)
     yield from quality_warnings(placement)
     yield from trust_warnings(placement, kept)
     if gauge.warning:

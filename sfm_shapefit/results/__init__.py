@@ -4,7 +4,7 @@ from sfm_shapefit.results.files import write_graph_result, write_result
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, piece_rows
 from sfm_shapefit.results.summary import graph_summary, summary
 from sfm_shapefit.results.values import FurtherPiece, GraphResult, Inputs, LocateResult
-from sfm_shapefit.results.warnings import quality_warnings, trust_warnings
+from sfm_shapefit.results.warnings import graph_warnings, match_warnings, quality_warnings, trust_warnings
 
 __all__ = [
     "FurtherPiece",
@@ -13,6 +13,8 @@ __all__ = [
     "LocateResult",
     "camera_rows",
     "graph_summary",
+    "graph_warnings",
+    "match_warnings",
     "own_camera_rows",
     "pair_rows",
     "piece_rows",

@@ -13,7 +13,7 @@ from sfm_shapefit.placement import Placement
 from sfm_shapefit.report import SCHEMA_VERSION, PieceRow, solve_summary
 from sfm_shapefit.results.rows import name_of, piece_rows
 from sfm_shapefit.results.values import GraphResult, LocateResult, all_names
-from sfm_shapefit.results.warnings import quality_warnings
+from sfm_shapefit.results.warnings import graph_warnings
 from sfm_shapefit.robust.finish import Finish
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
@@ -86,7 +86,7 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "solve": solve_summary(placement.solve),
         "finish": _finish_summary(placement.finish),
         "timings_s": found.timings_s,
-        "warnings": list(quality_warnings(placement)),
+        "warnings": list(graph_warnings(placement)),
         "versions": _versions(),
     }
 

@@ -1,0 +1,323 @@
+"""Step 3: the pebble game on the frames of the bodies.
+
+Every camera has d pebbles, each free or covering a copy of a link that leaves the camera. A copy is
+independent of those placed before if d + 2 pebbles can be brought to its two ends; pebbles travel by
+reversing paths of covered copies.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.rigidity.growth import compact, find_root, incidence, unite
+
+_GAME_WORK = 20  # cameras marked before a game is contracted and restarted, as a multiple of its cameras
+
+
+class Game(NamedTuple):
+    """Bodies as frames: a multigraph on the cameras they share, or on the first few of these."""
+
+    num_cameras: int
+    ends: IntArray
+    """(k, 2) renumbered cameras of each link of a frame."""
+    copies: IntArray
+    """(k,) how many copies of an edge the link stands for."""
+    owner: IntArray
+    """(k,) the body that the link belongs to."""
+    num_bodies: int
+    is_whole: bool
+    """Whether all shared cameras take part."""
+
+
+def contract(num_cameras: int, edges: IntArray, body: IntArray, part: int, dimension: int) -> Game:
+    """Return the frames of all bodies on the first `part` cameras that are shared by bodies."""
+    num_bodies = int(body.max(initial=-1)) + 1
+    start, cameras, back_start, _ = incidence(num_cameras, edges, body, num_bodies)
+    is_shared = np.diff(back_start) >= 2
+    number = np.where(is_shared, np.cumsum(is_shared) - 1, part)
+    owner = np.repeat(np.arange(num_bodies), np.diff(start))
+    kept = number[cameras] < part
+    owner, member = owner[kept], number[cameras[kept]]
+    order = np.lexsort((member, owner))
+    owner, member = owner[order], member[order]
+
+    first = np.searchsorted(owner, owner)  # where the frame of each entry begins
+    place = np.arange(len(owner)) - first
+    from_first, from_second = np.flatnonzero(place >= 1), np.flatnonzero(place >= 2)
+    ends = np.concatenate(
+        [
+            np.column_stack([member[first[from_first]], member[from_first]]),
+            np.column_stack([member[first[from_second] + 1], member[from_second]]),
+        ]
+    )
+    copies = np.repeat([dimension - 1, 1], [len(from_first), len(from_second)])
+    owner = np.concatenate([owner[from_first], owner[from_second]])
+    by_last_camera = np.argsort(ends.max(axis=1, initial=0), kind="stable")
+    return Game(
+        num_cameras=min(part, int(is_shared.sum())),
+        ends=ends[by_last_camera].astype(np.int64),
+        copies=copies[by_last_camera].astype(np.int64),
+        owner=owner[by_last_camera].astype(np.int64),
+        num_bodies=num_bodies,
+        is_whole=bool(is_shared.sum() <= part),
+    )
+
+
+def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
+    """Play a game and unite bodies by what it shows.
+
+    Returns:
+        The rigid set that each body lies in, (number of bodies,), compact; and whether these sets are
+        all that there are. If not, two bodies at least were united, and the game has to be played again.
+    """
+    start, link_of = _links_at(game.num_cameras, game.ends)
+    board = _Board(
+        target=np.full((game.num_cameras, dimension), -1, dtype=np.int64),
+        free=np.full(game.num_cameras, dimension, dtype=np.int64),
+        start=start,
+        link_of=link_of,
+        ends=game.ends,
+        seen=np.zeros(game.num_cameras, dtype=np.int64),
+        came_from=np.zeros(game.num_cameras, dtype=np.int64),
+        came_by=np.zeros(game.num_cameras, dtype=np.int64),
+        queue=np.zeros(game.num_cameras, dtype=np.int64),
+        inside=np.zeros(game.num_cameras, dtype=np.int64),
+        escapes=np.zeros(game.num_cameras, dtype=np.int64),
+        members=np.zeros(game.num_cameras, dtype=np.int64),
+        clock=np.zeros(2, dtype=np.int64),
+    )
+    mark = _place_links(board, game.copies, _GAME_WORK * game.num_cameras)
+    if board.free.sum() == dimension + 1:  # the whole is one rigid set
+        united = np.arange(game.num_bodies)
+        united[game.owner] = game.owner.min()
+        return compact(united), True
+    if (mark >= 0).any():
+        return compact(_bodies_by_marks(board, game.owner, game.num_bodies, mark)), False
+    return compact(_bodies_by_search(board, game.owner, game.num_bodies)), True
+
+
+def _links_at(num_cameras: int, ends: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the links at each camera as a (start, links) list."""
+    order = np.argsort(ends.ravel(), kind="stable")
+    start = np.zeros(num_cameras + 1, dtype=np.int64)
+    start[1:] = np.cumsum(np.bincount(ends.ravel(), minlength=num_cameras))
+    return start, (order // 2).astype(np.int64)
+
+
+class _Board(NamedTuple):
+    """State of a pebble game: d pebbles per camera, each free or covering a copy that leaves it."""
+
+    target: IntArray
+    """(n, d) camera that the copy under each pebble leads to, -1 for a free pebble."""
+    free: IntArray
+    """(n,) number of free pebbles."""
+    start: IntArray
+    link_of: IntArray
+    ends: IntArray
+    """Links at each camera, and their two ends, placed or not."""
+    seen: IntArray
+    came_from: IntArray
+    came_by: IntArray
+    queue: IntArray
+    """Marks of the running search, valid where `seen` equals clock[0]."""
+    inside: IntArray
+    escapes: IntArray
+    members: IntArray
+    """Marks of the running rigid set, valid where they equal clock[1]; its cameras."""
+    clock: IntArray
+
+
+@kernel()
+def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
+    """Move one free pebble to camera u along a path of copies, sparing camera v; False if none is left."""
+    board.clock[0] += 1
+    now = board.clock[0]
+    board.seen[u] = now
+    board.seen[v] = now
+    board.queue[0] = u
+    head, tail = 0, 1
+    while head < tail:
+        x = board.queue[head]
+        head += 1
+        for s in range(board.target.shape[1]):
+            w = board.target[x, s]
+            if w < 0 or board.seen[w] == now:
+                continue
+            board.seen[w] = now
+            board.came_from[w] = x
+            board.came_by[w] = s
+            if board.free[w] > 0:
+                _reverse_path(board, u, w)
+                return True
+            board.queue[tail] = w
+            tail += 1
+    return False
+
+
+@kernel()
+def _reverse_path(board: _Board, u: int, w: int) -> None:
+    """Turn the copies on the path found from u to w, so that a pebble of w becomes free at u."""
+    slot = _free_slot(board, w)
+    board.free[w] -= 1
+    while w != u:
+        x = board.came_from[w]
+        board.target[w, slot] = x
+        slot = board.came_by[w]
+        w = x
+    board.target[u, slot] = -1
+    board.free[u] += 1
+
+
+@kernel()
+def _free_slot(board: _Board, u: int) -> int:
+    """Return the first free pebble of a camera that has one."""
+    slot = 0
+    while board.target[u, slot] >= 0:
+        slot += 1
+    return slot
+
+
+@kernel()
+def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
+    """Bring free pebbles to u and v until they hold `wanted` in all, or no more can come; return how many."""
+    dimension = board.target.shape[1]
+    while board.free[u] + board.free[v] < wanted and (
+        (board.free[u] < dimension and _fetch_pebble(board, u, v))
+        or (board.free[v] < dimension and _fetch_pebble(board, v, u))
+    ):
+        pass
+    return int(board.free[u] + board.free[v])
+
+
+@kernel()
+def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
+    """Play the game: place as many copies of each link as are independent of those before.
+
+    Gathering g pebbles on the ends of a link shows that g - (d + 1) more copies are independent. If
+    that is fewer than asked, both ends lie in a rigid set; its cameras are marked, so that links inside
+    it are passed over at once. The game ends early when the whole is rigid, or when `max_work` cameras
+    have been marked: contracting what was found is then cheaper than going on.
+
+    Returns:
+        (n,) the link by which a camera was found to lie in a rigid set, -1 for none.
+    """
+    n, dimension = board.target.shape
+    room = dimension * n - (dimension + 1)
+    mark = np.full(n, -1, np.int64)
+    size_at = np.zeros(len(copies), np.int64)
+    for k in range(len(copies)):
+        u, v = board.ends[k, 0], board.ends[k, 1]
+        if mark[u] >= 0 and mark[u] == mark[v]:
+            continue
+        gathered = _gather(board, u, v, dimension + 1 + copies[k])
+        placed = min(copies[k], gathered - (dimension + 1))
+        for _ in range(placed):
+            a, b = (u, v) if board.free[u] > 0 else (v, u)
+            board.target[a, _free_slot(board, a)] = b
+            board.free[a] -= 1
+        room -= placed
+        if placed < copies[k]:
+            size_at[k] = _rigid_set(board, u, v)
+            max_work -= size_at[k]
+            for q in range(size_at[k]):
+                w = board.members[q]
+                if mark[w] < 0 or size_at[mark[w]] <= size_at[k]:
+                    mark[w] = k
+        if room == 0 or max_work < 0:
+            break
+    return mark
+
+
+@kernel()
+def _rigid_set(board: _Board, u: int, v: int) -> int:
+    """Collect the largest rigid set around u and v, which hold all the d + 1 pebbles that they can.
+
+    It consists of the cameras that no path of copies leads from to a free pebble elsewhere. Returns
+    its size; its cameras stand in `members`, and `inside` marks them.
+    """
+    board.clock[1] += 1
+    now = board.clock[1]
+    board.members[0] = u
+    board.members[1] = v
+    board.inside[u] = now
+    board.inside[v] = now
+    head, size = 0, 2
+    while head < size:
+        x = board.members[head]
+        head += 1
+        for s in range(board.start[x], board.start[x + 1]):
+            k = board.link_of[s]
+            w = board.ends[k, 0] + board.ends[k, 1] - x
+            if board.inside[w] != now and board.escapes[w] != now:
+                size = _join_unless_escaping(board, w, size)
+    return size
+
+
+@kernel()
+def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
+    """Follow all copies from w: if none escapes to a free pebble, all cameras met join the rigid set."""
+    rigid = board.clock[1]
+    board.clock[0] += 1
+    now = board.clock[0]
+    board.seen[w] = now
+    board.came_from[w] = -1
+    board.queue[0] = w
+    head, tail = 0, 1
+    while head < tail:
+        x = board.queue[head]
+        head += 1
+        if board.free[x] > 0 or board.escapes[x] == rigid:
+            while x >= 0:
+                board.escapes[x] = rigid
+                x = board.came_from[x]
+            return size
+        for s in range(board.target.shape[1]):
+            y = board.target[x, s]
+            if y >= 0 and board.seen[y] != now and board.inside[y] != rigid:
+                board.seen[y] = now
+                board.came_from[y] = x
+                board.queue[tail] = y
+                tail += 1
+    for q in range(tail):
+        board.inside[board.queue[q]] = rigid
+        board.members[size] = board.queue[q]
+        size += 1
+    return size
+
+
+@kernel()
+def _bodies_by_marks(board: _Board, owner: IntArray, num_bodies: int, mark: IntArray) -> IntArray:
+    """Return a root body for each body: bodies with two cameras of the same mark have the same."""
+    parent = np.arange(num_bodies)
+    for k in range(len(owner)):
+        u, v = board.ends[k, 0], board.ends[k, 1]
+        if mark[u] >= 0 and mark[u] == mark[v]:
+            unite(parent, owner[k], owner[mark[u]])
+    for b in range(num_bodies):
+        parent[b] = find_root(parent, b)
+    return parent
+
+
+@kernel()
+def _bodies_by_search(board: _Board, owner: IntArray, num_bodies: int) -> IntArray:
+    """Return a root body for each body after a full game: bodies in the same rigid set have the same."""
+    parent = np.arange(num_bodies)
+    done = np.zeros(num_bodies, np.bool_)
+    for k in range(len(owner)):
+        if done[owner[k]]:
+            continue
+        u, v = board.ends[k, 0], board.ends[k, 1]
+        _gather(board, u, v, 2 * board.target.shape[1])
+        for q in range(_rigid_set(board, u, v)):
+            x = board.members[q]
+            for s in range(board.start[x], board.start[x + 1]):
+                link = board.link_of[s]
+                w = board.ends[link, 0] + board.ends[link, 1] - x
+                if board.inside[w] == board.clock[1]:
+                    done[owner[link]] = True
+                    unite(parent, owner[k], owner[link])
+    for b in range(num_bodies):
+        parent[b] = find_root(parent, b)
+    return parent

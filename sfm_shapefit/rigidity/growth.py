@@ -1,0 +1,257 @@
+"""Steps 1 and 2: rigid bodies by triangles, and by growth over the cameras that bodies share.
+
+Bodies are sets of pairs. They are told apart by a label per pair; while they unite, by a forest in which
+each set is a tree and its smallest member the root.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.jit import kernel
+
+_GROWTH_ROUNDS = 4  # a later round rarely unites anything; the pebble game is exact anyway
+_GROWTH_WORK = 30  # cameras looked at while growing, as a multiple of all (body, camera) incidences
+
+
+def compact(label: IntArray) -> IntArray:
+    """Renumber non-negative labels to 0..k-1, keeping their order."""
+    used = np.zeros(int(label.max(initial=-1)) + 1, dtype=np.int64)
+    used[label] = 1
+    return np.asarray((np.cumsum(used) - 1)[label], dtype=np.int64)
+
+
+@kernel()
+def find_root(parent: IntArray, item: int) -> int:
+    """Return the root of an item, halving its path."""
+    while parent[item] != item:
+        parent[item] = parent[parent[item]]
+        item = parent[item]
+    return item
+
+
+@kernel()
+def unite(parent: IntArray, a: int, b: int) -> None:
+    """Unite the sets of two items under the smaller root."""
+    a = find_root(parent, a)
+    b = find_root(parent, b)
+    if a < b:
+        parent[b] = a
+    else:
+        parent[a] = b
+
+
+@kernel()
+def triangle_bodies(num_cameras: int, edges: IntArray) -> IntArray:
+    """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same.
+
+    Each pair is directed to its end of higher degree, which leaves at most sqrt(2 m) pairs at any
+    camera, and each triangle is met once, at its lowest end.
+    """
+    m = len(edges)
+    degree = np.zeros(num_cameras, np.int64)
+    for e in range(m):
+        degree[edges[e, 0]] += 1
+        degree[edges[e, 1]] += 1
+    tail = np.empty(m, np.int64)
+    start = np.zeros(num_cameras + 1, np.int64)
+    for e in range(m):
+        i, j = edges[e, 0], edges[e, 1]
+        tail[e] = i if (degree[i], i) < (degree[j], j) else j
+        start[tail[e] + 1] += 1
+    start = np.cumsum(start)
+    fill = start[:-1].copy()
+    edge_of = np.empty(m, np.int64)
+    head_of = np.empty(m, np.int64)
+    for e in range(m):
+        slot = fill[tail[e]]
+        fill[tail[e]] += 1
+        edge_of[slot] = e
+        head_of[slot] = edges[e, 0] + edges[e, 1] - tail[e]
+
+    parent = np.arange(m)
+    seen_from = np.full(num_cameras, -1, np.int64)
+    seen_edge = np.empty(num_cameras, np.int64)
+    for a in range(num_cameras):
+        for s in range(start[a], start[a + 1]):
+            seen_from[head_of[s]] = a
+            seen_edge[head_of[s]] = edge_of[s]
+        for s in range(start[a], start[a + 1]):
+            b = head_of[s]
+            for r in range(start[b], start[b + 1]):
+                c = head_of[r]
+                if seen_from[c] == a:
+                    unite(parent, edge_of[s], edge_of[r])
+                    unite(parent, edge_of[s], seen_edge[c])
+    for e in range(m):
+        parent[e] = find_root(parent, e)
+    return parent
+
+
+@kernel()
+def incidence(
+    num_cameras: int, edges: IntArray, body: IntArray, num_bodies: int
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """Return which cameras each body has, and which bodies each camera, as two (start, items) lists."""
+    m = len(edges)
+    edge_start = np.zeros(num_bodies + 1, np.int64)
+    for e in range(m):
+        edge_start[body[e] + 1] += 1
+    edge_start = np.cumsum(edge_start)
+    fill = edge_start[:-1].copy()
+    edge_of = np.empty(m, np.int64)
+    for e in range(m):
+        edge_of[fill[body[e]]] = e
+        fill[body[e]] += 1
+
+    start = np.zeros(num_bodies + 1, np.int64)
+    cameras = np.empty(2 * m, np.int64)
+    back_start = np.zeros(num_cameras + 1, np.int64)
+    last = np.full(num_cameras, -1, np.int64)
+    count = 0
+    for b in range(num_bodies):
+        for s in range(edge_start[b], edge_start[b + 1]):
+            for side in range(2):
+                camera = edges[edge_of[s], side]
+                if last[camera] != b:
+                    last[camera] = b
+                    cameras[count] = camera
+                    back_start[camera + 1] += 1
+                    count += 1
+        start[b + 1] = count
+    back_start = np.cumsum(back_start)
+    fill = back_start[:-1].copy()
+    bodies = np.empty(count, np.int64)
+    for b in range(num_bodies):
+        for s in range(start[b], start[b + 1]):
+            bodies[fill[cameras[s]]] = b
+            fill[cameras[s]] += 1
+    return start, cameras[:count].copy(), back_start, bodies
+
+
+def grown(num_cameras: int, edges: IntArray, body: IntArray) -> IntArray:
+    """Return body labels after growing every body of at least 3 cameras, largest first (step 2)."""
+    for _ in range(_GROWTH_ROUNDS):
+        num_bodies = int(body.max(initial=-1)) + 1
+        start, cameras, back_start, bodies = incidence(num_cameras, edges, body, num_bodies)
+        growth = _Growth(
+            start=start,
+            cameras=cameras,
+            back_start=back_start,
+            bodies=bodies,
+            parent=np.arange(num_bodies),
+            taken=np.full(num_bodies, -1),
+            met=np.full(num_bodies, -1),
+            inside=np.full(num_cameras, -1),
+            reached=np.full(num_cameras, -1),
+            reached_by=np.full(num_cameras, -1),
+            reached_at=np.full(num_cameras, -1),
+            queue=np.full(num_cameras, -1),
+        )
+        size = np.diff(start)
+        seeds = np.argsort(-size, kind="stable")[: int((size >= 3).sum())].astype(np.int64)
+        _grow(growth, seeds, _GROWTH_WORK * len(cameras))
+        if (growth.parent == np.arange(num_bodies)).all():
+            break
+        body = compact(growth.parent[body])
+    return body
+
+
+class _Growth(NamedTuple):
+    """State of growing bodies; a mark is valid where it equals the seed that grows."""
+
+    start: IntArray
+    cameras: IntArray
+    back_start: IntArray
+    bodies: IntArray
+    """Cameras of each body, bodies at each camera."""
+    parent: IntArray
+    """(number of bodies,) which bodies were united."""
+    taken: IntArray
+    met: IntArray
+    """(number of bodies,) marks: part of the seed; shares a camera with it."""
+    inside: IntArray
+    reached: IntArray
+    """(n,) marks: camera of the seed; camera of a body that shares one with the seed, ..."""
+    reached_by: IntArray
+    reached_at: IntArray
+    """(n,) ... the first such body, and the camera that it shares."""
+    queue: IntArray
+    """The seed's cameras, in the order of joining."""
+
+
+@kernel()
+def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
+    """Let each seed absorb what step 2 allows; leave a root body for each body in `parent`."""
+    for seed in seeds:
+        if growth.parent[seed] == seed and growth.taken[seed] < 0 and max_work >= 0:
+            max_work -= _grow_seed(growth, seed)
+    for b in range(len(growth.parent)):
+        growth.parent[b] = find_root(growth.parent, b)
+
+
+@kernel()
+def _grow_seed(growth: _Growth, seed: int) -> int:
+    """Absorb each body that meets the seed's cameras a second time; return the work done.
+
+    A body larger than what has been grown so far is not searched for cameras that it shares with
+    others, which bounds the work of small seeds beside large bodies.
+    """
+    work = 0
+    tail = _absorb(growth, seed, seed, 0)
+    head = 0
+    while head < tail:
+        camera = growth.queue[head]
+        head += 1
+        for s in range(growth.back_start[camera], growth.back_start[camera + 1]):
+            b = growth.bodies[s]
+            work += 1
+            if growth.taken[b] == seed:
+                continue
+            size = growth.start[b + 1] - growth.start[b]
+            if growth.met[b] == seed:
+                tail = _absorb(growth, seed, b, tail)
+            elif size <= tail:
+                work += size
+                tail = _reach_out(growth, seed, b, camera, tail)
+            growth.met[b] = seed
+    return work
+
+
+@kernel()
+def _reach_out(growth: _Growth, seed: int, b: int, camera: int, tail: int) -> int:
+    """Mark the cameras of a body that meets the seed at `camera`; absorb it if that closes a triangle.
+
+    The triangle is the seed, this body, and one that meets the seed elsewhere and this body outside.
+    Two bodies that meet the seed at the same camera, and each other outside, share two cameras.
+    """
+    for s in range(growth.start[b], growth.start[b + 1]):
+        other = growth.cameras[s]
+        if growth.inside[other] == seed:
+            continue
+        if growth.reached[other] != seed:
+            growth.reached[other] = seed
+            growth.reached_by[other] = b
+            growth.reached_at[other] = camera
+        elif growth.reached_at[other] == camera:
+            unite(growth.parent, growth.reached_by[other], b)
+        else:
+            tail = _absorb(growth, seed, growth.reached_by[other], tail)
+            return _absorb(growth, seed, b, tail)
+    return tail
+
+
+@kernel()
+def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
+    """Unite a body with the seed and queue the cameras that it brings; return the queue's new tail."""
+    if growth.taken[eaten] == seed:
+        return tail
+    growth.taken[eaten] = seed
+    unite(growth.parent, seed, eaten)
+    for s in range(growth.start[eaten], growth.start[eaten + 1]):
+        if growth.inside[growth.cameras[s]] != seed:
+            growth.inside[growth.cameras[s]] = seed
+            growth.queue[tail] = growth.cameras[s]
+            tail += 1
+    return tail

@@ -1,0 +1,79 @@
+"""Why cameras are outside the largest rigid piece, in words."""
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, IntArray
+from sfm_shapefit.rigidity.pieces import RigidPiece
+from sfm_shapefit.viewgraph import ViewGraph
+
+
+def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, str]:
+    """Say for each camera outside the largest piece why its position is not determined with it.
+
+    Args:
+        graph: the view graph.
+        pieces: its pieces, as `rigid_pieces` returns them.
+
+    Returns:
+        Camera index, ascending, to one of: "no pair"; "another component"; "pendant: joined by a
+        single pair to NAME"; "another rigid piece, hinged at NAME, ..."; "not rigidly tied to the
+        largest piece". Hinges shared with the largest piece are named if there are any, else all
+        hinges of the camera's piece. Without names in the graph, NAME is "camera K".
+    """
+    placed = np.zeros(graph.num_cameras, dtype=np.bool_)
+    if pieces:
+        placed[pieces[0].cameras] = True
+    degree = graph.degrees()
+    component = graph.components()
+    main = component[pieces[0].cameras[0]] if pieces else -1
+    neighbour = _a_neighbour(graph)
+    home = _large_piece_of(graph.num_cameras, pieces)
+
+    reasons: dict[int, str] = {}
+    for camera in np.flatnonzero(~placed).tolist():
+        if degree[camera] == 0:
+            reasons[camera] = "no pair"
+        elif component[camera] != main:
+            reasons[camera] = "another component"
+        elif degree[camera] == 1:
+            reasons[camera] = f"pendant: joined by a single pair to {_name(graph, int(neighbour[camera]))}"
+        else:
+            hinges = _hinges_of(camera, int(home[camera]), pieces, placed)
+            names = ", ".join(_name(graph, hinge) for hinge in hinges)
+            reasons[camera] = (
+                f"another rigid piece, hinged at {names}"
+                if names
+                else "not rigidly tied to the largest piece"
+            )
+    return reasons
+
+
+def _a_neighbour(graph: ViewGraph) -> IntArray:
+    """Return one neighbour of each camera (n,), -1 without any: the neighbour where there is one only."""
+    neighbour = np.full(graph.num_cameras, -1, dtype=np.int64)
+    neighbour[graph.edges[:, 0]] = graph.edges[:, 1]
+    neighbour[graph.edges[:, 1]] = graph.edges[:, 0]
+    return neighbour
+
+
+def _large_piece_of(num_cameras: int, pieces: list[RigidPiece]) -> IntArray:
+    """Return the first piece of at least 3 cameras that holds each camera (n,), or -1."""
+    home = np.full(num_cameras, -1, dtype=np.int64)
+    for k in reversed(range(len(pieces))):
+        if len(pieces[k].cameras) >= 3:
+            home[pieces[k].cameras] = k
+    return home
+
+
+def _hinges_of(camera: int, home: int, pieces: list[RigidPiece], placed: BoolArray) -> list[int]:
+    """Return the hinges to name for a camera of piece `home`: the placed ones if any, never itself."""
+    if home < 0:
+        return []
+    hinges = pieces[home].hinges
+    to_largest = hinges[placed[hinges]]
+    return [int(h) for h in (to_largest if len(to_largest) else hinges) if h != camera]
+
+
+def _name(graph: ViewGraph, camera: int) -> str:
+    """Return the name of a camera for a report."""
+    return f"camera {camera}" if graph.names is None else graph.names[camera]
