@@ -8,6 +8,7 @@ go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
 import argparse
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import get_args
 
@@ -39,6 +40,11 @@ class Panel:
 
     def cells(self) -> list[Cell]:
         return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
+
+    @property
+    def doubles(self) -> bool:
+        """Whether each n is twice the one before: drawn on a logarithmic axis."""
+        return all(later == 2 * n for n, later in pairwise(self.n))
 
 
 def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
@@ -133,7 +139,7 @@ def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
         picture = axis.pcolormesh(
             panel.q, panel.n, image(panel, results), cmap="gray_r", vmin=0.0, vmax=1.0, shading="nearest"
         )
-        if panel.n[-1] > 4 * panel.n[1]:  # sizes that double
+        if panel.doubles:
             axis.set_yscale("log")
             axis.set_yticks(panel.n, [str(n) for n in panel.n])
             axis.minorticks_off()

@@ -112,6 +112,13 @@ def test_every_panel_of_every_figure_names_a_known_method():
         assert {panel.method for panel in module.panels(figure)} <= set(METHODS)
 
 
+def test_only_sizes_that_double_are_drawn_on_a_logarithmic_axis():
+    module = script("phase_transition")
+    doubling = [name for name in module.FIGURES if any(panel.doubles for panel in module.panels(name))]
+    assert doubling == ["large"]
+    assert all(panel.doubles for panel in module.panels("large"))
+
+
 def test_the_theory_plot_has_a_quick_mode_and_grants_less_than_is_recovered(tmp_path, capsys):
     module = script("theory_plot")
     module.main(["--out", str(tmp_path / "f.png"), "--quick"])
