@@ -7,7 +7,7 @@ go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import get_args
@@ -162,10 +162,24 @@ def report(shown: Sequence[Panel], results: Results) -> str:
         lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
         if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
             lines += _failures(panel.cells(), values)
+    lines += _noisy_where_exact(shown, results)
     if len(results.methods) == 2:
         apart = np.abs(np.subtract(*(results.mean_errors(m) for m in results.methods))).max()
         lines.append(f"largest difference of a cell between {' and '.join(results.methods)}: {apart:.1e}")
     return "\n".join(lines)
+
+
+def _noisy_where_exact(shown: Sequence[Panel], results: Results) -> list[str]:
+    """Say how large the errors with noise are in the cells that are exact without."""
+    lines, known = [], {replace(panel, title=""): panel for panel in shown}
+    for noisy in shown:
+        clean = known.get(replace(noisy, title="", sigma=0.0))
+        if clean is None or noisy.sigma == 0.0:
+            continue
+        errors = image(noisy, results)[image(clean, results) < EXACT]
+        largest = errors.max(initial=0.0)
+        lines.append(f"{noisy.title}: at most {largest:.2g} in the {errors.size} cells exact without")
+    return lines
 
 
 def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:

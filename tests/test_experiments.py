@@ -86,6 +86,9 @@ def test_figure_1_has_a_quick_mode(figure, tmp_path, capsys):
     assert (tmp_path / "f.png").stat().st_size > 5000
     said = capsys.readouterr().out
     assert "problems recovered below 1e-09" in said
+    worst, cells = said.split("ShapeFit, noise 0.05: at most ")[1].split()[0:4:3]
+    assert int(cells) >= 1
+    assert float(worst) < 0.1  # twice the noise
 
 
 @pytest.mark.slow
