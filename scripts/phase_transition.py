@@ -7,7 +7,8 @@ go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
 
 import argparse
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import get_args
 
@@ -39,6 +40,11 @@ class Panel:
 
     def cells(self) -> list[Cell]:
         return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
+
+    @property
+    def doubles(self) -> bool:
+        """Whether each n is twice the one before: drawn on a logarithmic axis."""
+        return all(later == 2 * n for n, later in pairwise(self.n))
 
 
 def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
@@ -133,7 +139,7 @@ def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
         picture = axis.pcolormesh(
             panel.q, panel.n, image(panel, results), cmap="gray_r", vmin=0.0, vmax=1.0, shading="nearest"
         )
-        if panel.n[-1] > 4 * panel.n[1]:  # sizes that double
+        if panel.doubles:
             axis.set_yscale("log")
             axis.set_yticks(panel.n, [str(n) for n in panel.n])
             axis.minorticks_off()
@@ -156,10 +162,24 @@ def report(shown: Sequence[Panel], results: Results) -> str:
         lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
         if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
             lines += _failures(panel.cells(), values)
+    lines += _noisy_where_exact(shown, results)
     if len(results.methods) == 2:
         apart = np.abs(np.subtract(*(results.mean_errors(m) for m in results.methods))).max()
         lines.append(f"largest difference of a cell between {' and '.join(results.methods)}: {apart:.1e}")
     return "\n".join(lines)
+
+
+def _noisy_where_exact(shown: Sequence[Panel], results: Results) -> list[str]:
+    """Say how large the errors with noise are in the cells that are exact without."""
+    lines, known = [], {replace(panel, title=""): panel for panel in shown}
+    for noisy in shown:
+        clean = known.get(replace(noisy, title="", sigma=0.0))
+        if clean is None or noisy.sigma == 0.0:
+            continue
+        errors = image(noisy, results)[image(clean, results) < EXACT]
+        largest = errors.max(initial=0.0)
+        lines.append(f"{noisy.title}: at most {largest:.2g} in the {errors.size} cells exact without")
+    return lines
 
 
 def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:

@@ -86,6 +86,9 @@ def test_figure_1_has_a_quick_mode(figure, tmp_path, capsys):
     assert (tmp_path / "f.png").stat().st_size > 5000
     said = capsys.readouterr().out
     assert "problems recovered below 1e-09" in said
+    worst, cells = said.split("ShapeFit, noise 0.05: at most ")[1].split()[0:4:3]
+    assert int(cells) >= 1
+    assert float(worst) < 0.1  # twice the noise
 
 
 @pytest.mark.slow
@@ -110,6 +113,13 @@ def test_every_panel_of_every_figure_names_a_known_method():
     for figure in module.FIGURES:
         assert module.panels(figure)
         assert {panel.method for panel in module.panels(figure)} <= set(METHODS)
+
+
+def test_only_sizes_that_double_are_drawn_on_a_logarithmic_axis():
+    module = script("phase_transition")
+    doubling = [name for name in module.FIGURES if any(panel.doubles for panel in module.panels(name))]
+    assert doubling == ["large"]
+    assert all(panel.doubles for panel in module.panels("large"))
 
 
 def test_the_theory_plot_has_a_quick_mode_and_grants_less_than_is_recovered(tmp_path, capsys):

@@ -36,7 +36,9 @@ def test_the_documented_fixtures_are_those_that_there_are(pytester, monkeypatch)
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     pytester.makeconftest(example()[0])
     listed = pytester.runpytest_subprocess("--fixtures", "-q").stdout.str()
+    page = (ROOT / "docs" / "synthetic.md").read_text(encoding="utf-8")
     for row in (line for line in fixtures.__doc__.splitlines() if line.startswith("| `")):
+        assert row in page
         for name in row.split("|")[1].replace("`", "").split(","):
             assert f"\n{name.strip()} [" in listed or f"\n{name.strip()} --" in listed, name
 

@@ -1,5 +1,6 @@
 """The benchmark beside peers: its limits, its one table, and its quick mode."""
 
+import math
 import sys
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,6 +14,7 @@ sys.path.insert(0, str(ROOT / "scripts"))
 
 import benchmark
 from benchmarks import graph_peers, peers, real_peers
+from benchmarks.kept import KeptAnswers
 from benchmarks.real import Errors
 from benchmarks.real_peers import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Row, checks
 
@@ -38,6 +40,28 @@ def test_ours_must_not_be_worse_than_the_best_peer_beyond_what_the_truth_can_tel
     assert mean.met
 
 
+def test_answers_of_an_interrupted_comparison_are_kept_and_not_asked_again(tmp_path):
+    file, asked = tmp_path / "kept.json", []
+
+    def ask(median):
+        asked.append(median)
+        return Row(name="ours", errors=errors(median, 2.0), cpu_s=0.25)
+
+    first = KeptAnswers(file, {"limit": 1})
+    first.get("one", lambda: ask(1.0))
+    again = KeptAnswers(file, {"limit": 1})
+    assert "one" in again
+    assert "two" not in again
+    row = peers._row(again.get("one", lambda: ask(3.0)))
+    assert row.errors == errors(1.0, 2.0)
+    assert row.cpu_s == 0.25
+    assert math.isnan(row.seconds)  # unknown stays unknown
+    assert asked == [1.0]
+    assert len(again.loads) == 1
+    with pytest.raises(ValueError, match="other settings; delete it or give another --cache"):
+        KeptAnswers(file, {"limit": 2})
+
+
 def test_without_peers_there_is_no_limit():
     assert checks(rows(errors(1.0, 1.0), None)) == []
 
@@ -48,14 +72,14 @@ def test_the_table_has_error_time_and_memory_and_says_why_there_is_no_answer():
         num_cameras=9,
         num_edges=20,
         answers=(
-            graph_peers.Answer(name="ours", ours=True, error=1e-3, seconds=0.5, peak_mb=300.0),
+            graph_peers.Answer(name="ours", ours=True, error=1e-3, seconds=0.5, cpu_s=0.4, peak_mb=300.0),
             graph_peers.Answer(name="gtsam", ours=False, note="skipped: gtsam is not installed"),
         ),
     )
     text = peers.section(
         [graph], {"castle-P30": rows(errors(1.0, 2.0, 3), errors(1.0, 2.0))}, "- Command: none\n", 9.0
     )
-    assert "| er2-9 (20 pairs) | ours | 0.00100 | 0.500 | 300 |  |" in text
+    assert "| er2-9 (20 pairs) | ours | 0.00100 | 0.500 (0.400) | 300 |  |" in text
     assert "| er2-9 (20 pairs) | gtsam | - | - | - | skipped: gtsam is not installed |" in text
     assert "1.00 / 2.00 / 9.00 (3 missing) | - | 512 |" in text
     assert "failed: no answer" in text
@@ -64,13 +88,13 @@ def test_the_table_has_error_time_and_memory_and_says_why_there_is_no_answer():
 
 def test_a_peer_of_scenes_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
     monkeypatch.setattr(real_peers, "find_spec", lambda _package: None)
-    row = real_peers.answer("pytheia LUD", Path(), None, "no directions", 1.0)
+    row = real_peers.answer("pytheia LUD", Path(), None, "no directions", 1)
     assert row.note == "skipped: pytheia is not installed"
 
 
 def test_a_set_without_directions_is_a_failure_of_the_peers_that_need_them(monkeypatch):
     monkeypatch.setattr(real_peers, "find_spec", lambda _package: object())
-    row = real_peers.answer("gtsam with Huber", Path(), None, "the model is broken", 1.0)
+    row = real_peers.answer("gtsam with Huber", Path(), None, "the model is broken", 1)
     assert row.note == "failed: the model is broken"
 
 
@@ -104,7 +128,7 @@ def test_a_real_scene_is_measured_with_ours_and_with_pycolmap():
     scene = peers.SCENES[folder.name]
     positioning = next(name for name in real_peers.contenders() if name.startswith(POSITIONING))
     for name, limit in ((BY_DEFAULT, 0.005), (positioning, 0.1)):
-        row = real_peers.answer(name, folder, scene, "none", 200.0)
+        row = real_peers.answer(name, folder, scene, "none", 200)
         assert row.errors is not None, row.note
         assert row.errors.median < limit
         assert row.seconds > 0.0

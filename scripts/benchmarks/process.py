@@ -8,6 +8,7 @@ import contextlib
 import multiprocessing
 import os
 import resource
+import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from multiprocessing.connection import Connection
@@ -33,6 +34,7 @@ def call(
     *args: object,
     environment: Mapping[str, str] | None = None,
     timeout_s: float | None = None,
+    cpu_limit_s: int | None = None,
 ) -> Any:
     """Call a function in a fresh process and return its result.
 
@@ -41,15 +43,16 @@ def call(
         args: its arguments.
         environment: variables to set for that process, on top of this one's.
         timeout_s: wall-clock limit, imports included.
+        cpu_limit_s: limit of the process's own CPU time, imports included: the same on a loaded machine.
 
     Raises:
-        TimeoutError: if the limit passed; the process is ended.
+        TimeoutError: if a limit passed; the process is ended.
         RuntimeError: if the function raised, with its message, or the process died without an answer.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     with _environment(environment or {}):
-        process = context.Process(target=_answer, args=(sender, function, args))
+        process = context.Process(target=_answer, args=(sender, function, args, cpu_limit_s))
         process.start()
     sender.close()
     try:
@@ -58,6 +61,8 @@ def call(
         good, answer = receiver.recv()
     except EOFError:
         process.join()
+        if process.exitcode == -signal.SIGXCPU:
+            raise TimeoutError(f"no answer within {cpu_limit_s} s of CPU time") from None
         raise RuntimeError(f"the process ended with code {process.exitcode} and no answer") from None
     finally:
         if process.is_alive():
@@ -71,8 +76,13 @@ def call(
     return answer
 
 
-def _answer(sender: Connection, function: Callable[..., Any], args: tuple[object, ...]) -> None:
+def _answer(
+    sender: Connection, function: Callable[..., Any], args: tuple[object, ...], cpu_limit_s: int | None
+) -> None:
     """Send what the function returns or why it failed."""
+    if cpu_limit_s is not None:
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the system would write the memory to a file
+        resource.setrlimit(resource.RLIMIT_CPU, (cpu_limit_s, cpu_limit_s + 1))
     try:
         sender.send((True, function(*args)))
     except Exception as error:  # whatever a library raises is an answer, to be shown as such

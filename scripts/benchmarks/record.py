@@ -45,14 +45,19 @@ def legend(quantities: Sequence[Quantity]) -> str:
 def environment(packages: Sequence[str], command: str) -> str:
     """Return when, how and on what the figures were measured, as a Markdown list."""
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
-    versions = [f"{name} {_version(name)}" for name in packages]
     return (
         f"- Command: `{command}`\n"
         f"- Date: {datetime.datetime.now(datetime.UTC).date().isoformat()}\n"
         f"- Machine: {os.cpu_count()} cores, {cpu_model()}, {platform.system()} {platform.machine()};"
         f" load average at the start (1, 5, 15 min): {load}\n"
-        f"- Versions: sfm_shapefit {__version__}, python {platform.python_version()}, {', '.join(versions)}\n"
+        f"- Versions: sfm_shapefit {__version__}, python {platform.python_version()},"
+        f" {', '.join(versions(packages))}\n"
     )
+
+
+def versions(packages: Sequence[str]) -> list[str]:
+    """Return each package with its version."""
+    return [f"{name} {_version(name)}" for name in packages]
 
 
 def cpu_model(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
