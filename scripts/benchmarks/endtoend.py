@@ -213,9 +213,7 @@ def section(measured: Sequence[Located], about: str) -> str:
         )
     header = ["images", "pairs", "matches", "placed", "error / radius", "s", "CPU s", "peak MB", "verdict"]
     parts = ["## Reliability: end to end at scale\n", about, "", table(header, rows)]
-    parts += [
-        "\nSeconds / CPU seconds / peak MB of each stage; exponents between the smallest and the largest:\n"
-    ]
+    parts += ["\nSeconds / CPU seconds / peak MB by stage; exponents between smallest and largest:\n"]
     return "\n".join([*parts, _stages(measured)])
 
 
