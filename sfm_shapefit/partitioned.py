@@ -19,8 +19,6 @@ Partition and merge follow Zhu et al., "Very large-scale global SfM by distribut
 2018.
 """
 
-import resource
-import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
@@ -78,8 +76,6 @@ class PieceSolution:
     gap: float
     """Certified, of its ShapeFit optimum."""
     seconds: float
-    peak_mb: float
-    """Largest resident memory of the process that solved it, so far."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -190,7 +186,11 @@ def piece_tasks(
         piece, cameras = graph.restricted_to(rows)
         known = None if covariance is None else covariance[rows]
         yield PieceTask(
-            graph=piece, cameras=cameras, covariance=known, classes=classes[rows], options=options
+            graph=piece,
+            cameras=cameras,
+            covariance=known,
+            classes=classes[rows],
+            options=replace(options, threads=1, uniqueness=False),  # one piece for each worker
         )
 
 
@@ -222,17 +222,15 @@ def _solve_body(task: PieceTask, body: RigidPiece) -> PieceSolution | None:
     graph, nodes = task.graph.restricted_to(body.edges)
     known = None if task.covariance is None else task.covariance[body.edges]
     try:
-        solved = solve(graph, replace(task.options, uniqueness=False))
+        solved = solve(graph, task.options)
     except UnsolvableError:
         return None
     finished = finish(graph, solved, task.options, known, task.classes[body.edges])
-    unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
     return PieceSolution(
         cameras=task.cameras[nodes],
         locations=np.array(finished.locations),
         gap=solved.gap,
         seconds=time.perf_counter() - start,
-        peak_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6,
     )
 
 

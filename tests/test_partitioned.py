@@ -84,7 +84,7 @@ def test_parts_are_about_equal_and_few_pairs_are_cut(box, by_metis, monkeypatch)
 
 
 def solution(cameras, locations) -> PieceSolution:
-    return PieceSolution(cameras=cameras, locations=locations, gap=0.0, seconds=0.0, peak_mb=0.0)
+    return PieceSolution(cameras=cameras, locations=locations, gap=0.0, seconds=0.0)
 
 
 def test_merging_finds_scales_and_shifts_in_spite_of_wrong_cameras():

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, Literal, TypeVar, get_type_hints
 
 import typer
 
@@ -42,6 +42,17 @@ Report = Annotated[
 ]
 Scene = Annotated[
     bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
+]
+ExecutorName = Annotated[
+    Literal["serial", "processes", "dask"],
+    typer.Option(
+        "--executor",
+        help="Who measures directions, and solves the pieces of a graph whose factor exceeds "
+        "--factor-memory: this process, so many others as --threads says, or a cluster.",
+    ),
+]
+Scheduler = Annotated[
+    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already.")
 ]
 Config = Annotated[
     Path | None,

@@ -1,7 +1,7 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -10,6 +10,7 @@ from sfm_shapefit.cli.console import Rows, catch_termination, print_table, repor
 from sfm_shapefit.cli.flags import (
     Config,
     Database,
+    ExecutorName,
     InputPath,
     Json,
     ModelArgument,
@@ -19,6 +20,7 @@ from sfm_shapefit.cli.flags import (
     Quiet,
     Report,
     Scene,
+    Scheduler,
     Verbose,
     one_path,
     options_from,
@@ -48,14 +50,8 @@ def locate_command(
             help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
         ),
     ] = None,
-    executor: Annotated[
-        Literal["serial", "processes", "dask"],
-        typer.Option("--executor", help="Who measures the directions: this process, others, or a cluster."),
-    ] = "serial",
-    scheduler: Annotated[
-        str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
-    ] = None,
+    executor: ExecutorName = "serial",
+    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
     config: Config = None,
     report: Report = True,

@@ -8,12 +8,14 @@ import typer
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
 from sfm_shapefit.cli.flags import (
+    ExecutorName,
     Json,
     OutArgument,
     Overwrite,
     Quiet,
     Report,
     Scene,
+    Scheduler,
     one_path,
     options_from,
     takes,
@@ -62,6 +64,8 @@ def solve_command(
         bool,
         typer.Option("--1dsfm", help="Also write 1dsfm/: the pairs that agree, rotations and locations."),
     ] = False,
+    executor: ExecutorName = "serial",
+    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
     report: Report = True,
     scene: Scene = False,
@@ -79,11 +83,15 @@ def solve_command(
         inputs = [path for path in (source, rotations) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=inputs):
             from sfm_shapefit.pipeline import solve_graph_file
+            from sfm_shapefit.pipeline.execution import open_executor
             from sfm_shapefit.report import dumps
             from sfm_shapefit.results import graph_summary, write_graph_result
 
             catch_termination()
-            with shown_progress(not quiet) as progress:
+            with (
+                open_executor(executor, options.threads, scheduler) as workers,
+                shown_progress(not quiet) as progress,
+            ):
                 found = solve_graph_file(
                     source,
                     options,
@@ -91,6 +99,7 @@ def solve_command(
                     max_rotation_error_deg=max_rotation_error,
                     reverse=reverse,
                     progress=progress,
+                    executor=workers,
                 )
             write_graph_result(
                 found,
