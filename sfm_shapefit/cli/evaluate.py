@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.evaluation import Evaluation
 
 
-@app.command("evaluate")
+@app.command("evaluate", short_help="Compare a model's poses with those of a reference.")
 def evaluate_command(
     model: ModelArgument = None,
     reference: Annotated[

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.results import LocateResult
 
 
-@app.command("locate")
+@app.command("locate", short_help="Place the cameras of a model from its rotations and matches.")
 @takes(LocateOptions)
 def locate_command(
     model: ModelArgument = None,
@@ -50,11 +50,19 @@ def locate_command(
     ] = None,
     executor: Annotated[
         Literal["serial", "processes", "dask"],
-        typer.Option("--executor", help="Who measures the directions: this process, others, or a cluster."),
+        typer.Option(
+            "--executor",
+            help="Who measures the directions of a database, and solves the pieces of graphs too large for one "
+            "factor: this process, others on this machine, or a dask cluster.",
+        ),
     ] = "serial",
     scheduler: Annotated[
         str | None,
-        typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
+        typer.Option(
+            "--scheduler",
+            metavar="ADDRESS",
+            help="Of a dask scheduler that runs already; one is started here if not given.",
+        ),
     ] = None,
     overwrite: Overwrite = False,
     config: Config = None,

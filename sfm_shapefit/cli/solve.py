@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.results import GraphResult
 
 
-@app.command("solve")
+@app.command("solve", short_help="Place the nodes of a bare view graph, or of relative poses.")
 @takes(PlacementOptions)
 def solve_command(
     graph: Annotated[
