@@ -52,8 +52,8 @@ def locate_command(
         Literal["serial", "processes", "dask"],
         typer.Option(
             "--executor",
-            help="Who measures the directions of a database, and solves the pieces of graphs too large for one "
-            "factor: this process, others on this machine, or a dask cluster.",
+            help="Who measures the directions of a database, and solves the pieces of graphs too large for "
+            "one factor: this process, others on this machine, or a dask cluster.",
         ),
     ] = "serial",
     scheduler: Annotated[
