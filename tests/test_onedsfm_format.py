@@ -5,8 +5,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import g2o_text, is_onedsfm, onedsfm_files, read_onedsfm, read_rotations
+from sfm_shapefit.formats import (
+    g2o_text,
+    is_g2o,
+    is_onedsfm,
+    onedsfm_files,
+    read_g2o,
+    read_g2o_rotations,
+    read_onedsfm,
+    read_rotations,
+)
 from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.pipeline import solve_graph_file
 from tests.scenes import real_scene
 
 IDENTITY = "1 0 0 0 1 0 0 0 1"
@@ -179,3 +189,83 @@ def test_g2o_numbers_nodes_that_have_names_and_needs_no_rotations():
 def test_g2o_has_no_vertices_in_five_dimensions():
     with pytest.raises(InputError, match="5 dimensions"):
         g2o_text(["0"], np.zeros((1, 5)))
+
+
+def edges_text(cam_from_world, centers, information=""):
+    """All pairs as a pose-graph tool writes them: the pose of j in the axes of i, in metres."""
+    lines = []
+    for i in range(len(centers)):
+        for j in range(i + 1, len(centers)):
+            seen = cam_from_world[i] @ (centers[j] - centers[i])
+            turn = Rotation.from_matrix(cam_from_world[i] @ cam_from_world[j].T).as_quat()
+            numbers = " ".join(map(repr, map(float, [*seen, *turn])))
+            lines.append(f"EDGE_SE3:QUAT {10 * i} {10 * j} {numbers}{information}\n")
+    return "".join(lines)
+
+
+def test_the_edges_of_a_g2o_file_are_relative_poses_and_its_vertices_rotations(tmp_path):
+    cam_from_world, centers = scene()
+    names = [str(10 * k) for k in range(6)]
+    vertices = g2o_text(names, centers, cam_from_world)
+    information = " 1 0 0 0 0 0 1 0 0 0 0 1 0 0 0 1 0 0 1 0 1"
+    file = tmp_path / "graph.g2o"
+    file.write_text(f"# made here\n{vertices}FIX 0\n{edges_text(cam_from_world, centers, information)}")
+    poses = read_g2o(file)
+    assert is_g2o(file)
+    assert poses.names == tuple(names)
+    i, j = poses.pairs.T
+    np.testing.assert_allclose(
+        poses.rotations, cam_from_world[j] @ cam_from_world[i].swapaxes(1, 2), atol=1e-14
+    )
+    rotations, known = read_g2o_rotations(file, poses.names)
+    assert known.all()
+    np.testing.assert_allclose(rotations, cam_from_world, atol=1e-14)
+    graph = poses.view_graph(rotations, known)
+    np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
+
+
+def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
+    cam_from_world, centers = scene()
+    file = tmp_path / "graph.g2o"
+    vertices = g2o_text([str(10 * k) for k in range(6)], np.zeros((6, 3)), cam_from_world)
+    file.write_text(edges_text(cam_from_world, centers) + vertices)
+    found = solve_graph_file(file, rotations=file)
+    assert "6 of 6 rotations of" in found.statement
+    placed, true = (x - x.mean(axis=0) for x in (found.placement.locations, centers))
+    # Exact directions: positions come back but for scale, to the solve's tolerance.
+    np.testing.assert_allclose(placed / np.linalg.norm(placed), true / np.linalg.norm(true), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0", "line 2: has 9 columns, expected 10"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 1 5 5", "line 2: has 12 columns, expected 10"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 x", "line 2: 'x' is not a number"),
+        ("EDGE_SE3:QUAT 1 2 nan 0 0 0 0 0 1", "line 2: has a number that is not finite"),
+        ("EDGE_SE3:QUAT 1 2 1 0 0 0 0 0 2", "line 2: has no unit quaternion"),
+        ("EDGE_SE3:QUAT 1 2 0 0 0 0 0 0 1", "line 2: has no translation"),
+        ("EDGE_SE3:QUAT 2 2 1 0 0 0 0 0 1", "line 2: joins a vertex with itself"),
+        ("EDGE_SE3:QUAT 1 0 1 0 0 0 0 0 1", "line 2: gives a pair for the second time"),
+        ("EDGE_SE2 1 2 1 0 0 1 0 0 1 0 1", "line 2: is neither a vertex nor EDGE_SE3:QUAT"),
+    ],
+)
+def test_malformed_edges_of_g2o_are_refused_by_line(tmp_path, line, words):
+    (tmp_path / "graph.g2o").write_text(f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1\n{line}\n")
+    with pytest.raises(InputError, match=words):
+        read_g2o(tmp_path / "graph.g2o")
+
+
+def test_vertices_that_are_none_twice_or_of_others_are_refused(tmp_path):
+    file = tmp_path / "graph.g2o"
+    vertex = "VERTEX_SE3:QUAT 0 1 2 3 0 0 0 1\n"
+    for text, words in [
+        (vertex * 2, "line 2: gives an earlier vertex a second pose"),
+        (vertex, "has a pose of none of the 1 vertices"),
+        ("VERTEX_SE2 0 1 2 0\n", "has no VERTEX_SE3:QUAT"),
+    ]:
+        file.write_text(text)
+        with pytest.raises(InputError, match=words):
+            read_g2o_rotations(file, ("7",))
+    with pytest.raises(InputError, match="has no EDGE_SE3:QUAT"):
+        read_g2o(file)

@@ -1,11 +1,12 @@
 """The command line's root: commands join it as their modules are loaded."""
 
 import sys
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 from typer.core import TyperGroup
 
+from sfm_shapefit import __version__
 from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination, refuse_little_memory
 
 _ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
@@ -26,8 +27,25 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # its columns break long sentences into one word a line
-    help="Place the cameras of a COLMAP model whose rotations are known.",
+    context_settings={"help_option_names": ["-h", "--help"]},
 )
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"sfm-shapefit {__version__}")  # noqa: T201
+        raise typer.Exit
+
+
+@app.callback()
+def root(
+    *,
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
+    ] = False,
+) -> None:
+    """Place the cameras of a COLMAP model whose rotations are known."""
 
 
 def main() -> None:

@@ -12,7 +12,7 @@ from sfm_shapefit.cli.flags import InputPath, ModelArgument, OutputPath, Quiet, 
 _FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
 
 
-@app.command("convert")
+@app.command("convert", short_help="Write a model in another format.")
 def convert_command(
     model: ModelArgument = None,
     out: Annotated[Path | None, typer.Argument(metavar="OUT", help="File or folder to be made.")] = None,

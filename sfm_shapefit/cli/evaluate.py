@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.evaluation import Evaluation
 
 
-@app.command("evaluate")
+@app.command("evaluate", short_help="Compare a model's poses with those of a reference.")
 def evaluate_command(
     model: ModelArgument = None,
     reference: Annotated[
@@ -52,14 +52,14 @@ def evaluate_command(
 def _evaluation_table(errors: "Evaluation") -> Rows:
     """Return the errors in the reference's units."""
     position, rotation = errors.position, errors.rotation_deg
-    recall = "\n".join(f"{r.recall:7.1%} within {r.threshold:.4g}" for r in errors.recalls)
+    recall = "\n".join(f"{r.recall:.1%} within {r.threshold:.4g}" for r in errors.recalls)
     return [
         ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
         *([("missing", shortened(errors.missing))] if errors.missing else []),
         (
             "position error",
             f"median {position.median:.4g}, mean {position.mean:.4g}, max {position.max:.4g} "
-            f"(extent {errors.extent:.4g})",
+            f"(the reference's cameras extend over {errors.extent:.4g})",
         ),
         (
             "rotation error",

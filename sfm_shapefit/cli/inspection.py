@@ -37,7 +37,7 @@ _INSPECTED = (
 """The options of `locate` that decide what the view graph is and what becomes of it."""
 
 
-@app.command("inspect")
+@app.command("inspect", short_help="Diagnose a model and say what locate would do; write nothing.")
 @takes(LocateOptions, only=_INSPECTED)
 def inspect_command(
     model: Annotated[

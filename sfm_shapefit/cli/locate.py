@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.results import LocateResult
 
 
-@app.command("locate")
+@app.command("locate", short_help="Place the cameras of a model from its rotations and matches.")
 @takes(LocateOptions)
 def locate_command(
     model: ModelArgument = None,

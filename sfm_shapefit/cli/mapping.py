@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.mapping.results import MapResult
 
 
-@app.command("map")
+@app.command("map", short_help="From the matches of a database alone: rotations, then locate.")
 @takes(MapOptions)
 def map_command(
     database: Annotated[

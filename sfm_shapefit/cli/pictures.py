@@ -13,7 +13,7 @@ from sfm_shapefit.cli.flags import Scene, one_path
 Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
 
 
-@app.command("report")
+@app.command("report", short_help="Make report.html again from the other files of OUT.")
 def report_command(out: Output = None, *, scene: Scene = False) -> None:
     """Write OUT/report.html anew from the other files of OUT."""
     folder = one_path(out, None, "OUT")
@@ -30,7 +30,7 @@ def report_command(out: Output = None, *, scene: Scene = False) -> None:
             raise InputError(f"{what}; copy it elsewhere first") from error
 
 
-@app.command("view")
+@app.command("view", short_help="Explore OUT in the browser.")
 def view_command(
     out: Output = None,
     *,

@@ -27,14 +27,15 @@ if TYPE_CHECKING:
     from sfm_shapefit.results import GraphResult
 
 
-@app.command("solve")
+@app.command("solve", short_help="Place the nodes of a bare view graph, or of relative poses.")
 @takes(PlacementOptions)
 def solve_command(
     graph: Annotated[
         Path | None,
         typer.Argument(
             metavar="GRAPH",
-            help="Text file, i j vx vy vz [weight] per line; or 1DSfM's EGs.txt, or its folder.",
+            help="Text file, i j vx vy vz [weight] per line; or relative poses: 1DSfM's EGs.txt or its "
+            "folder, GLOMAP's text, or a g2o file.",
         ),
     ] = None,
     out: OutArgument = None,
@@ -44,7 +45,8 @@ def solve_command(
         typer.Option(
             "--rotations",
             metavar="FILE",
-            help="World-to-camera rotations for EGs.txt, i R11 R12 ... R33 per line; averaged if not given.",
+            help="Rotations for relative poses: 1DSfM's rots.txt, i R11 R12 ... R33 per line, or the "
+            "vertices of a g2o file; averaged if not given.",
         ),
     ] = None,
     max_rotation_error: Annotated[
@@ -53,7 +55,7 @@ def solve_command(
             "--max-rotation-error",
             metavar="DEG",
             min=0.0,
-            help="Leave out pairs of EGs.txt whose rotation contradicts the cameras' by more.",
+            help="Leave out relative poses whose rotation contradicts the cameras' by more.",
         ),
     ] = 10.0,
     reverse: Annotated[

@@ -17,7 +17,7 @@ Images = Annotated[
 ]
 
 
-@app.command("synth")
+@app.command("synth", short_help="Make a synthetic workspace with known truth.")
 @takes(SceneOptions)
 @takes(WorkspaceOptions)
 @takes(RenderOptions)

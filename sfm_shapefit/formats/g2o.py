@@ -1,22 +1,97 @@
-"""Poses and positions as g2o vertices, which pose-graph tools (g2o, GTSAM) read.
+"""g2o files, those of pose-graph tools (g2o, GTSAM): relative poses are read, placed nodes are written.
 
-    VERTEX_SE3:QUAT    id x y z qx qy qz qw      centre and rotation world_from_cam
-    VERTEX_TRACKXYZ    id x y z                  a point, where there is no rotation
-    VERTEX_XY          id x y                    the same in the plane
+    VERTEX_SE3:QUAT    id x y z qx qy qz qw        centre and rotation world_from_cam
+    EDGE_SE3:QUAT      i j x y z qx qy qz qw [21]  cam_i_from_cam_j, whose x y z is camera j seen from i
+    VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
+    VERTEX_XY          id x y                      the same in the plane
 
-Ids are whole numbers: the nodes' own where all are, else 0, 1, ... with the names in comments.
+Of an edge the rotation and the direction of x y z are taken; its length and the 21 numbers of its information
+matrix are not used. Ids are whole numbers: on writing the nodes' own where all are, else 0, 1, ... with the
+names in comments.
 
 Source: Kuemmerle, Grisetti, Strasdat, Konolige, Burgard, "g2o: a general framework for graph
 optimization", ICRA 2011, and its file format.
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse, repeated
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
+from sfm_shapefit.geometry import normalized
+
+_POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
+_POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
+_INFORMATION = 21  # the upper triangle of an edge's information matrix
+_PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
+_FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
+_UNIT_TOLERANCE = 1e-3
+
+
+def is_g2o(source: Path | str) -> bool:
+    """Return whether a path is a text file whose first word is a tag of g2o."""
+    path = Path(source)
+    if not path.is_file():
+        return False
+    try:
+        with path.open(encoding="utf-8") as stream:
+            first = next((words[0] for line in stream if (words := line.split("#", 1)[0].split())), "")
+    except (OSError, UnicodeDecodeError):
+        return False
+    return first.startswith(("EDGE_", *_PASSED_OVER))
+
+
+def read_g2o(path: Path | str) -> EpipolarGeometries:
+    """Read the relative poses of a g2o file; its vertices are passed over, see `read_g2o_rotations`.
+
+    Raises:
+        InputError: if the file is malformed or holds edges of another kind, naming the first bad line.
+    """
+    file = Path(path)
+    numbers, rows = _tagged(file, _RELATIVE_POSE)
+    rows = [row[:-_INFORMATION] if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION else row for row in rows]
+    values = number_table(file, numbers, rows, first=3, width=_RELATIVE_POSE_COLUMNS)
+    names, nodes = node_indices([word for row in rows for word in row[1:3]])
+    pairs = nodes.reshape(-1, 2)
+    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
+    largest = np.abs(values[:, :3]).max(axis=1)
+    refuse(file, numbers, ~(largest > 0.0), "has no translation, so no direction")
+    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    return EpipolarGeometries(
+        names=tuple(names),
+        pairs=pairs,
+        rotations=_rotations(file, numbers, values[:, 3:]).swapaxes(1, 2),
+        to_second=normalized(values[:, :3] / largest[:, None]),  # squares neither overflow nor vanish
+    )
+
+
+def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
+    """Read the vertices' rotations (n, 3, 3) cam_from_world of the named cameras, and (n,) who has one.
+
+    Raises:
+        InputError: if the file is malformed, naming the first bad line, or has none of the cameras.
+    """
+    file = Path(path)
+    numbers, rows = _tagged(file, _POSE)
+    values = number_table(file, numbers, rows, first=2, width=_POSE_COLUMNS)
+    ids = [row[1] for row in rows]
+    refuse(file, numbers, repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
+    rotations = _rotations(file, numbers, values[:, 3:]).swapaxes(1, 2)
+    index = {name: k for k, name in enumerate(names)}
+    inside = [k for k, name in enumerate(ids) if name in index]
+    if not inside:
+        raise InputError(
+            f"{file} has a pose of none of the {len(names)} vertices of the edges; check its ids"
+        )
+    found, known = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros(len(names), dtype=np.bool_)
+    where = [index[ids[k]] for k in inside]
+    found[where], known[where] = rotations[inside], True
+    return found, known
 
 
 def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray | None = None) -> str:
@@ -49,3 +124,22 @@ def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray 
 
 def _one_line(name: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in name)
+
+
+def _tagged(file: Path, tag: str) -> tuple[list[int], list[list[str]]]:
+    """Return numbers and words of the lines of one tag; edges that are not understood are refused."""
+    numbers, rows = read_lines(file, _FORM)
+    known = {_POSE, _RELATIVE_POSE}
+    strange = [row[0] not in known and not row[0].startswith(_PASSED_OVER) for row in rows]
+    refuse(file, numbers, np.array(strange), f"is neither a vertex nor {_FORM}, which alone can be read")
+    chosen = [k for k, row in enumerate(rows) if row[0] == tag]
+    if not chosen:
+        raise InputError(f"{file} has no {tag}; give a pose graph in three dimensions")
+    return [numbers[k] for k in chosen], [rows[k] for k in chosen]
+
+
+def _rotations(file: Path, numbers: list[int], quaternions: FloatArray) -> FloatArray:
+    """Return the rotations (k, 3, 3) of quaternions x, y, z, w, which must be of length 1."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit quaternion qx qy qz qw")
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix())

@@ -13,7 +13,14 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import first_words, node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import (
+    first_words,
+    node_indices,
+    number_table,
+    read_lines,
+    refuse,
+    repeated,
+)
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.geometry import normalized
@@ -53,10 +60,7 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     refuse(
         file, numbers, ~(np.linalg.norm(translations, axis=1) > 0.0), "has no translation, so no direction"
     )
-    keys = np.sort(pairs, axis=1)
-    first = np.zeros(len(keys), dtype=np.bool_)
-    first[np.unique(keys, axis=0, return_index=True)[1]] = True
-    refuse(file, numbers, ~first, "gives a pair for the second time")
+    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     rotations = np.array([rotation_from_quaternion(q) for q in quaternions])
     return EpipolarGeometries(
         names=tuple(names),

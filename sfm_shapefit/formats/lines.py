@@ -112,6 +112,13 @@ def refuse(file: Path, numbers: list[int], bad: BoolArray, reason: str) -> None:
         raise InputError(f"{file}, line {numbers[int(np.argmax(bad))]}: {reason}")
 
 
+def repeated(rows: IntArray) -> BoolArray:
+    """Return which of (k, c) rows occurred before."""
+    found = np.ones(len(rows), dtype=np.bool_)
+    found[np.unique(rows, axis=0, return_index=True)[1]] = False
+    return found
+
+
 def _is_number(word: str) -> bool:
     try:
         float(word)

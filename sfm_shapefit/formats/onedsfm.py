@@ -24,7 +24,14 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import first_words, node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import (
+    first_words,
+    node_indices,
+    number_table,
+    read_lines,
+    refuse,
+    repeated,
+)
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -112,7 +119,7 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
     lengths = np.linalg.norm(translations, axis=1)
     refuse(file, numbers, np.abs(lengths - 1.0) > _ROTATION_TOLERANCE, "has no unit direction at its end")
     refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
-    refuse(file, numbers, _repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
+    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
     found = EpipolarGeometries(
         names=tuple(names),
         pairs=pairs,
@@ -138,7 +145,7 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
     index = {name: k for k, name in enumerate(names)}
     ids = [row[0] for row in rows]
     _, as_node = node_indices(ids)
-    refuse(file, numbers, _repeated(as_node[:, None]), "gives an earlier camera a second rotation")
+    refuse(file, numbers, repeated(as_node[:, None]), "gives an earlier camera a second rotation")
     inside = [k for k, name in enumerate(ids) if name in index]
     if not inside:
         raise InputError(f"{file} has a rotation of none of the {len(names)} cameras; check its ids")
@@ -205,10 +212,3 @@ def _nearest_rotations(matrices: FloatArray) -> FloatArray:
     """Return the rotations nearest to (k, 3, 3) matrices that are rotations but for rounding."""
     u, _, vt = np.linalg.svd(matrices)
     return np.asarray(u @ vt)
-
-
-def _repeated(rows: IntArray) -> BoolArray:
-    """Return which rows occurred before."""
-    repeated = np.ones(len(rows), dtype=np.bool_)
-    repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
-    return repeated

@@ -32,7 +32,7 @@ ExecutorKind = Literal["serial", "processes", "dask"]
 MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work, and 230 MB."""
 _RETRIES = 3  # of a task whose worker died, by dask
-_NO_DASK = "the executor dask needs dask.distributed; install sfm_shapefit[dask]"
+_NO_DASK = "the executor dask needs dask.distributed: pip install '.[dask]' in the folder of sfm_shapefit"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

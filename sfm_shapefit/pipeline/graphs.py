@@ -12,8 +12,11 @@ from sfm_shapefit.colmap.foreign import relative_poses_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import (
     EpipolarGeometries,
+    is_g2o,
     is_onedsfm,
     is_relative_poses,
+    read_g2o,
+    read_g2o_rotations,
     read_graph,
     read_onedsfm,
     read_relative_poses,
@@ -53,11 +56,13 @@ def solve_graph_file(
 
     Args:
         path: a text file, see `formats.read_graph`; or relative poses: a 1DSfM folder or EGs.txt, see
-            `formats.read_onedsfm`, GLOMAP's text, see `formats.read_relative_poses`, or a pose graph.
+            `formats.read_onedsfm`, GLOMAP's text, see `formats.read_relative_poses`, the edges of a g2o file,
+            see `formats.read_g2o`, or a pose graph.
         options: settings; defaults if None.
-        rotations: rots.txt of a 1DSfM source, see `formats.read_rotations`; averaged by pycolmap if None.
-        max_rotation_error_deg: pairs of a 1DSfM source whose relative rotation contradicts those of the
-            cameras by more are left out, as `locate` leaves out such relative poses.
+        rotations: of the cameras of relative poses: 1DSfM's rots.txt, see `formats.read_rotations`, or the
+            vertices of a g2o file; averaged by pycolmap if None.
+        max_rotation_error_deg: relative poses whose rotation contradicts those of the cameras by more are
+            left out, as `locate` leaves them out.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
         progress: called as stages advance.
         executor: solves a graph in pieces whose factor would be too large for one machine; none if None.
@@ -107,6 +112,8 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
         return relative_poses_of(source)
     if is_onedsfm(source):
         return read_onedsfm(source)
+    if is_g2o(source):
+        return read_g2o(source)
     return read_relative_poses(source) if is_relative_poses(source) else None
 
 
@@ -132,7 +139,8 @@ def _rotations(geometries: EpipolarGeometries, path: Path | str | None) -> _Rota
     """Return the rotations of a file, or averaged ones."""
     total = len(geometries.names)
     if path is not None:
-        given, known = read_rotations(path, geometries.names)
+        read = read_g2o_rotations if is_g2o(path) else read_rotations
+        given, known = read(path, geometries.names)
         return _Rotations(given, known, f"{int(np.sum(known))} of {total} rotations of {path}")
     averaged, known = average_rotations(total, geometries.pairs, geometries.rotations)
     statement = f"{int(np.sum(known))} of {total} rotations averaged by pycolmap"

@@ -372,7 +372,8 @@ def _choose(
     difference = costs["LUD"] - costs["ShapeFit"]
     if apart <= COLLAPSED:
         name = "LUD" if difference < 0.0 else "ShapeFit"
-        return by_name[name], f"both starts agree (lengths to {apart:.0%}); {name} fits no worse"
+        apart_text = f"the starts' lengths differ by {apart:.0%}, not by a collapse"
+        return by_name[name], f"{apart_text}; {name} fits no worse"
     if abs(difference) <= _TIE * min(costs.values()):
         return by_name["LUD"], (
             f"the starts disagree (lengths by {apart:.0%}) and fit alike: LUD, whose lengths cannot collapse"

@@ -6,6 +6,7 @@
     f8: Float64Array, f4: Float32Array, i4: Int32Array, u4: Uint32Array, u2: Uint16Array, u1: Uint8Array,
   };
   const VERDICTS = ["agrees", "contradicts", "undetermined", "no direction"];
+  const PAIRS = ["Pairs that agree", "that contradict", "that cannot be judged", "without a direction"];
   const VARIABLES = ["--agrees", "--contradicts", "--undetermined", "--nodirection"];
   const RAMP = [[0, "#b3202c"], [0.4, "#e8743b"], [0.7, "#e9c54a"], [1, "#2a9d8f"]];
   const STATES = {
@@ -229,7 +230,7 @@
       if (!pairsOf[code].length) return;
       const lines = pairLines(pairsOf[code]);
       const shown = code === 3 ? false : pairsOf[code].length <= MANY_PAIRS;
-      addLayer(verdict, `Pairs: ${verdict} (${count(pairsOf[code].length)})`, VARIABLES[code], shown, [trace({
+      addLayer(verdict, `${PAIRS[code]} (${count(pairsOf[code].length)})`, VARIABLES[code], shown, [trace({
         x: lines.x, y: lines.y, z: lines.z, customdata: lines.pair, kind: "pair",
         opacity: code === 0 ? Math.max(Math.min(6 / Math.sqrt(pairsOf[code].length + 1), 0.6), 0.15) : 0.75,
         line: { color: color(VARIABLES[code]), width: code === 0 ? 1.5 : 2 },
