@@ -237,6 +237,22 @@ def test_a_peer_is_beaten_by_error_or_by_time():
     assert not graph_peers.checks(without_ours)[0].met
 
 
+def test_only_a_real_graph_of_cameras_alone_is_held_to_the_limit_of_time():
+    def measured(num_points, seconds):
+        return solver.RealGraph(
+            name="set", num_cameras=100, num_points=num_points, num_edges=800, method="newton",
+            converged=True, objective=1e-3, gap=1e-9, factorisations=12,
+            wall_s=(seconds,), newton_s=(seconds,), distance=0.0,
+        )  # fmt: skip
+
+    def verdicts(one):
+        return {check.name: check.met for check in solver.real_checks(one)}
+
+    assert verdicts(measured(0, 0.05)) == {"gap": True, "factorisations": True, "ms": False}
+    assert verdicts(measured(0, 0.03)) == {"gap": True, "factorisations": True, "ms": True}
+    assert verdicts(measured(250, 0.05)) == {"gap": True, "factorisations": True}
+
+
 # --- the commands ----------------------------------------------------------------------------------
 
 
@@ -295,7 +311,8 @@ def test_the_solver_benchmark_writes_its_section(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_a_real_graph_is_solved_to_its_optimum():
     scene = real_scene("fountain-P11")
-    found = solver.measure_real(scene.name, scene)
+    found = solver.measure_real(scene.name, scene, "never")
+    assert (found.num_cameras, found.num_points) == (11, 0)
     assert found.converged
     assert found.gap <= solver.TOL
     # The optimum is 5e-5 and flat to second order: a gap of 1e-8 leaves 1e-6 or so in locations.

@@ -123,7 +123,7 @@ def certify(
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
-        UnsolvableError: if the dual must be repaired and the graph is not connected.
+        UnsolvableError: if the dual must be repaired, no factor is given, and the graph is not connected.
     """
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, dual)
@@ -296,12 +296,13 @@ def _preconditioner(
     graph: ViewGraph, stiffness: FloatArray, factor: LaplacianFactor | None, threads: int
 ) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
-    components = int(graph.components().max()) + 1
-    if components > 1:
-        raise UnsolvableError(
-            f"the graph falls into {components} connected components; certify each one separately"
-        )
-    factor = laplacian_factor(graph, threads=threads) if factor is None else factor
+    if factor is None:  # whoever has a factor has looked, and on large graphs the look takes much memory
+        components = int(graph.components().max()) + 1
+        if components > 1:
+            raise UnsolvableError(
+                f"the graph falls into {components} connected components; certify each one separately"
+            )
+        factor = laplacian_factor(graph, threads=threads)
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32
