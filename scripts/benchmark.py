@@ -7,7 +7,7 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, onedsfm, peers, real, rigs, scale, solver, trust
+from benchmarks import coherent, directions, families, onedsfm, peers, real, rigid, rigs, scale, solver, trust
 from benchmarks import map as mapping
 
 SUBCOMMANDS = {
@@ -15,6 +15,7 @@ SUBCOMMANDS = {
     "solver": solver,
     "scale": scale,
     "graphs": families,
+    "rigidity": rigid,
     "peers": peers,
     "onedsfm": onedsfm,
     "directions": directions,
