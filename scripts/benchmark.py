@@ -7,7 +7,22 @@ import argparse
 import sys
 from collections.abc import Sequence
 
-from benchmarks import coherent, directions, families, onedsfm, peers, real, rigid, rigs, scale, solver, trust
+from benchmarks import (
+    coherent,
+    directions,
+    endtoend,
+    families,
+    forecasts,
+    onedsfm,
+    partitioned,
+    peers,
+    real,
+    rigid,
+    rigs,
+    scale,
+    solver,
+    trust,
+)
 from benchmarks import map as mapping
 
 SUBCOMMANDS = {
@@ -23,6 +38,9 @@ SUBCOMMANDS = {
     "coherent": coherent,
     "rigs": rigs,
     "map": mapping,
+    "endtoend": endtoend,
+    "forecast": forecasts,
+    "partitioned": partitioned,
 }
 
 

@@ -2,7 +2,7 @@
 
     cut       cameras into parts that few pairs join (`laplacian.partition`)
     overlap   each part with its neighbours that see it best, a share of its own size
-    solve     each piece: its largest rigid body, certified ShapeFit and the robust finish, in any executor
+    solve     each rigid body of each piece: certified ShapeFit and the robust finish, in any executor
     merge     log scales of pieces by the medians of length ratios between shared cameras, then shifts by the
               medians of their offsets, both as least absolute deviations over all pairs of pieces that share
               enough; rotations are common, so nothing turns
@@ -12,7 +12,8 @@
 A piece ties to another one by four shared cameras or more; with fewer its scale would be a guess, and the
 map would tear there. Pieces outside the largest body of tied ones start at their neighbours instead. The
 pieces' certificates prove their own optima, not one of the whole. Where one machine holds the factor of the
-graph the whole solve is better: as exact and in less time in all (`is_worth_it`).
+graph the whole solve is better: as exact, and in less time in all. Where most pairs would join two pieces, as
+in random graphs, pieces know too little, and the whole solve goes on without a factor (`choose_pieces`).
 
 Partition and merge follow Zhu et al., "Very large-scale global SfM by distributed motion averaging", CVPR
 2018.
@@ -31,14 +32,20 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.partition import partition
-from sfm_shapefit.rigidity import rigid_pieces
-from sfm_shapefit.robust.finish import finish
+from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.robust.finish import Finish, finish, finish_merged
 from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.solver.angular import AngularResult, Metric, plan_refinement, refine_angles
+from sfm_shapefit.solver.angular import plan_refinement
 from sfm_shapefit.solver.iterative import IterativeNormal
-from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.options import SolverResult, Status
+from sfm_shapefit.solver.program import projected_length
+from sfm_shapefit.solver.solve import solve, uncertified
 from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.workers import answers
 
+_CAMERAS_PER_PIECE = 15_000
+_LEAST_PIECES = 4  # of a graph that does not fit: half of it would hardly be smaller
+_LARGEST_CUT = 0.5  # share of pairs between parts
 _OVERLAP = 0.15  # of a part; 10 % costs twice the error of 25 % before the refinement, none after it
 _LEAST_LINKS = 3  # pairs of a neighbour with the part
 _LEAST_SHARED = 4  # cameras, to tie two pieces
@@ -56,6 +63,7 @@ class PieceTask:
     cameras: IntArray
     """(n,) the cameras of its nodes in the whole graph."""
     covariance: FloatArray | None
+    classes: IntArray
     options: PlacementOptions
 
 
@@ -78,64 +86,87 @@ class PieceSolution:
 class PartitionedResult:
     """A whole graph placed in pieces."""
 
-    locations: FloatArray
-    """(n, d) centred, of unit norm."""
-    merged: FloatArray
-    """(n, d) before the refinement of the whole."""
+    solve: SolverResult
+    """The merged locations, with what the pieces' certificates prove; none is of the whole."""
+    finish: Finish
+    """The refinement of the whole."""
     pieces: tuple[PieceSolution, ...]
     num_merged: int
     """Pieces that are tied to one another; the cameras of the others started at their neighbours."""
     num_spread: int
     """Cameras that no merged piece places."""
-    refined: AngularResult
-    """The refinement of the whole."""
 
 
-def is_worth_it(graph: ViewGraph, options: PlacementOptions) -> bool:
-    """Return whether the factor of the whole graph is too large for one machine, the one use of pieces."""
-    return plan_refinement(graph, options.factor_memory * 1_000_000) is None
+def choose_pieces(graph: ViewGraph, options: PlacementOptions) -> IntArray | None:
+    """Return the part of each camera (n,), or None where the whole solve is better.
+
+    It is where the factor of the whole fits into `options.factor_memory`, and where most pairs would be cut.
+    """
+    if options.objective != "auto" or not options.refine:
+        return None  # another answer is wanted
+    if plan_refinement(graph, options.factor_memory * 1_000_000) is not None:
+        return None
+    count = max(_LEAST_PIECES, -(-graph.num_cameras // _CAMERAS_PER_PIECE))
+    part_of = partition(adjacency(graph.num_cameras, graph.edges), count)
+    cut = np.mean(part_of[graph.edges[:, 0]] != part_of[graph.edges[:, 1]])
+    return None if cut > _LARGEST_CUT else part_of
 
 
 def place_partitioned(
     graph: ViewGraph,
-    num_pieces: int,
+    part_of: IntArray,
     options: PlacementOptions | None = None,
     covariance: FloatArray | None = None,
+    classes: IntArray | None = None,
     executor: Executor | None = None,
 ) -> PartitionedResult:
     """Place a rigid view graph in overlapping pieces, and refine it as a whole.
 
     Args:
         graph: connected and parallel rigid.
-        num_pieces: at least 1; about its number of cameras over that which a machine holds.
+        part_of: (n,) the part of each camera, see `choose_pieces`.
         options: of each piece; `factor_memory` decides how the whole is refined.
         covariance: (m, d - 1, d - 1) of each direction; None if unknown.
+        classes: (m,) 0 for pairs of cameras, 1 for directions to points; None: all 0.
         executor: solves the pieces; they are solved here, one by one, if None.
 
     Raises:
         UnsolvableError: if no piece can be solved.
+        WorkerError: if a worker died and the executor does not replace it.
     """
-    options = options or PlacementOptions()
-    tasks = piece_tasks(graph, num_pieces, options, covariance)
+    options, start = options or PlacementOptions(), time.perf_counter()
+    classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
+    tasks = piece_tasks(graph, part_of, options, covariance, classes)
     if executor is None:
         found = [solve_piece(task) for task in tasks]
     else:
-        futures = [executor.submit(solve_piece, task) for task in tasks]
-        found = [future.result() for future in futures]
-    pieces = tuple(piece for piece in found if piece is not None)
+        found = list(answers(executor, solve_piece, tasks))
+    pieces = tuple(piece for part in found for piece in part)
     if not pieces:
-        raise UnsolvableError(f"none of the {num_pieces} pieces has three rigid cameras; take fewer")
+        raise UnsolvableError("no piece has four rigid cameras; leave out the executor")
     merged, num_merged, num_spread = merge(graph, pieces)
-    metric = Metric(covariance, np.zeros(graph.num_edges, dtype=np.int64))
-    plan = plan_refinement(graph, options.factor_memory * 1_000_000)
-    refined = refine_angles(graph, merged, metric, IterativeNormal(graph) if plan is None else plan)
+    if not projected_length(graph, merged) > 0.0:
+        raise UnsolvableError("the pieces do not fit together; leave out the executor")
+    reason = _statement(pieces, num_merged, num_spread)
+    solved = uncertified(graph, merged, Status.IN_PIECES, "pieces", reason, start)
+    plan = plan_refinement(graph, options.factor_memory * 1_000_000) or IterativeNormal(graph)
     return PartitionedResult(
-        locations=refined.locations,
-        merged=merged,
+        solve=solved,
+        finish=finish_merged(graph, merged, covariance, classes, plan, "the merged pieces are the one start"),
         pieces=pieces,
         num_merged=num_merged,
         num_spread=num_spread,
-        refined=refined,
+    )
+
+
+def _statement(pieces: tuple[PieceSolution, ...], num_merged: int, num_spread: int) -> str:
+    """Say how the pieces were put together."""
+    largest = max(len(piece.cameras) for piece in pieces)
+    gap = max(piece.gap for piece in pieces)
+    loose = f"; {num_spread} cameras started at their neighbours" if num_spread else ""
+    return (
+        f"the factor of the whole would be too large: {len(pieces)} pieces of up to {largest} cameras, each "
+        f"certified to {gap:.1e} or better, {num_merged} of them merged{loose}"
     )
 
 
@@ -143,10 +174,13 @@ def place_partitioned(
 
 
 def piece_tasks(
-    graph: ViewGraph, num_pieces: int, options: PlacementOptions, covariance: FloatArray | None
+    graph: ViewGraph,
+    part_of: IntArray,
+    options: PlacementOptions,
+    covariance: FloatArray | None,
+    classes: IntArray,
 ) -> Iterator[PieceTask]:
     """Yield the overlapping pieces of a graph."""
-    part_of = partition(adjacency(graph.num_cameras, graph.edges), num_pieces)
     for part in range(int(part_of.max()) + 1):
         inside = part_of == part
         inside[_overlap(graph, part_of == part)] = True
@@ -155,7 +189,9 @@ def piece_tasks(
             continue
         piece, cameras = graph.restricted_to(rows)
         known = None if covariance is None else covariance[rows]
-        yield PieceTask(graph=piece, cameras=cameras, covariance=known, options=options)
+        yield PieceTask(
+            graph=piece, cameras=cameras, covariance=known, classes=classes[rows], options=options
+        )
 
 
 def _overlap(graph: ViewGraph, inside: BoolArray) -> IntArray:
@@ -168,20 +204,28 @@ def _overlap(graph: ViewGraph, inside: BoolArray) -> IntArray:
     return np.asarray(order[links[order] >= _LEAST_LINKS], dtype=np.int64)
 
 
-def solve_piece(task: PieceTask) -> PieceSolution | None:
-    """Return the largest rigid body of a piece, solved, certified and refined; None if it has none."""
+def solve_piece(task: PieceTask) -> list[PieceSolution]:
+    """Return the rigid bodies of a piece, most cameras first, solved, certified and refined each."""
+    found = []
+    for body in sorted(rigid_pieces(task.graph), key=lambda body: -len(body.cameras)):
+        if len(body.cameras) < _LEAST_SHARED:
+            break
+        solution = _solve_body(task, body)
+        if solution is not None:
+            found.append(solution)
+    return found
+
+
+def _solve_body(task: PieceTask, body: RigidPiece) -> PieceSolution | None:
+    """Return one rigid body's solution; None if the solver refuses it."""
     start = time.perf_counter()
-    bodies = rigid_pieces(task.graph)
-    if not bodies or len(bodies[0].cameras) < _LEAST_SHARED:
-        return None
-    body = max(bodies, key=lambda piece: len(piece.cameras))
     graph, nodes = task.graph.restricted_to(body.edges)
     known = None if task.covariance is None else task.covariance[body.edges]
     try:
         solved = solve(graph, replace(task.options, uniqueness=False))
     except UnsolvableError:
         return None
-    finished = finish(graph, solved, task.options, known)
+    finished = finish(graph, solved, task.options, known, task.classes[body.edges])
     unit = 1 if sys.platform == "darwin" else 1024  # bytes there, kilobytes elsewhere
     return PieceSolution(
         cameras=task.cameras[nodes],
@@ -204,7 +248,7 @@ def merge(graph: ViewGraph, pieces: tuple[PieceSolution, ...]) -> tuple[FloatArr
     ratios = np.array([_log_ratio(a, b) for _, _, a, b in ties]).reshape(-1, 1)
     scales = np.exp(_potentials(len(pieces), pairs, ratios))[:, 0]
     offsets = [np.median(scales[q] * b - scales[p] * a, axis=0) for p, q, a, b in ties]
-    shifts = _potentials(len(pieces), pairs, np.array(offsets).reshape(len(ties), -1), graph.dimension)
+    shifts = _potentials(len(pieces), pairs, np.array(offsets).reshape(len(ties), graph.dimension))
 
     total, count = np.zeros((graph.num_cameras, graph.dimension)), np.zeros(graph.num_cameras)
     for p in sorted(joined):
@@ -246,10 +290,10 @@ def _largest_body(count: int, pairs: list[tuple[int, int]]) -> set[int]:
     return {p for p in range(count) if body[p] == largest}
 
 
-def _potentials(count: int, pairs: IntArray, wanted: FloatArray, width: int = 1) -> FloatArray:
-    """Return h (count, c) of least sum |h_p - h_q - wanted| over the pairs, of mean 0; 0 without pairs."""
+def _potentials(count: int, pairs: IntArray, wanted: FloatArray) -> FloatArray:
+    """Return h (count, c) of least sum |h_p - h_q - wanted (m, c)| over the pairs; 0 without pairs."""
     if len(pairs) == 0:
-        return np.zeros((count, width))
+        return np.zeros((count, wanted.shape[1]))
     rows = np.zeros((len(pairs), count))
     rows[np.arange(len(pairs)), pairs[:, 0]] = 1.0
     rows[np.arange(len(pairs)), pairs[:, 1]] = -1.0

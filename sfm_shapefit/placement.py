@@ -5,6 +5,7 @@ its own. The largest is the answer; the others are kept apart.
 """
 
 from collections.abc import Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.partitioned import choose_pieces, place_partitioned
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
 from sfm_shapefit.robust.options import Filter, PlacementOptions
@@ -112,6 +114,7 @@ def place(
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
     on_iteration: OnIteration | None = None,
+    executor: Executor | None = None,
 ) -> Placement:
     """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
 
@@ -122,6 +125,7 @@ def place(
         evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
         num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
         on_iteration: called after each iteration of the solve, on graphs where that costs little.
+        executor: solves a graph in pieces whose factor is too large for one machine; see `partitioned`.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
@@ -136,7 +140,8 @@ def place(
         for piece in ordered_pieces(considered, num_cameras)
     ]
     refuse_without_triangle(considered, pieces, num_cameras)
-    return _place_piece(graph, (dropped, pieces), 0, options, covariance, evidence, num_cameras, on_iteration)
+    parts = dropped, pieces
+    return _place_piece(graph, parts, 0, options, covariance, evidence, num_cameras, on_iteration, executor)
 
 
 def place_further(
@@ -216,6 +221,7 @@ def _place_piece(
     evidence: Evidence | None,
     num_cameras: int,
     on_iteration: OnIteration | None = None,
+    executor: Executor | None = None,
 ) -> Placement:
     """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`.
 
@@ -233,11 +239,16 @@ def _place_piece(
         history.append(info)
         return None if on_iteration is None else on_iteration(info)
 
-    if options.solves_shapefit:
-        solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
+    part_of = None if executor is None else choose_pieces(piece, options)
+    if part_of is not None:
+        joined = place_partitioned(piece, part_of, options, known, classes, executor)
+        solved, finished = joined.solve, joined.finish
     else:
-        solved = solve_baseline(piece, options.objective)
-    finished = finish(piece, solved, options, known, classes)
+        if options.solves_shapefit:
+            solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
+        else:
+            solved = solve_baseline(piece, options.objective)
+        finished = finish(piece, solved, options, known, classes)
     placed = int(np.sum(nodes < num_cameras))
     memory, back = options.factor_memory, finished.put_back
     assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory=memory)

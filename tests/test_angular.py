@@ -297,10 +297,8 @@ def test_a_class_that_is_not_fitted_yet_keeps_its_level():
 def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
     graph = graph_of(random_graph_problem(20, 0.8, seed=1))
     assert plan_refinement(graph) is not None
-    with monkeypatch.context() as patch:
-        patch.setattr(angular, "_MAX_FLOPS", 10.0)
-        assert plan_refinement(graph) is None
-    monkeypatch.setattr(angular, "_MAX_BYTES", 10)
+    assert plan_refinement(graph, max_bytes=10) is None
+    monkeypatch.setattr(angular, "_MAX_FLOPS", 10.0)
     assert plan_refinement(graph) is None
 
 

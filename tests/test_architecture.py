@@ -13,6 +13,7 @@ PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 LAYERS = [
     "errors",
     "arrays",
+    "workers",
     "output",
     "jit",
     "geometry",
@@ -28,8 +29,8 @@ LAYERS = [
     "robust",
     "epipolar",
     "rotations",
-    "placement",
     "partitioned",
+    "placement",
     "body_placement",
     "gauge",
     "evaluation",

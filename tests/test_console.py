@@ -30,7 +30,7 @@ def assert_counted_up(steps: list[tuple[int, int]], total: int) -> None:
     assert inner[-1] == (total, total)
 
 
-def test_locate_counts_pairs_iterations_and_images():
+def test_locate_counts_pairs_and_images():
     stages = stages_of(lambda progress: locate(RING / "sparse/0", progress=progress))
     assert list(stages) == [
         "read",
@@ -44,18 +44,18 @@ def test_locate_counts_pairs_iterations_and_images():
     assert_counted_up(stages["directions"], 16)  # verified pairs of the 8 images
     assert_counted_up(stages["structure"], 16)
     assert_counted_up(stages["triangulation"], 8)
-    iterations = stages["solve"][1:-1]
-    assert [done for done, _ in iterations] == list(range(1, len(iterations) + 1))
-    assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
 
 
-def test_tracks_of_a_model_are_counted_by_its_images():
+def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations():
     stages = stages_of(
         lambda progress: locate(
             FACADE / "sparse/0", options=LocateOptions(directions="tracks"), progress=progress
         )
     )
     assert_counted_up(stages["directions"], 9)
+    iterations = stages["solve"][1:-1]
+    assert [done for done, _ in iterations] == list(range(1, len(iterations) + 1))
+    assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
 
 
 @pytest.mark.slow

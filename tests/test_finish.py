@@ -100,7 +100,7 @@ def test_without_refinement_the_start_that_fits_better_is_kept_as_it_is(chain):
 
 
 def start(name: str) -> Start:
-    return Start(name=name, locations=np.eye(3), refined=None)
+    return Start(name=name, locations=np.eye(3), refined=None, put_back=np.empty(0, dtype=np.int64))
 
 
 @pytest.mark.parametrize(

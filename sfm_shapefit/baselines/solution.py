@@ -7,11 +7,11 @@ import time
 
 import numpy as np
 
-from sfm_shapefit.arrays import frozen
 from sfm_shapefit.baselines.locators import LOCATORS
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.options import SolverResult, Status
-from sfm_shapefit.solver.program import normalized_locations, objective, projected_length
+from sfm_shapefit.solver.program import projected_length
+from sfm_shapefit.solver.solve import uncertified
 from sfm_shapefit.viewgraph import ViewGraph
 
 
@@ -31,17 +31,5 @@ def solve_baseline(graph: ViewGraph, name: str) -> SolverResult:
         raise UnsolvableError(
             f"{name} found no finite locations; check the directions, or choose --objective auto"
         )
-    locations = normalized_locations(graph, located)
-    return SolverResult(
-        locations=frozen(locations),
-        status=Status.NOT_SOLVED,
-        objective=objective(graph, locations),
-        dual_bound=0.0,
-        dual=frozen(np.zeros_like(graph.directions)),
-        equality_residual=0.0,
-        unique=None,
-        iterations=0,
-        seconds=time.perf_counter() - start,
-        method=name,
-        method_reason="as asked; ShapeFit was not solved, so nothing certifies these locations",
-    )
+    reason = "as asked; ShapeFit was not solved, so nothing certifies these locations"
+    return uncertified(graph, located, Status.NOT_SOLVED, name, reason, start)

@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.cli.console import Rows, shortened
-from sfm_shapefit.solver.options import Status
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.adjustment import Adjusted
@@ -24,7 +23,7 @@ def pieces_line(facts: dict[str, Any]) -> Rows:
 def objective_line(solve: "SolverResult") -> str:
     """Say what the solver reached, how sure that is, and which solver it was."""
     chosen = f"{solve.method}: {solve.method_reason}"
-    if solve.status is Status.NOT_SOLVED:
+    if not solve.status.has_certificate:
         return f"{solve.objective:.6g}, not certified ({chosen})"
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
 

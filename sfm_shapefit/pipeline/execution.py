@@ -12,7 +12,7 @@ task to another one.
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
@@ -24,7 +24,8 @@ from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions import DirectionOptions, PairDirections, concatenate, estimate_directions
-from sfm_shapefit.errors import InputError, ShapeFitError
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.workers import WorkerError, answers
 
 ExecutorKind = Literal["serial", "processes", "dask"]
 
@@ -32,10 +33,6 @@ MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work, and 230 MB."""
 _RETRIES = 3  # of a task whose worker died, by dask
 _NO_DASK = "the executor dask needs dask.distributed; install sfm_shapefit[dask]"
-
-
-class WorkerError(ShapeFitError):
-    """A worker died, or the scheduler could not be reached."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,20 +87,11 @@ def shared_out(
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
     parts = database.parts(matches_per_task)
-    futures = [
-        executor.submit(
-            measure_task, DirectionTask(database=path, part=part, cameras=cameras, options=options)
-        )
-        for part in parts
-    ]
+    tasks = [DirectionTask(database=path, part=part, cameras=cameras, options=options) for part in parts]
     found: list[PairDirections] = []
-    try:
-        for (_, stop), future in zip(parts, futures, strict=True):
-            found += _answer(future)
-            advance(stop, database.num_pairs)
-    finally:
-        for future in futures:
-            future.cancel()
+    for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
+        found += measured
+        advance(stop, database.num_pairs)
     return found
 
 
@@ -116,19 +104,6 @@ def measure_task(task: DirectionTask) -> list[PairDirections]:
             for batch in database.iter_matches(1, part=task.part)
         ]
     return [concatenate(found)] if found else []
-
-
-def _answer(future: "Future[list[PairDirections]]") -> list[PairDirections]:
-    """Return what a worker found; an error of the input passes as it is."""
-    try:
-        return future.result()
-    except ShapeFitError:
-        raise
-    except Exception as error:
-        what = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise WorkerError(
-            f"a worker failed ({what}); check its memory and that it sees the database, and run again"
-        ) from error
 
 
 @contextmanager

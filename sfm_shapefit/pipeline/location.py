@@ -59,8 +59,9 @@ def locate(
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
-        executor: shares out the pairs of a database among its workers, which must see its file; the
-            answer is the same to the bit. None: they are measured here.
+        executor: shares out the pairs of a database among its workers, which must see its file, with the same
+            answer to the bit; and solves a graph in pieces whose factor would be too large for one machine.
+            None: all is done here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -94,6 +95,8 @@ def locate(
         min_triangulation_angle_deg     1.5         filter of points
         bundle_adjust                   False       adjust poses and points; intrinsics stay
         min_trust                       0.6         cameras of less trust are left out; 0 keeps all
+        factor_memory                   2000        MB that one sparse factor may take, or it is left out
+        max_memory                      0           peak memory in MB to stay below; 0 for no limit
         threads                         0           one per core; the answer does not depend on it
 
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
@@ -116,7 +119,7 @@ def locate(
             joint = joint_graph(opened, directions, options)
             source, joint, options = within_memory(opened, directions, joint, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = placed(joint, rigid, evidence, options, clock)
+            placement = placed(joint, rigid, evidence, options, clock, executor)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rigid_gauge(
                 model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)

@@ -6,6 +6,7 @@ taken.
 """
 
 from collections.abc import Callable
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -100,7 +101,12 @@ def rigs_statement(model: PosedModel, joint: JointGraph) -> str:
 
 
 def placed(
-    joint: JointGraph, rigid: Rigid, evidence: Evidence, options: LocateOptions, clock: Clock
+    joint: JointGraph,
+    rigid: Rigid,
+    evidence: Evidence,
+    options: LocateOptions,
+    clock: Clock,
+    executor: Executor | None = None,
 ) -> Placement:
     """Place the view graph, over bodies where there are any.
 
@@ -109,7 +115,7 @@ def placed(
     """
     if rigid.bodies is None:
         settings, k = options.for_placement(), joint.num_cameras
-        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration)
+        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration, executor)
     first = None
     if options.points != "always":
         try:

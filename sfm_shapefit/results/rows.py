@@ -12,7 +12,6 @@ from sfm_shapefit.placement import Placement, count_large
 from sfm_shapefit.report import CameraRow, PairRow, PieceRow
 from sfm_shapefit.rigidity import left_out_reasons
 from sfm_shapefit.robust.verdicts import Verdict
-from sfm_shapefit.solver.options import Status
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"
@@ -104,7 +103,7 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     judged: dict[int, tuple[Placement, int, float]] = {}
     for piece in (placement, *further):
         dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
-        if piece.solve.status is Status.NOT_SOLVED:
+        if not piece.solve.status.has_certificate:
             dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
     dropped = set(placement.dropped.tolist())

@@ -26,7 +26,7 @@ _FEWEST_TWOFOLD = 3  # fewer prove nothing
 
 def quality_warnings(placement: Placement) -> Iterator[str]:
     """Yield what the user should know about a solution, a sentence each."""
-    if placement.solve.status is Status.NOT_SOLVED:
+    if not placement.solve.status.has_certificate:
         yield placement.solve.status.value
     elif placement.solve.status is not Status.CONVERGED:
         yield f"the solve is not certified to the tolerance: {placement.solve.status.value}"

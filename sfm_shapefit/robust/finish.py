@@ -21,6 +21,7 @@ from sfm_shapefit.solver.admm.lud import LudResult, solve_lud
 from sfm_shapefit.solver.angular import (
     AngularResult,
     Metric,
+    NormalFactor,
     agreeing_pairs,
     plan_refinement,
     refine_angles,
@@ -70,7 +71,7 @@ class Finish:
     locations: FloatArray
     """(n, d) centred, scaled like the solver's."""
     start: str
-    """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
+    """The program they come from: "ShapeFit", "LUD", the name of a baseline, or "pieces" of a large graph."""
     refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -205,17 +206,44 @@ def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_
 def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:
     """Return a baseline's answer as it is."""
     start = _unrefined(solved.method, solved.locations)
+    return _alone(graph, start, metric, solved.locations, "the baseline's own answer, as asked")
+
+
+def finish_merged(
+    graph: ViewGraph,
+    merged: FloatArray,
+    covariance: FloatArray | None,
+    classes: IntArray,
+    plan: SymbolicFactor | NormalFactor,
+    reason: str,
+) -> Finish:
+    """Return the robust finish of the locations (n, d) that merged pieces give, as the only start.
+
+    Args:
+        graph, covariance, classes: as in `finish`.
+        merged: where the refinement starts.
+        plan: what it solves its steps with.
+        reason: why there is one start only.
+    """
+    metric = Metric(covariance, classes)
+    start = _refined("pieces", merged, merged, graph, metric, plan, None)
+    return _alone(graph, start, metric, normalized_locations(graph, start.best), reason)
+
+
+def _alone(graph: ViewGraph, start: Start, metric: Metric, locations: FloatArray, reason: str) -> Finish:
+    """Return the finish where there is one start."""
     levels = _common_levels(graph, [start], metric)
+    moved = _moves(start)
     return Finish(
-        locations=solved.locations,
+        locations=locations,
         start=start.name,
-        refined=False,
-        reason="the baseline's own answer, as asked",
+        refined=moved[1] > 0.0,
+        reason=reason,
         disagreement=None,
-        costs={start.name: robust_cost(graph, start.locations, metric, levels)},
+        costs={start.name: robust_cost(graph, start.best, metric, levels)},
         levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=(0.0, 0.0),
-        num_turned_pairs=0,
+        moved=moved,
+        num_turned_pairs=_turned_pairs(graph, start, metric, levels),
         put_back=start.put_back,
         lud=None,
     )
@@ -263,7 +291,7 @@ def _refined(
     home: FloatArray,
     graph: ViewGraph,
     metric: Metric,
-    plan: SymbolicFactor | ReducedFactor | None,
+    plan: SymbolicFactor | NormalFactor | None,
     rival: FloatArray | None,
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round.

@@ -24,7 +24,12 @@ from sfm_shapefit.solver.options import (
     SolverResult,
     Status,
 )
-from sfm_shapefit.solver.program import normalized_locations, projected_length, scale_functional
+from sfm_shapefit.solver.program import (
+    normalized_locations,
+    objective,
+    projected_length,
+    scale_functional,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
@@ -111,6 +116,34 @@ def solve(
         seconds=time.perf_counter() - start,
         method=choice.method,
         method_reason="; ".join(filter(None, [choice.reason, run.note])),
+    )
+
+
+def uncertified(
+    graph: ViewGraph, locations: FloatArray, status: Status, method: str, reason: str, start: float
+) -> SolverResult:
+    """Return locations (n, d) that something else found, in ShapeFit's scale; they have no certificate.
+
+    Args:
+        graph: connected and parallel rigid.
+        locations: finite, and pointing the way the directions do on the whole.
+        status: why there is none.
+        method, reason: what found them, and why that.
+        start: `time.perf_counter()` when it began.
+    """
+    scaled = normalized_locations(graph, locations)
+    return SolverResult(
+        locations=frozen(scaled),
+        status=status,
+        objective=objective(graph, scaled),
+        dual_bound=0.0,
+        dual=frozen(np.zeros_like(graph.directions)),
+        equality_residual=0.0,
+        unique=None,
+        iterations=0,
+        seconds=time.perf_counter() - start,
+        method=method,
+        method_reason=reason,
     )
 
 

@@ -110,6 +110,8 @@ def _certainty(scene: Scene) -> Iterator[str]:
 
 def _optimum(solve: dict[str, Any]) -> str:
     """Say what the certificate proves."""
+    if solve["status"] in ("not_solved", "in_pieces"):
+        return f"Nothing certifies these positions as a whole ({solve['method']}: {solve['method_reason']})."
     unique = {
         True: ", and no other placement is as good",
         False: ", but others may be as good",

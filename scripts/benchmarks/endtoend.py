@@ -1,0 +1,191 @@
+"""End to end at scale: a synthetic workspace as COLMAP would leave it, and `locate` on it.
+
+Each scene is made by `synth` in a folder that is kept if it is given, so that a run can be repeated. `locate`
+runs as a process of its own; its processor time and its peak memory are the system's count of it. Stages are
+compared between sizes by exponents: log(time ratio) / log(ratio of matches), 1 where a stage is linear.
+"""
+
+import argparse
+import json
+import math
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from benchmarks.metrics import Check, number, verdict
+from benchmarks.record import environment, table, write_section
+
+HELP = "synth and locate at thousands of images: time by stage, memory, exponents."
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("numpy", "scipy", "numba", "pycolmap")
+LARGEST = 10_000
+MOST_S, MOST_MB = 600.0, 4000.0  # of the largest
+MATCHES_PER_PAIR, PAIRS_PER_IMAGE, POINTS_PER_IMAGE = 100, 60, 45
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Usage:
+    """What a process took."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Located:
+    """One size."""
+
+    num_images: int
+    num_pairs: int
+    num_matches: int
+    num_placed: int
+    median_error: float
+    """Of the cameras, as a share of the scene's radius."""
+    usage: Usage
+    stages_s: dict[str, float]
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `endtoend`."""
+    parser.add_argument("--images", type=int, nargs="+", default=[2500, LARGEST], help="sizes")
+    parser.add_argument("--folder", type=Path, help="where scenes are kept (default: a temporary folder)")
+    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the section and write it; a missed limit is no failure."""
+    sizes = " ".join(map(str, args.images))
+    about = environment(PACKAGES, f"python scripts/benchmark.py endtoend --images {sizes}")
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = args.folder or Path(temporary)
+        measured = [measure(folder, size) for size in sorted(args.images)]
+    body = section(measured, about)
+    print(body)
+    write_section(args.out, "endtoend", body)
+    return 0
+
+
+def measure(folder: Path, num_images: int) -> Located:
+    """Make a scene of so many images if the folder has none, and locate its cameras."""
+    scene, out = folder / f"facade{num_images}", folder / "out"
+    if not scene.exists():
+        print(f"making {num_images} images", file=sys.stderr, flush=True)
+        command("synth", scene, *_scene_flags(num_images))
+    shutil.rmtree(out, ignore_errors=True)
+    print(f"locating {num_images} images", file=sys.stderr, flush=True)
+    usage, _ = command("locate", scene / "sparse" / "0", out, "--quiet")
+    facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
+    truth = scene / "sparse" / "0"  # its centres are the true ones, which `locate` does not look at
+    _, errors = command("evaluate", out, truth, "--json")
+    located = Located(
+        num_images=num_images,
+        num_pairs=facts["num_pairs"],
+        num_matches=_num_matches(scene / "database.db"),
+        num_placed=facts["num_placed"],
+        median_error=json.loads(errors)["position"]["median"] / _radius(truth),
+        usage=usage,
+        stages_s=facts["timings_s"],
+    )
+    shutil.rmtree(out)
+    return located
+
+
+def _scene_flags(num_images: int) -> Iterator[object]:
+    yield from ("--shape", "facade", "--num-images", num_images)
+    yield from ("--num-points", POINTS_PER_IMAGE * num_images)
+    yield from ("--max-pairs-per-image", PAIRS_PER_IMAGE, "--max-matches-per-pair", MATCHES_PER_PAIR)
+
+
+def command(*words: object) -> tuple[Usage, str]:
+    """Run a command of sfm-shapefit; return what it took and what it printed.
+
+    Raises:
+        RuntimeError: if it fails, with its last line.
+    """
+    start = time.perf_counter()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sfm_shapefit.cli", *map(str, words)],
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    printed = process.stdout.read()
+    _, code, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(code)
+    if process.returncode:
+        raise RuntimeError(f"{words[0]} ended with code {process.returncode}: {printed.strip()[-300:]}")
+    unit = 1 if sys.platform == "darwin" else 1024
+    usage = Usage(
+        wall_s=time.perf_counter() - start,
+        cpu_s=used.ru_utime + used.ru_stime,
+        peak_mb=used.ru_maxrss * unit / 1e6,
+    )
+    return usage, printed
+
+
+def _num_matches(database: Path) -> int:
+    import pycolmap
+
+    with pycolmap.Database.open(database) as opened:
+        return int(opened.num_inlier_matches())
+
+
+def _radius(model: Path) -> float:
+    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.geometry import median_spread
+
+    return median_spread(read_model(model).centers)
+
+
+def section(measured: Sequence[Located], about: str) -> str:
+    """Return the Markdown of all sizes."""
+    rows = []
+    for one in measured:
+        used = one.usage
+        checks = [
+            Check(name="s", value=used.wall_s, limit=MOST_S),
+            Check(name="MB", value=used.peak_mb, limit=MOST_MB),
+        ]
+        rows.append(
+            [
+                str(one.num_images),
+                str(one.num_pairs),
+                str(one.num_matches),
+                str(one.num_placed),
+                f"{one.median_error:.2e}",
+                number(used.wall_s),
+                number(used.cpu_s),
+                number(used.peak_mb),
+                verdict(checks) if one.num_images >= LARGEST else "no target",
+            ]
+        )
+    header = ["images", "pairs", "matches", "placed", "error / radius", "s", "CPU s", "peak MB", "verdict"]
+    parts = ["## Reliability: end to end at scale\n", about, "", table(header, rows)]
+    parts += ["\nSeconds of each stage of `locate`, and the exponent between the smallest and the largest:\n"]
+    return "\n".join([*parts, _stages(measured)])
+
+
+def _stages(measured: Sequence[Located]) -> str:
+    names = list(measured[-1].stages_s)
+    header = ["stage", *[f"{one.num_images} images" for one in measured], "exponent"]
+    rows = []
+    for name in names:
+        seconds = [one.stages_s.get(name, 0.0) for one in measured]
+        rows.append([name, *map(number, seconds), _exponent(measured, seconds)])
+    return table(header, rows)
+
+
+def _exponent(measured: Sequence[Located], seconds: Sequence[float]) -> str:
+    if len(measured) < 2 or min(seconds[0], seconds[-1]) < 0.5:  # too short to say anything
+        return "-"
+    growth = math.log(measured[-1].num_matches / measured[0].num_matches)
+    return f"{math.log(seconds[-1] / seconds[0]) / growth:.2f}"

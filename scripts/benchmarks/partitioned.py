@@ -1,0 +1,217 @@
+"""Beyond one machine: graphs placed in pieces against the whole, directions on a cluster against one process.
+
+Each measurement is a process of its own. The error is the root mean square over cameras after shift and
+scale, as a share of the scene's radius (median distance from the centre). Memory of a worker, and of the
+whole, is the peak less what a process takes that has placed a small graph: packages and compiled code.
+"""
+
+import argparse
+import os
+import signal
+import sys
+import tempfile
+import threading
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.endtoend import command
+from benchmarks.graphs import GraphSpec, draw, view_graph
+from benchmarks.metrics import Check, number, verdict
+from benchmarks.process import call, peak_memory_mb
+from benchmarks.record import environment, table, write_section
+
+HELP = "Placing in pieces against placing whole; directions on a dask cluster against one process."
+ROOT = Path(__file__).parents[2]
+PACKAGES = ("numpy", "scipy", "numba", "pycolmap", "distributed", "pymetis")
+DEGREES = {"geo": 64.0, "comm": 67.0}
+MOST_ERROR, MOST_MEMORY = 1.1, 0.25  # of the whole
+WORKERS = 2
+PIECE = 12_500  # cameras
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Placed:
+    """One way to place a graph."""
+
+    error: float
+    wall_s: float
+    cpu_s: float
+    memory_mb: float
+    """Peak of the process, or of the largest worker."""
+    statement: str
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `partitioned`."""
+    parser.add_argument("--cameras", type=int, default=100_000, help="of each graph (default 1e5)")
+    parser.add_argument("--families", nargs="*", default=list(DEGREES), choices=list(DEGREES))
+    parser.add_argument("--images", type=int, default=1000, help="of the cluster's scene (default 1000)")
+    parser.add_argument("--folder", type=Path, help="where the scene is kept (default: a temporary folder)")
+    parser.add_argument("--timeout", type=float, default=3600.0, help="seconds per measurement")
+    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Measure, print the section and write it; a missed limit is no failure."""
+    about = environment(PACKAGES, f"python scripts/benchmark.py partitioned --cameras {args.cameras}")
+    rows = []
+    for family in args.families:
+        spec = GraphSpec(family=family, n=args.cameras, degree=DEGREES[family], sigma=0.01)
+        rows += graph_rows(spec, args.timeout)
+    with tempfile.TemporaryDirectory() as temporary:
+        cluster = cluster_rows(args.folder or Path(temporary), args.images, args.timeout)
+    body = "\n".join(
+        [
+            "## Reliability: beyond one machine\n",
+            about,
+            f"\nIn pieces: {WORKERS} worker processes here, the whole refined in the parent.\n",
+            table(["graph", "way", "error / radius", "s", "CPU s", "memory, MB", "verdict", "how"], rows),
+            f"\nDirections of {args.images} images, {WORKERS} dask workers of one thread each:\n",
+            table(["way", "s", "speed-up", "same bits"], cluster),
+        ]
+    )
+    print(body)
+    write_section(args.out, "partitioned", body)
+    return 0
+
+
+# --- graphs ----------------------------------------------------------------------------------------
+
+
+def graph_rows(spec: GraphSpec, timeout_s: float) -> list[list[str]]:
+    """Return the rows of one graph: whole, and in pieces."""
+    base_mb: float = call(_small_process, timeout_s=timeout_s)
+    rows, whole = [], None
+    for way in ("whole", "pieces"):
+        print(f"{spec}: {way}", file=sys.stderr, flush=True)
+        placed: Placed = call(place_graph, spec, way == "pieces", timeout_s=timeout_s)
+        checks = []
+        if whole is not None:
+            checks = [
+                Check(name="error", value=placed.error / whole.error, limit=MOST_ERROR),
+                Check(
+                    name="memory",
+                    value=(placed.memory_mb - base_mb) / (whole.memory_mb - base_mb),
+                    limit=MOST_MEMORY,
+                ),
+            ]
+        whole = whole or placed
+        figures = [placed.wall_s, placed.cpu_s, placed.memory_mb - base_mb]
+        error = f"{placed.error:.3e}"
+        rows.append([str(spec), way, error, *map(number, figures), verdict(checks), placed.statement])
+    return rows
+
+
+def place_graph(spec: GraphSpec, in_pieces: bool) -> Placed:
+    """Place the largest rigid body of a graph; whole with a factor of any size, or in pieces."""
+    from sfm_shapefit.laplacian.operators import adjacency
+    from sfm_shapefit.laplacian.partition import partition
+    from sfm_shapefit.partitioned import place_partitioned
+    from sfm_shapefit.pipeline.execution import open_executor
+    from sfm_shapefit.rigidity import rigid_pieces
+    from sfm_shapefit.robust.finish import finish
+    from sfm_shapefit.robust.options import PlacementOptions
+    from sfm_shapefit.solver.solve import solve
+
+    problem = draw(spec)
+    body = max(rigid_pieces(view_graph(problem)), key=lambda piece: len(piece.cameras))
+    graph, nodes = view_graph(problem).restricted_to(body.edges)
+    truth = problem.locations[nodes]
+    options = PlacementOptions(tol=1e-4, factor_memory=500 if in_pieces else 100_000, threads=WORKERS)
+    start, used = time.perf_counter(), _cpu_s()
+    if in_pieces:
+        count = max(4, graph.num_cameras // PIECE)
+        part_of = partition(adjacency(graph.num_cameras, graph.edges), count)
+        with open_executor("processes", WORKERS) as executor:
+            joined = place_partitioned(graph, part_of, options, executor=executor)
+        solved, found = joined.solve, joined.finish
+        memory = max(piece.peak_mb for piece in joined.pieces)
+    else:
+        solved = solve(graph, options)
+        found = finish(graph, solved, options)
+        memory = peak_memory_mb()
+    return Placed(
+        error=_error(found.locations, truth),
+        wall_s=time.perf_counter() - start,
+        cpu_s=_cpu_s() - used,
+        memory_mb=memory,
+        statement=f"{solved.method}: {solved.method_reason}",
+    )
+
+
+def _small_process() -> float:
+    """Return the peak memory of a process that places a small graph."""
+    place_graph(GraphSpec(family="geo", n=400, degree=20.0, sigma=0.01), in_pieces=False)
+    return peak_memory_mb()
+
+
+def _cpu_s() -> float:
+    times = os.times()
+    return times.user + times.system + times.children_user + times.children_system
+
+
+def _error(found: "np.ndarray[Any, Any]", truth: "np.ndarray[Any, Any]") -> float:
+    from sfm_shapefit.geometry import fit_similarity, median_spread
+
+    moved = fit_similarity(found, truth, rotate=False).apply(found)
+    return float(np.sqrt(np.mean(np.sum((moved - truth) ** 2, axis=1)))) / median_spread(truth)
+
+
+# --- a cluster -------------------------------------------------------------------------------------
+
+
+def cluster_rows(folder: Path, num_images: int, timeout_s: float) -> list[list[str]]:
+    """Return the rows of directions measured by one process, by a cluster, and by one that loses a worker."""
+    scene = folder / f"facade{num_images}"
+    if not scene.exists():
+        pairs = ("--max-pairs-per-image", 60, "--max-matches-per-pair", 100)
+        shape = ("--shape", "facade", "--num-images", num_images, "--num-points", 45 * num_images)
+        command("synth", scene, *shape, *pairs)
+    rows, first = [], None
+    for way in ("one process", "dask", "dask, a worker killed midway"):
+        print(f"directions: {way}", file=sys.stderr, flush=True)
+        seconds, found = call(measure_directions, scene, way, timeout_s=timeout_s)
+        first = first or (seconds, found)
+        rows.append([way, number(seconds), f"{first[0] / seconds:.2f}", "yes" if found == first[1] else "no"])
+    return rows
+
+
+def measure_directions(scene: Path, way: str) -> tuple[float, str]:
+    """Return the seconds of measuring a scene's directions, and a digest of them; warmed up."""
+    import hashlib
+    from contextlib import nullcontext
+
+    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.options import LocateOptions
+    from sfm_shapefit.pipeline.clock import Clock
+    from sfm_shapefit.pipeline.execution import open_executor
+    from sfm_shapefit.pipeline.measurement import measure_directions as measured
+    from sfm_shapefit.pipeline.sources import choose_inputs, open_source
+
+    options = LocateOptions(threads=1)
+    model_folder = scene / "sparse" / "0"
+    model = read_model(model_folder)
+    inputs = choose_inputs(model_folder, None, "auto")
+    executor = open_executor("dask", WORKERS) if way.startswith("dask") else nullcontext(None)
+    with open_source(model, inputs, 0) as source, executor as workers:
+        measured(source, options, Clock(), workers)  # compiles, and starts the workers
+        start = time.perf_counter()
+        if way.endswith("midway"):
+            threading.Timer(0.5, _kill_a_worker).start()
+        found = measured(source, options, Clock(), workers)
+        seconds = time.perf_counter() - start
+    digest = hashlib.sha256(found.directions.tobytes() + found.covariance.tobytes())
+    return seconds, digest.hexdigest()
+
+
+def _kill_a_worker() -> None:
+    """Kill the youngest process that this one's cluster started."""
+    import multiprocessing
+
+    children = multiprocessing.active_children()
+    if children:
+        os.kill(max(child.pid or 0 for child in children), signal.SIGKILL)
