@@ -1,6 +1,7 @@
 """Corruption with a structure: wrong pairs that agree with one another, or gather on weakly tied cameras."""
 
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -100,3 +101,16 @@ def test_a_trial_measures_all_methods_against_both_configurations():
     assert 0.05 < trial.contradicting < 0.15
     text = coherent.section({("small", 0.1): [trial], ("small", 0.5): [trial]}, "- Command: none\n")
     assert "| small | never | never | never |" in text
+    assert (
+        "Of 0 answers with an error above 0.2, 0 carry a warning; of 0 without wrong pairs, 0: met." in text
+    )
+
+
+def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_missed_limits():
+    right = coherent.Trial(
+        shapefit=0.01, lud=0.01, placed=0.01, placed_false=1.4, contradicting=0.0, warned=True
+    )
+    wrong = replace(right, placed=1.0, warned=False)
+    text = coherent.section({("small", 0.0): [right], ("small", 0.4): [wrong, right]}, "- Command: none\n")
+    assert "Of 1 answers with an error above 0.2, 0 carry a warning; of 1 without wrong pairs, 1:" in text
+    assert "**missed**: warned 0 < 1.00, false alarms 1.00 > 0" in text

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from benchmarks.graphs import GraphSpec, draw, relative_error, view_graph
-from benchmarks.metrics import Quantity, number
+from benchmarks.metrics import Check, Quantity, number, verdict
 from benchmarks.record import environment, legend, table, write_section
 
 if TYPE_CHECKING:
@@ -169,6 +169,7 @@ def section(measured: dict[tuple[str, float], list[Trial]], about: str) -> str:
         "All wrong pairs agree on one second configuration of the cameras. At q = 0.5 it is as good an answer"
         " as the truth, which is the limit of every method.",
         table(header, rows),
+        _warnings_sentence(measured),
         "### Where the methods break",
         f"The least q from which on the median error stays above {BROKEN:g}.",
         _breaking_table(measured),
@@ -189,6 +190,21 @@ def _row(name: str, q: float, trials: Sequence[Trial]) -> list[str]:
         f"{_median(trials, 'contradicting'):.0%}",
         f"{warned} of {len(trials)}, {sum(trial.warned for trial in broken)} of {len(broken)} broken",
     ]
+
+
+def _warnings_sentence(measured: dict[tuple[str, float], list[Trial]]) -> str:
+    """Say whether every broken answer carries a warning, and none does where no pair is wrong."""
+    broken = [trial for trials in measured.values() for trial in trials if trial.placed > BROKEN]
+    clean = [trial for (_, q), trials in measured.items() for trial in trials if q == 0.0]
+    warned, alarms = (sum(trial.warned for trial in trials) for trials in (broken, clean))
+    checks = [
+        Check(name="warned", value=warned, limit=len(broken), better="higher"),
+        Check(name="false alarms", value=alarms, limit=0),
+    ]
+    return (
+        f"Of {len(broken)} answers with an error above {BROKEN:g}, {warned} carry a warning; of {len(clean)} "
+        f"without wrong pairs, {alarms}: {verdict(checks)}."
+    )
 
 
 def _breaking_table(measured: dict[tuple[str, float], list[Trial]]) -> str:
