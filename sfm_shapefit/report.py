@@ -146,13 +146,13 @@ def write_json(summary: dict[str, Any], path: Path) -> None:
     path.write_text(dumps(summary) + "\n", encoding="utf-8")
 
 
-def dumps(summary: dict[str, Any]) -> str:
-    """Return a summary as JSON text that UTF-8 can encode.
+def dumps(summary: dict[str, Any], *, only_ascii: bool = False) -> str:
+    """Return a summary as JSON text that UTF-8 can encode, or ASCII, with escapes for all else.
 
     NaN and infinities, which JSON has not, become null. Bytes of a path that are no UTF-8 become the escape
     \\udcXX, from which `os.fsencode` of the parsed text gives them back.
     """
-    text = json.dumps(_finite(summary), indent=2, ensure_ascii=False, allow_nan=False)
+    text = json.dumps(_finite(summary), indent=2, ensure_ascii=only_ascii, allow_nan=False)
     return text.encode("utf-8", errors="backslashreplace").decode("utf-8")  # Python's escape is JSON's
 
 

@@ -1,10 +1,14 @@
 """Splitting for ShapeFit and LUD: agreement with the conic reference, exactness, and how it ends."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, linear, solve_admm, solve_lud
+from sfm_shapefit.solver.admm.anderson import Anderson
 from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
+from sfm_shapefit.solver.admm.engine import Iteration
 from sfm_shapefit.solver.admm.linear import predict_factor
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
@@ -372,6 +376,41 @@ def test_slow_communities_are_freed_by_smaller_penalties_late():
     solve_admm(graph, 1e-9, 300, factor, on_iteration=lambda info: objectives.append(info.objective))
     # 117 iterations to 1e-5 with the same balance at every renewal
     assert objectives[110] <= min(objectives) * (1.0 + 1e-5)
+
+
+def test_acceleration_takes_the_best_combination_of_its_history():
+    """Against least squares in the norm of rho; the history is kept in float32, to 1e-7."""
+    m, d, memory = 700, 3, 3  # more edges than a block, in two chunks
+    rng = np.random.default_rng(1)
+    chunks = ((0, 0, 650), (1, 650, m))
+    passes = SimpleNamespace(
+        data=SimpleNamespace(bounds=(0, 650, m)), over_chunks=lambda run: [run(*chunk) for chunk in chunks]
+    )
+    acceleration, rho = Anderson(passes, (m, d), memory), rng.uniform(0.5, 2.0, m)
+    points, images = rng.standard_normal((2, 6, m, d))
+    for k in range(6):
+        expected = images[k].copy()
+        first = max(k - memory, 0)
+        if k > 0:
+            f = np.diff(images[first : k + 1], axis=0).reshape(k - first, -1)
+            g = np.diff((images - points)[first : k + 1], axis=0).reshape(k - first, -1)
+            root = np.repeat(np.sqrt(rho), d)
+            gamma = np.linalg.lstsq((g * root).T, (images[k] - points[k]).ravel() * root, rcond=None)[0]
+            expected -= (gamma @ f).reshape(m, d)
+        found = acceleration.advance(points[k], images[k].copy(), rho)
+        np.testing.assert_allclose(found, expected, atol=1e-5)
+
+
+def test_acceleration_is_astray_far_above_the_objective_that_it_began_with():
+    asked = SimpleNamespace(objective=lambda state: state.value)
+    state = SimpleNamespace(value=0.1, anderson=object())
+    assert not Iteration._is_astray(asked, state, 1)
+    state.value = 1e6
+    assert Iteration._is_astray(asked, state, 2)
+    state.value = float("nan")
+    assert Iteration._is_astray(asked, state, 3)
+    state.anderson = None
+    assert not Iteration._is_astray(asked, state, 4)
 
 
 @pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])

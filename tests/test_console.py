@@ -1,14 +1,18 @@
 """What the user sees while a command runs: progress with totals, and pycolmap's messages only if wanted."""
 
+import io
+import json
 import os
 import re
 import subprocess
 import sys
 from collections import defaultdict
+from functools import partial
 
 import pytest
 
 from sfm_shapefit import LocateOptions, MapOptions, locate, map_database
+from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import shown_progress
 from tests.scenes import BUNDLED, FACADE, RING, ROOT
 
@@ -118,3 +122,30 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, verbo
     assert "sfm-shapefit: directions\n" in done.stderr
     assert re.search(r"time +│ \d+\.\d s \(read \d+\.\d\d, directions \d+\.\d\d", done.stdout)
     assert "bundle adjustment" in done.stdout
+
+
+def written(monkeypatch, encoding, show):
+    """Return what is shown on a stdout of some encoding."""
+    raw = io.BytesIO()
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", io.TextIOWrapper(raw, encoding=encoding))
+        show()
+        sys.stdout.flush()
+        return raw.getvalue().decode(encoding)
+
+
+def test_names_that_stdout_cannot_show_have_escapes(monkeypatch):
+    table = partial(console.print_table, "d\u00e9", [("left out", "\u0663\nb\x1b[2J")])
+    shown = written(monkeypatch, "ascii", table)
+    assert r"d\xe9" in shown
+    assert r"\u0663" in shown
+    assert r"b\ufffd[2J" in shown
+    assert "d\u00e9" in written(monkeypatch, "utf-8", table)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "utf-8"])
+def test_json_means_the_same_on_any_stdout(monkeypatch, encoding):
+    summary = {"names": ["d\u00e9", "\u0663", "\udce9"]}
+    shown = written(monkeypatch, encoding, partial(console.print_json, summary))
+    assert json.loads(shown) == summary
+    assert ("\u0663" in shown) == (encoding == "utf-8")

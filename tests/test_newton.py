@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,
@@ -225,6 +225,19 @@ def test_corrupted_graphs_of_all_kinds_are_solved(solver):
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-6
 
 
+def test_bound_and_objective_before_the_first_step_are_those_of_the_formulas():
+    graph, _ = drawn(7, sigma=0.1)
+    problem, iterate, _, _ = steps.allocate(graph)
+    rng = np.random.default_rng(7)
+    iterate.r[:], iterate.feasible[:] = rng.standard_normal((2, *iterate.r.shape))
+    progress = steps.measure(problem, iterate)
+    kappa = graph.weights.sum()
+    expected = graph.weights @ np.linalg.norm(iterate.r, axis=1) / kappa
+    assert progress.objective == pytest.approx(expected, rel=1e-12)
+    assert progress.multiplier == pytest.approx(np.sum(iterate.r * iterate.feasible) / kappa, rel=1e-12)
+    assert progress.gap == pytest.approx(progress.objective - progress.multiplier, rel=1e-12)
+
+
 @SOLVERS
 def test_directions_that_cancel_or_do_not_determine_anything_are_refused_or_solved_without_nan(solver):
     circle = np.array([[0, 1], [1, 2], [2, 0]])
@@ -232,6 +245,9 @@ def test_directions_that_cancel_or_do_not_determine_anything_are_refused_or_solv
     same = ViewGraph(3, circle, np.tile([[1.0, 0.0]], (3, 1)))
     with pytest.raises(UnsolvableError):
         solver(same, TOL, 50)  # c = 0
+    rounded = np.array([[1.0, 0.0], [1.0, 1e-14], [1.0, -2e-14]])
+    with pytest.raises(UnsolvableError, match="cancel at every camera"):
+        solver(ViewGraph(3, circle, rounded), TOL, 50)  # c is rounding
     t, y, _ = solver(ViewGraph(3, circle, v), TOL, 50)
     assert np.isfinite(t).all()
     assert np.isfinite(y).all()

@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all faults, print each problem and a table; 1 if there is a problem."""
     with tempfile.TemporaryDirectory() as temporary:
+        Path(temporary).chmod(0o711)  # another user reads the input later
         bench = Bench((args.work or Path(temporary)).resolve())
         rng = np.random.default_rng(args.seed)
         checks: dict[str, Callable[[], Problems]] = {

@@ -148,10 +148,28 @@ def print_table(title: str, rows: Rows) -> None:
     from rich.text import Text
 
     # Text, not markup: names and paths come from strangers, and brackets in them mean nothing.
-    table = Table(title=Text(printable(title)), show_header=False, title_justify="left")
+    table = Table(title=Text(_encodable(title)), show_header=False, title_justify="left")
     for label, value in rows:
-        table.add_row(label, Text("\n".join(printable(line) for line in value.split("\n"))))
+        table.add_row(label, Text("\n".join(_encodable(line) for line in value.split("\n"))))
     Console().print(table)
+
+
+def print_json(summary: dict[str, Any]) -> None:
+    """Print a summary as JSON on stdout; one that is no UTF-8 gets escapes, which mean the same."""
+    from sfm_shapefit.report import dumps
+
+    text = dumps(summary)
+    try:
+        text.encode(sys.stdout.encoding or "utf-8")
+    except UnicodeEncodeError:
+        text = dumps(summary, only_ascii=True)
+    print(text)  # noqa: T201
+
+
+def _encodable(text: str) -> str:
+    """Return printable text with escapes for what stdout, perhaps an ASCII one, cannot show."""
+    encoding = sys.stdout.encoding or "utf-8"
+    return printable(text).encode(encoding, "backslashreplace").decode(encoding)
 
 
 def shortened(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:

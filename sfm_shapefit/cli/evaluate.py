@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, print_table, reported, shortened
+from sfm_shapefit.cli.console import Rows, print_json, print_table, reported, shortened
 from sfm_shapefit.cli.flags import InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.errors import InputError
 
@@ -36,7 +36,7 @@ def evaluate_command(
     truth = one_path(reference, None, "REF")
     with reported():
         from sfm_shapefit.pipeline import evaluate
-        from sfm_shapefit.report import dumps, write_records
+        from sfm_shapefit.report import write_records
 
         errors = evaluate(source, truth, threshold or ())
         if csv is not None:
@@ -44,7 +44,7 @@ def evaluate_command(
                 raise InputError(f"{csv} exists and is no .csv file; choose another name")
             write_records(errors.rows(), csv)
         if as_json:
-            print(dumps(errors.as_dict()))  # noqa: T201
+            print_json(errors.as_dict())
         else:
             print_table(f"{source} against {truth}", _evaluation_table(errors))
 

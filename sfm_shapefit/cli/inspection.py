@@ -11,6 +11,7 @@ from sfm_shapefit.cli.console import (
     SEE_JSON,
     Rows,
     catch_termination,
+    print_json,
     print_table,
     reported,
     shortened,
@@ -60,13 +61,12 @@ def inspect_command(
         options = options_from(LocateOptions, given)
 
         from sfm_shapefit.pipeline import inspect as inspect_model
-        from sfm_shapefit.report import dumps
 
         catch_termination()
         with shown_progress(not as_json) as progress:
             found = inspect_model(source, database, options, theory=theory, progress=progress)
         if as_json:
-            print(dumps(found.as_dict()))  # noqa: T201
+            print_json(found.as_dict())
         else:
             what = "nodes" if source.is_file() else "images"
             print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))

@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
+from sfm_shapefit.cli.console import (
+    Rows,
+    catch_termination,
+    print_json,
+    print_table,
+    reported,
+    shortened,
+    shown_progress,
+)
 from sfm_shapefit.cli.flags import (
     Config,
     Database,
@@ -74,7 +82,6 @@ def locate_command(
             from sfm_shapefit.colmap.quiet import pycolmap_heard
             from sfm_shapefit.pipeline import locate
             from sfm_shapefit.pipeline.execution import open_executor
-            from sfm_shapefit.report import dumps
             from sfm_shapefit.results import summary, write_result
 
             catch_termination()
@@ -87,7 +94,7 @@ def locate_command(
                 write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
     with reported("interrupted; the output is complete"):
         if as_json:
-            print(dumps(summary(found)))  # noqa: T201
+            print_json(summary(found))
         elif not quiet:
             table = _locate_table(found, target, pictures_line(report, scene), verbose=verbose)
             print_table(f"{len(found.model.names)} images of {source}", table)

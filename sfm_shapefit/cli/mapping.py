@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
+from sfm_shapefit.cli.console import (
+    Rows,
+    catch_termination,
+    print_json,
+    print_table,
+    reported,
+    shortened,
+    shown_progress,
+)
 from sfm_shapefit.cli.flags import (
     Config,
     Json,
@@ -59,7 +67,6 @@ def map_command(
             from sfm_shapefit.colmap.quiet import pycolmap_heard
             from sfm_shapefit.mapping.results import map_summary, write_map_result
             from sfm_shapefit.mapping.run import map_database
-            from sfm_shapefit.report import dumps
 
             catch_termination()
             with shown_progress(not quiet, verbose) as progress, pycolmap_heard(verbose):
@@ -69,7 +76,7 @@ def map_command(
                 )
     with reported("interrupted; the output is complete"):
         if as_json:
-            print(dumps(map_summary(found)))  # noqa: T201
+            print_json(map_summary(found))
         elif not quiet:
             print_table(f"{found.num_images} images of {source}", _map_table(found, target, verbose=verbose))
 

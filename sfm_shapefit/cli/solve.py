@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, catch_termination, print_table, reported, shortened, shown_progress
+from sfm_shapefit.cli.console import (
+    Rows,
+    catch_termination,
+    print_json,
+    print_table,
+    reported,
+    shortened,
+    shown_progress,
+)
 from sfm_shapefit.cli.flags import (
     ExecutorName,
     Json,
@@ -86,7 +94,6 @@ def solve_command(
         with claimed_output(target, overwrite=overwrite, protect=inputs):
             from sfm_shapefit.pipeline import solve_graph_file
             from sfm_shapefit.pipeline.execution import open_executor
-            from sfm_shapefit.report import dumps
             from sfm_shapefit.results import graph_summary, write_graph_result
 
             catch_termination()
@@ -115,7 +122,7 @@ def solve_command(
             )
     with reported("interrupted; the output is complete"):
         if as_json:
-            print(dumps(graph_summary(found)))  # noqa: T201
+            print_json(graph_summary(found))
         elif not quiet:
             print_table(
                 f"{found.placement.graph.num_cameras} nodes of {source}",
