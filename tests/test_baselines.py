@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from sfm_shapefit import baselines
-from sfm_shapefit.baselines.gauge import unit_gauge
 from sfm_shapefit.baselines.onedsfm import onedsfm_scores
 from sfm_shapefit.baselines.triangles import triangle_scores
 from sfm_shapefit.geometry import normalized
@@ -32,18 +31,6 @@ def test_every_locator_is_exact_on_exact_directions(name, d):
     # Interior points and splitting stop at 1e-8; positions are off by that times the conditioning.
     assert error(found, problem.locations) < 1e-5
     assert np.linalg.norm(found) == pytest.approx(1.0)
-
-
-def test_the_side_is_that_of_most_pairs_not_of_the_longest():
-    edges = np.array([[0, 1], [1, 2], [0, 2], [2, 3]])
-    t = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [100.0, 0.0]])
-    directions = normalized(differences(t, edges))
-    directions[3] *= -1.0  # a wrong pair with a baseline of 100
-    graph = ViewGraph(4, edges, directions)
-    for given in (t, -t):
-        found = unit_gauge(graph, given)
-        assert error(found, t) < 1e-12
-        assert np.linalg.norm(found) == pytest.approx(1.0)
 
 
 def test_least_squares_minimises_the_sum_of_squared_distances_across():
