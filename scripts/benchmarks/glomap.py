@@ -67,9 +67,9 @@ class Positioned:
     tracks_s: float
     """Reading the copied database and building tracks, here in Python."""
     positioning_s: float
+    """`run_global_positioning` alone."""
     positioning_cpu_s: float
     """CPU time of it, all threads."""
-    """`run_global_positioning` alone."""
 
 
 @contextmanager
