@@ -32,8 +32,8 @@ PUBLISHED = (
     " loss 83, 1DSfM + ShapeKick 2.4; on the scenes of 332 to 450 cameras ShapeKick takes 1.2 to 2.4."
 )
 COLLAPSE = (
-    "Least squares leaves two cameras far out and the others in a small cluster; ShapeFit's scale, L(T) > 0, then"
-    " turns the cluster around."
+    "Least squares leaves two cameras far out and the others in a small cluster; ShapeFit's scale, L(T) > 0,"
+    " then turns the cluster around."
 )
 RUNS: dict[str, dict[str, Any]] = {
     "default": {},
