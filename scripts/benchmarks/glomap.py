@@ -68,6 +68,8 @@ class Positioned:
     """Reading the copied database and building tracks, here in Python."""
     positioning_s: float
     """`run_global_positioning` alone."""
+    positioning_cpu_s: float
+    """CPU time of it, all threads."""
 
 
 @contextmanager
@@ -127,14 +129,14 @@ def position(database: Path, model: Path, setting: Setting) -> Positioned:
     num_tracks = _add_tracks(reconstruction, graph, pairs)
     seen = [image for image in reconstruction.images.values() if image.num_points3D]
     keep_frames(reconstruction, {image.frame_id for image in seen})
-    read = time.perf_counter()
+    read, cpu = time.perf_counter(), time.process_time()
     settings = pycolmap.GlobalPositionerOptions()
     settings.use_gpu = False
     settings.random_seed = 0
     if not pycolmap.run_global_positioning(settings, pose_graph, reconstruction):
         raise RuntimeError("pycolmap.run_global_positioning reports failure")
-    done = time.perf_counter()
-    return Positioned(reconstruction, num_tracks, read - start, done - read)
+    done, cpu = time.perf_counter(), time.process_time() - cpu
+    return Positioned(reconstruction, num_tracks, read - start, done - read, cpu)
 
 
 def map_globally(database: Path, min_num_matches: int) -> tuple[pycolmap.Reconstruction, float]:

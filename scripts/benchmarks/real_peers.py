@@ -165,7 +165,7 @@ def _located(name: str, folder: Path) -> Located:
         else:
             setting = next(one for one in SETTINGS if name == f"{POSITIONING}, {one.label}")
             found = position(database, folder / "sparse" / "0", setting)
-            model, seconds, cpu_s = found.reconstruction, found.positioning_s, math.nan
+            model, seconds, cpu_s = found.reconstruction, found.positioning_s, found.positioning_cpu_s
             note = f"{found.num_tracks} tracks"
     peak = peak_memory_mb()
     names, centers = _centers(model)
