@@ -72,6 +72,7 @@ class Stages:
             cpu_s=earlier.cpu_s + cpu_s - self._cpu_s,
             peak_mb=max(earlier.peak_mb, peak_memory_mb()),
         )
+        print(f"{self._stage}: {self.found[self._stage]}", file=sys.stderr, flush=True)
         self._stage, self._wall_s, self._cpu_s = stage, wall_s, cpu_s
         reset_peak()
 
