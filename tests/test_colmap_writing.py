@@ -263,6 +263,18 @@ def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
+    original, _ = ring_model(noise_px=3.0)
+    seed, graph = seeded(original, ring_centers() + 0.01)
+    tracks = graph if source == "matches" else original
+    copied = dump(triangulate(seed, tracks))
+    assert seed.num_points3D() == 0
+    structure = triangulate(seed, tracks, in_place=True)
+    assert structure is seed
+    assert dump(structure) == copied
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
 def test_twice_the_same_gives_the_same_bits(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)

@@ -114,6 +114,8 @@ def triangulate(
     options: StructureOptions | None = None,
     advance: Advance | None = None,
     executor: Executor | None = None,
+    *,
+    in_place: bool = False,
 ) -> pycolmap.Reconstruction:
     """Return a copy of `seed` whose 3D points are triangulated at its poses; old points are dropped.
 
@@ -123,6 +125,7 @@ def triangulate(
         options: filters; the defaults if None.
         advance: called with the images, or tracks, that are done and their number.
         executor: shares out the tracks of another model among its workers; no use for matches.
+        in_place: return `seed` itself, which must be without points: a copy of a large model takes gigabytes.
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
@@ -133,7 +136,7 @@ def triangulate(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = options or StructureOptions()
-    structure = without_points(seed)
+    structure = seed if in_place else without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
         _triangulate_matches(structure, tracks, options, advance or _unheard)
     else:

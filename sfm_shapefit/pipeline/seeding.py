@@ -53,7 +53,8 @@ def seeded_model(
         seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
     if not options.bundle_adjust:  # which triangulates at the seed's poses itself
         with clock("triangulation"):
-            seeded = triangulate(seed, tracks, options.for_structure(), clock.advance, executor)
+            settings = options.for_structure()
+            seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
     if options.bundle_adjust:
         with clock("bundle adjustment"):
             still = () if fixed is None else source.model.frame_ids[fixed].tolist()
