@@ -15,7 +15,7 @@ from tests.scenes import RING, ROOT, fingerprint, real_scene
 sys.path.insert(0, str(ROOT / "scripts"))  # as `python scripts/benchmark.py` does
 
 import benchmark
-from benchmarks import glomap, real, record
+from benchmarks import endtoend, glomap, real, record
 from benchmarks.metrics import Check, median, number, ratio, times, verdict
 
 import sfm_shapefit
@@ -358,3 +358,32 @@ def test_a_real_scene_is_measured_and_its_files_stay_as_they_are(tmp_path):
     assert row[5] == "met"
     assert str(ROOT) not in text
     assert fingerprint(scene) == before
+
+
+# --- scale ------------------------------------------------------------------------------------------
+
+
+def test_what_a_stage_takes_is_added_up_where_it_comes_again(capsys):
+    stages = endtoend.Stages()
+    for stage in ("read", "solve", "solve", "read", "end"):
+        stages(stage)
+    assert list(stages.found) == ["imports", "read", "solve"]
+    assert all(used.wall_s >= 0.0 and used.peak_mb > 10.0 for used in stages.found.values())
+    assert capsys.readouterr().err.count("read: ") == 2
+
+
+def test_the_exponent_of_a_stage_is_that_of_its_processor_time():
+    def located(size, cpu_s):
+        used = {"solve": endtoend.Usage(wall_s=1.0, cpu_s=cpu_s, peak_mb=100.0)}
+        return endtoend.Located(
+            num_images=size,
+            num_pairs=30 * size,
+            num_matches=3000 * size,
+            num_placed=size,
+            median_error=1e-3,
+            usage=used["solve"],
+            stages=used,
+        )
+
+    assert "| 1.50 |" in endtoend.section([located(100, 2.0), located(400, 16.0)], "")
+    assert "| - |" in endtoend.section([located(100, 0.2), located(400, 1.6)], "")  # too short to tell

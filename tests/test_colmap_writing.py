@@ -2,10 +2,12 @@
 
 import contextlib
 import os
+import pickle
 import resource
 import shutil
 import stat
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -240,6 +242,36 @@ def test_the_models_own_tracks_keep_the_ids_of_their_points():
     assert set(structure.point3D_ids()) == set(original.point3D_ids())
     for point_id, point in structure.points3D.items():
         assert {e.point2D_idx for e in point.track.elements} == {point_id - 1}
+
+
+class Copying(ThreadPoolExecutor):
+    """Sends what a task needs, and nothing else, as other processes get it."""
+
+    def submit(self, work, /, task):
+        return super().submit(work, pickle.loads(pickle.dumps(task)))
+
+
+def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
+    monkeypatch.setattr("sfm_shapefit.colmap.structure._TRACKS_A_TASK", 7)
+    original, points = ring_model(noise_px=3.0)
+    seed, seen = seeded(original, ring_centers() + 0.01)[0], []
+    with Copying(2) as executor:
+        shared = triangulate(seed, original, None, lambda *done: seen.append(done), executor)
+    assert dump(shared) == dump(triangulate(seed, original))
+    assert seen[0] == (7, len(points))
+    assert seen[-1] == (len(points), len(points))
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
+    original, _ = ring_model(noise_px=3.0)
+    seed, graph = seeded(original, ring_centers() + 0.01)
+    tracks = graph if source == "matches" else original
+    copied = dump(triangulate(seed, tracks))
+    assert seed.num_points3D() == 0
+    structure = triangulate(seed, tracks, in_place=True)
+    assert structure is seed
+    assert dump(structure) == copied
 
 
 @pytest.mark.parametrize("source", ["matches", "tracks"])

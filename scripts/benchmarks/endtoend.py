@@ -72,6 +72,7 @@ class Stages:
             cpu_s=earlier.cpu_s + cpu_s - self._cpu_s,
             peak_mb=max(earlier.peak_mb, peak_memory_mb()),
         )
+        print(f"{self._stage}: {self.found[self._stage]}", file=sys.stderr, flush=True)
         self._stage, self._wall_s, self._cpu_s = stage, wall_s, cpu_s
         reset_peak()
 
@@ -104,7 +105,7 @@ def measure(folder: Path, num_images: int, threads: int) -> Located:
     scene, out = folder / f"facade{num_images}", folder / "out"
     if not scene.exists():
         print(f"making {num_images} images", file=sys.stderr, flush=True)
-        command("synth", scene, *_scene_flags(num_images))
+        command("synth", scene, *scene_flags(num_images))
     shutil.rmtree(out, ignore_errors=True)
     print(f"locating {num_images} images", file=sys.stderr, flush=True)
     stages = call(_located, scene, out, threads, environment=thread_environment(threads))
@@ -138,7 +139,8 @@ def _located(scene: Path, out: Path, threads: int) -> dict[str, Usage]:
     return stages.found
 
 
-def _scene_flags(num_images: int) -> Iterator[object]:
+def scene_flags(num_images: int) -> Iterator[object]:
+    """Yield what `synth` makes a scene of."""
     yield from ("--shape", "facade", "--num-images", num_images)
     yield from ("--num-points", POINTS_PER_IMAGE * num_images)
     yield from ("--max-pairs-per-image", PAIRS_PER_IMAGE)

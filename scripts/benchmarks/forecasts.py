@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import sys
 import tempfile
 from pathlib import Path
 
@@ -57,4 +58,5 @@ def measure(name: str, workspace: Path) -> list[str]:
     pairs = [(expected["peak_mb"], used.peak_mb), (expected["total_s"], used.cpu_s)]
     checks = [Check(name="factor", value=max(ratio(a, b), ratio(b, a)), limit=FACTOR) for a, b in pairs]
     cells = [cell for a, b in pairs for cell in (number(a), number(b), f"{ratio(a, b):.2f}")]
+    print(name, *cells, file=sys.stderr, flush=True)
     return [name, *cells, verdict(checks)]

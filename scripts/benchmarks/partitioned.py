@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.endtoend import command
+from benchmarks.endtoend import command, scene_flags
 from benchmarks.graphs import GraphSpec, draw, view_graph
 from benchmarks.metrics import Check, number, verdict
 from benchmarks.process import call, peak_memory_mb
@@ -71,7 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `partitioned`."""
     parser.add_argument("--cameras", type=int, default=100_000, help="of each graph (default 1e5)")
     parser.add_argument("--families", nargs="*", default=list(DEGREES), choices=list(DEGREES))
-    parser.add_argument("--images", type=int, default=1000, help="of the cluster's scene (default 1000)")
+    parser.add_argument(
+        "--images", type=int, default=1000, help="of the cluster's scene, 0: none (default 1000)"
+    )
     parser.add_argument("--folder", type=Path, help="where the scene is kept (default: a temporary folder)")
     parser.add_argument("--timeout", type=float, default=3600.0, help="seconds per measurement")
     parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
@@ -85,7 +87,8 @@ def run(args: argparse.Namespace) -> int:
         spec = GraphSpec(family=family, n=args.cameras, degree=DEGREES[family], sigma=0.01)
         rows += graph_rows(spec, args.timeout)
     with tempfile.TemporaryDirectory() as temporary:
-        cluster = cluster_rows(args.folder or Path(temporary), args.images, args.timeout)
+        folder = args.folder or Path(temporary)
+        cluster = cluster_rows(folder, args.images, args.timeout) if args.images else []
     body = "\n".join(
         [
             "## Reliability: beyond one machine\n",
@@ -127,6 +130,7 @@ def graph_rows(spec: GraphSpec, timeout_s: float) -> list[list[str]]:
         figures = [placed.cpu_s, placed.memory_mb - base_mb, placed.merging_mb - base_mb]
         error = f"{placed.error:.3e}"
         rows.append([str(spec), way, error, *map(number, figures), verdict(checks), placed.statement])
+        print(rows[-1], file=sys.stderr, flush=True)
     return rows
 
 
@@ -191,9 +195,7 @@ def cluster_rows(folder: Path, num_images: int, timeout_s: float) -> list[list[s
     """Return the rows of directions measured by one process, by a cluster, and by one that loses a worker."""
     scene = folder / f"facade{num_images}"
     if not scene.exists():
-        pairs = ("--max-pairs-per-image", 60, "--max-matches-per-pair", 100)
-        shape = ("--shape", "facade", "--num-images", num_images, "--num-points", 45 * num_images)
-        command("synth", scene, *shape, *pairs)
+        command("synth", scene, *scene_flags(num_images))
     rows, first = [], None
     for way in ("one process", "dask", "dask, a worker killed midway"):
         print(f"directions: {way}", file=sys.stderr, flush=True)

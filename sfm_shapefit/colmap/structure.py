@@ -10,24 +10,29 @@ Tracks come from one of two sources:
 Whatever survives fits its observations to `max_reprojection_error_px`, lies in front of the cameras that
 see it, and is seen under at least `min_triangulation_angle_deg` by two of them.
 
-Everything is single-threaded and no sample is random: the same input gives the same bits.
+Everything is single-threaded and no sample is random: the same input gives the same bits. The tracks of
+another reconstruction know nothing of one another, so an executor's workers may share them, with the same
+bits again. COLMAP's triangulator goes from image to image through one graph of all matches, and tries pairs
+again by the share of their matches that has become points, so its work cannot be cut without another answer.
 
 Source: Schoenberger and Frahm, "Structure-from-Motion Revisited", CVPR 2016, section 4.3; the triangulation
 primitives are pycolmap's.
 """
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
 from sfm_shapefit.colmap.seed import without_points
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.workers import answers
 
 TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""
@@ -35,7 +40,7 @@ TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 Advance = Callable[[int, int], None]
 """Called with the work done so far and the work in all."""
 
-_TRACKS_A_REPORT = 1000
+_TRACKS_A_TASK = 1000  # about half a second of work
 _RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
 _IMAGES_OF_A_CHECKED_TRACK = 3
 _CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
@@ -108,6 +113,9 @@ def triangulate(
     tracks: TrackSource,
     options: StructureOptions | None = None,
     advance: Advance | None = None,
+    executor: Executor | None = None,
+    *,
+    in_place: bool = False,
 ) -> pycolmap.Reconstruction:
     """Return a copy of `seed` whose 3D points are triangulated at its poses; old points are dropped.
 
@@ -116,6 +124,8 @@ def triangulate(
         tracks: a graph from `correspondence_graph`, or the reconstruction whose own tracks serve.
         options: filters; the defaults if None.
         advance: called with the images, or tracks, that are done and their number.
+        executor: shares out the tracks of another model among its workers; no use for matches.
+        in_place: return `seed` itself, which must be without points: a copy of a large model takes gigabytes.
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
@@ -123,13 +133,14 @@ def triangulate(
 
     Raises:
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
+        WorkerError: if a worker died and the executor does not replace it.
     """
     options = options or StructureOptions()
-    structure = without_points(seed)
+    structure = seed if in_place else without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
         _triangulate_matches(structure, tracks, options, advance or _unheard)
     else:
-        _triangulate_tracks(structure, tracks, options, advance or _unheard)
+        _triangulate_tracks(structure, tracks, options, advance or _unheard, executor)
     _filter(structure, options)
     return structure
 
@@ -225,32 +236,72 @@ def _triangulate_tracks(
     source: pycolmap.Reconstruction,
     options: StructureOptions,
     advance: Advance,
+    executor: Executor | None,
 ) -> None:
     """Add to our own `structure` the points of another model, each triangulated from its own track."""
-    settings = pycolmap.EstimateTriangulationOptions()
-    settings.min_tri_angle = math.radians(options.min_triangulation_angle_deg)
-    settings.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
-    settings.ransac.max_error = options.max_reprojection_error_px
-    settings.ransac.random_seed = _RANDOM_SEED
     registered = sorted(structure.reg_image_ids())
+    observations = _Observations.of(structure, source, registered)
+    tracks = observations.tracks_of(options.min_track_length)
+    tasks = _track_tasks(structure, registered, observations, tracks, options)
+    parts = map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
+    done = 0
+    for part in parts:
+        for (first, _), found in zip(tracks[done : done + len(part)], part, strict=True):
+            if found is not None:
+                xyz, inliers = found
+                seen = np.flatnonzero(inliers) + first
+                at = zip(
+                    observations.images[seen].tolist(), observations.keypoints[seen].tolist(), strict=True
+                )
+                track = pycolmap.Track([pycolmap.TrackElement(registered[i], k) for i, k in at])
+                point_id = int(observations.points[first])
+                color = source.point3D(point_id).color
+                point = pycolmap.Point3D(xyz=xyz, color=color, track=track)
+                structure.add_point3D_with_id(point_id, point)
+        done += len(part)
+        advance(done, len(tracks))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class TrackTask:
+    """Some tracks, and all that is needed to triangulate them elsewhere."""
+
+    poses: list[pycolmap.Rigid3d]
+    cameras: list[pycolmap.Camera]
+    tracks: list[tuple[IntArray, FloatArray]]
+    """Images (k,), as positions in the two lists, and pixels (k, 2) of each."""
+    options: StructureOptions
+
+
+def _track_tasks(
+    structure: pycolmap.Reconstruction,
+    registered: list[int],
+    observations: "_Observations",
+    tracks: list[tuple[int, int]],
+    options: StructureOptions,
+) -> Iterator[TrackTask]:
+    """Yield the tracks, in their order, with the poses of all registered images."""
     poses = [structure.image(i).cam_from_world() for i in registered]
     cameras = [structure.camera(structure.image(i).camera_id) for i in registered]
-    observations = _Observations.of(structure, source, registered)
-    firsts, lasts = observations.tracks_of(options.min_track_length)
-    for done, (first, last) in enumerate(zip(firsts, lasts, strict=True), start=1):
-        if done % _TRACKS_A_REPORT == 0:
-            advance(done, len(firsts))
-        images = observations.images[first:last].tolist()
-        found = pycolmap.estimate_triangulation(
-            observations.xy[first:last], [poses[i] for i in images], [cameras[i] for i in images], settings
-        )
-        if found is not None:
-            seen = zip(images, observations.keypoints[first:last].tolist(), found["inliers"], strict=True)
-            track = [pycolmap.TrackElement(registered[i], k) for i, k, inlier in seen if inlier]
-            point_id = int(observations.points[first])
-            color = source.point3D(point_id).color
-            point = pycolmap.Point3D(xyz=found["xyz"], color=color, track=pycolmap.Track(track))
-            structure.add_point3D_with_id(point_id, point)
+    for start in range(0, len(tracks), _TRACKS_A_TASK):
+        parts = [slice(first, last) for first, last in tracks[start : start + _TRACKS_A_TASK]]
+        seen = [(observations.images[part], observations.xy[part]) for part in parts]
+        yield TrackTask(poses=poses, cameras=cameras, tracks=seen, options=options)
+
+
+def triangulate_task(task: TrackTask) -> list[tuple[FloatArray, BoolArray] | None]:
+    """Return position (3,) and inliers (k,) of each track, None where it has no point; for a worker."""
+    settings = pycolmap.EstimateTriangulationOptions()
+    settings.min_tri_angle = math.radians(task.options.min_triangulation_angle_deg)
+    settings.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+    settings.ransac.max_error = task.options.max_reprojection_error_px
+    settings.ransac.random_seed = _RANDOM_SEED
+    found = []
+    for images, xy in task.tracks:
+        poses, cameras = ([every[i] for i in images.tolist()] for every in (task.poses, task.cameras))
+        answer = pycolmap.estimate_triangulation(xy, poses, cameras, settings)
+        found.append(None if answer is None else (answer["xyz"], answer["inliers"]))
+    return found
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -289,11 +340,11 @@ class _Observations:
             xy=np.concatenate(xy)[order],
         )
 
-    def tracks_of(self, min_length: int) -> tuple[list[int], list[int]]:
+    def tracks_of(self, min_length: int) -> list[tuple[int, int]]:
         """Return where each track of at least `min_length` observations starts, and where it ends."""
         _, firsts, lengths = np.unique(self.points, return_index=True, return_counts=True)
         firsts, lengths = firsts[lengths >= min_length], lengths[lengths >= min_length]
-        return firsts.tolist(), (firsts + lengths).tolist()
+        return list(zip(firsts.tolist(), (firsts + lengths).tolist(), strict=True))
 
 
 # --- colours ---------------------------------------------------------------------------------------

@@ -59,9 +59,9 @@ def locate(
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
-        executor: shares out the pairs of a database among its workers, which must see its file, with the same
-            answer to the bit; and solves a graph in pieces whose factor would be too large for one machine.
-            None: all is done here.
+        executor: shares out the pairs of a database among its workers, which must see its file, or a model's
+            own tracks, with the same answer to the bit; and solves a graph in pieces whose factor would be
+            too large for one machine. None: all is done here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -129,7 +129,7 @@ def locate(
                 kept = trusted(placement, options.min_trust)
         with clock("further pieces"):
             further = further_pieces(source, placement, joint, evidence, options)
-        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed)
+        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed, executor)
         warnings = tuple(_warnings(source, directions, placement, kept, gauge, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,

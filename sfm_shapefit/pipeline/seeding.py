@@ -1,6 +1,7 @@
 """From placed cameras to seeded models: poses, points, colours, and bundle adjustment if asked for."""
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import Executor
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -39,11 +40,12 @@ def seeded_model(
     options: LocateOptions,
     clock: Clock,
     fixed: BoolArray | None = None,
+    executor: Executor | None = None,
 ) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
     """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
 
     `kept` says which of the placement's cameras are in the model, `gauge` where those are in its units.
-    Images that are `fixed` keep their poses to the last bit.
+    Images that are `fixed` keep their poses to the last bit; an executor shares out the model's own tracks.
     """
     adjusted = None
     located = kept, gauge.similarity.apply(placement.locations[kept])
@@ -51,7 +53,8 @@ def seeded_model(
         seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
     if not options.bundle_adjust:  # which triangulates at the seed's poses itself
         with clock("triangulation"):
-            seeded = triangulate(seed, tracks, options.for_structure(), clock.advance)
+            settings = options.for_structure()
+            seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
     if options.bundle_adjust:
         with clock("bundle adjustment"):
             still = () if fixed is None else source.model.frame_ids[fixed].tolist()
