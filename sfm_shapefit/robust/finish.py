@@ -372,7 +372,9 @@ def _choose(
     difference = costs["LUD"] - costs["ShapeFit"]
     if apart <= COLLAPSED:
         name = "LUD" if difference < 0.0 else "ShapeFit"
-        return by_name[name], f"the starts' lengths differ by {apart:.0%}, not by a collapse; {name} fits no worse"
+        return by_name[
+            name
+        ], f"the starts' lengths differ by {apart:.0%}, not by a collapse; {name} fits no worse"
     if abs(difference) <= _TIE * min(costs.values()):
         return by_name["LUD"], (
             f"the starts disagree (lengths by {apart:.0%}) and fit alike: LUD, whose lengths cannot collapse"
