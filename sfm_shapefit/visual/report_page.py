@@ -343,7 +343,7 @@ def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
 
 
 def _option(value: Any) -> str:
-    return {True: "yes", False: "no", None: "none"}.get(value, str(value)) if _is_plain(value) else str(value)
+    return {True: "yes", False: "no", None: "none", "": "none"}.get(value, str(value)) if _is_plain(value) else str(value)
 
 
 def _is_plain(value: Any) -> bool:
