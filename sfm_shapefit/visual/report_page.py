@@ -343,11 +343,9 @@ def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
 
 
 def _option(value: Any) -> str:
-    return {True: "yes", False: "no", None: "none", "": "none"}.get(value, str(value)) if _is_plain(value) else str(value)
-
-
-def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, bool)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "none" if value is None or value == "" else str(value)
 
 
 # --- the file --------------------------------------------------------------------------------------
