@@ -110,9 +110,11 @@ class Finish:
             return f"{self.start}, not refined: {self.reason}"
         median, largest = self.moved
         back = f"; {self.num_put_back} thrown out of the scene and put back" if self.num_put_back else ""
+        nodes = "cameras and points" if len(self.levels_deg) > 1 else "cameras"
         return (
-            f"{self.start}, refined in angles (moved by {median:.2%} of the scene's radius, at most "
-            f"{largest:.2%}; {self.num_turned_pairs} directions changed sides{back}): {self.reason}"
+            f"{self.start}, refined in angles ({nodes} moved by {median:.2%} of the scene's radius, at most "
+            f"{largest:.2%}; {self.num_turned_pairs} directions of theirs went from agreeing to "
+            f"contradicting or back{back}): {self.reason}"
         )
 
 
