@@ -117,6 +117,16 @@ def test_only_the_two_scripts_of_the_page_may_run_and_nothing_be_fetched(page):
     assert "http" not in own.replace("http-equiv", "")
 
 
+def test_a_model_in_memory_is_titled_by_its_database():
+    scene, facts = made_scene()
+    for inputs, title in [
+        ({"model": "sparse/0", "database": "a.db"}, "sparse/0"),
+        ({"model": "in memory", "database": "a.db"}, "a.db"),
+        ({"model": "in memory", "database": None}, "in memory"),
+    ]:
+        assert page_data(scene, {**facts, "inputs": {**facts["inputs"], **inputs}})["title"] == title
+
+
 def test_same_scene_same_page():
     assert report_html(*made_scene()) == report_html(*made_scene())
 

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.report import IN_MEMORY
 from sfm_shapefit.visual.charts import MOST_CELLS, residual_histogram, view_graph_matrix
 from sfm_shapefit.visual.scene import MAX_POINTS, PairClass, Scene, frustum_corners
 from sfm_shapefit.visual.words import Hint, first_looks, shortened, summary_sentences
@@ -215,8 +216,11 @@ def _convergence(scene: Scene) -> dict[str, Any]:
 
 
 def _title(facts: dict[str, Any]) -> str:
+    """Name the input: a model in memory, as of `map`, by the database that its matches come from."""
     inputs = facts["inputs"]
-    return shortened(str(inputs.get("model") or inputs.get("graph")))
+    model, database = inputs.get("model"), inputs.get("database")
+    named = database if model == IN_MEMORY and database else model or inputs.get("graph")
+    return shortened(str(named))
 
 
 def _subtitle(facts: dict[str, Any]) -> str:
