@@ -17,7 +17,8 @@ only one copy).
 
 import hashlib
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from typing import Any, TypeVar, cast
 
@@ -27,6 +28,7 @@ import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
+from numba.core.event import Listener, install_listener
 from numba.extending import get_cython_function_address, intrinsic
 
 
@@ -65,6 +67,27 @@ def kernel(*, exact: bool = False, inline: bool = False) -> Callable[[Kernel], K
             return cast(Kernel, numba.njit(**options)(function))
 
     return decorate
+
+
+@contextmanager
+def on_compilation(begun: Callable[[], None]) -> Iterator[None]:
+    """Call `begun`, once, when a kernel begins to be compiled that the cache on disk does not have."""
+
+    class First(Listener):  # type: ignore[misc]
+        """Hears of kernels that are compiled, not of those that are loaded."""
+
+        told = False
+
+        def on_start(self, _event: Any) -> None:
+            if not self.told:
+                self.told = True
+                begun()
+
+        def on_end(self, _event: Any) -> None:
+            """Hear of a kernel that is compiled."""
+
+    with install_listener("numba:compile", First()):
+        yield
 
 
 def function_address(module: str, name: str) -> int:

@@ -18,6 +18,8 @@ from sfm_shapefit.robust.verdicts import Verdict
 from sfm_shapefit.solver.options import SolverResult
 
 SCHEMA_VERSION = 1
+IN_MEMORY = "in memory"
+"""What stands in locate.json in the place of a model's path where there is none."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

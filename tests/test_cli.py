@@ -16,6 +16,7 @@ import pycolmap
 import pytest
 from typer.testing import CliRunner
 
+import sfm_shapefit
 from sfm_shapefit.cli import app
 from sfm_shapefit.options import LocateOptions
 from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
@@ -84,6 +85,14 @@ def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
     assert run("locate", RING_MODEL, tmp_path / "out", "--min-inlier-ratio", "7").exit_code == 2
     assert run("frobnicate").exit_code == 2
     assert list(tmp_path.iterdir()) == []
+
+
+def test_version_and_both_flags_of_help_are_there():
+    assert run("--version").stdout == f"sfm-shapefit {sfm_shapefit.__version__}\n"
+    listed = run("-h").stdout
+    assert listed == run("--help").stdout
+    assert "..." not in listed  # each command's line is whole
+    assert run("view", "-h").stdout.startswith("Usage:")
 
 
 def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_path):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numba
 import pytest
 
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import kernel, on_compilation
 
 ROOT = Path(__file__).parents[1]
 
@@ -32,8 +32,20 @@ def test_a_kernel_works_where_nothing_can_be_cached(monkeypatch):
     assert twice(21) == 42
 
 
+def test_compilations_are_told_once_and_only_where_there_are_any():
+    fresh, other = numba.njit(lambda x: x + 1), numba.njit(lambda x: x - 1)  # neither is on disk
+    told = []
+    with on_compilation(lambda: told.append("compiling")):
+        assert fresh(1) == 2
+        assert other(1) == 0
+    assert told == ["compiling"]
+    with on_compilation(lambda: told.append("again")):
+        assert fresh(2) == 3
+    assert told == ["compiling"]
+
+
 COMPILE = """
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import kernel, on_compilation
 def plus_one(x):
     return x + 1
 assert kernel()(plus_one)(1) == 2

@@ -1,5 +1,6 @@
 """What README and docs say runs as it stands: commands one after the other, Python blocks, and every link."""
 
+import ast
 import os
 import re
 import shlex
@@ -123,6 +124,25 @@ def test_every_page_of_the_docs_is_pointed_to():
         for target in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text(encoding="utf-8"))
     }
     assert set(PAGES[1:]) <= targets
+
+
+def strings_of(tree: ast.AST) -> list[str]:
+    """Return the strings of a module, with a star where they are filled in."""
+    filled = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr)]
+    plain = [
+        node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+    parts = [[v.value if isinstance(v, ast.Constant) else "*" for v in node.values] for node in filled]
+    return [*("".join(part) for part in parts), *(node.value for node in plain)]
+
+
+def test_what_the_table_of_reasons_says_the_program_says():
+    sources = (ROOT / "sfm_shapefit").rglob("*.py")
+    said = [text for path in sources for text in strings_of(ast.parse(path.read_text(encoding="utf-8")))]
+    table = README.read_text(encoding="utf-8").split("| it says |", 1)[1].split("\n\n", 1)[0]
+    for row in table.splitlines()[2:]:
+        sentence = re.sub(r"\b(N%?|X|\d+%)(?= |$)", "*", row.split("|")[1].strip())
+        assert any(sentence in text for text in said), sentence
 
 
 def test_the_readme_leads_with_a_light_picture_and_is_read_in_five_minutes():

@@ -5,6 +5,7 @@ import hashlib
 import json
 import re
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -116,6 +117,16 @@ def test_only_the_two_scripts_of_the_page_may_run_and_nothing_be_fetched(page):
     assert "http" not in own.replace("http-equiv", "")
 
 
+def test_a_model_in_memory_is_titled_by_its_database():
+    scene, facts = made_scene()
+    for inputs, title in [
+        ({"model": "sparse/0", "database": "a.db"}, "sparse/0"),
+        ({"model": "in memory", "database": "a.db"}, "a.db"),
+        ({"model": "in memory", "database": None}, "in memory"),
+    ]:
+        assert page_data(scene, {**facts, "inputs": {**facts["inputs"], **inputs}})["title"] == title
+
+
 def test_same_scene_same_page():
     assert report_html(*made_scene()) == report_html(*made_scene())
 
@@ -134,6 +145,16 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
     pair = next(look.pair for look in looks if look.pair is not None)
     against = scene.pairs.classes == PairClass.CONTRADICTS
     assert scene.pairs.support[pair] == scene.pairs.support[against].max()
+
+
+def test_pairs_that_are_off_by_little_alarm_nobody_one_by_one():
+    scene, facts = made_scene()
+    against = scene.pairs.classes == PairClass.CONTRADICTS
+    small = np.where(against, 0.05, scene.pairs.residuals_deg)
+    looks = first_looks(replace(scene, pairs=replace(scene.pairs, residuals_deg=small)), facts)
+    assert all(look.pair is None for look in looks)
+    said = f"{against.sum()} of the pairs contradict the solution, but by 0.05 degrees at most"
+    assert said in [look.text for look in looks]
 
 
 def test_nothing_known_nothing_claimed():

@@ -145,7 +145,7 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
         for t in (start, found.locations)
     )
     assert found.num_turned_pairs == np.sum(before != after) > 0
-    assert f"{found.num_turned_pairs} directions changed sides)" in found.statement()
+    assert f"{found.num_turned_pairs} directions of theirs went from agreeing" in found.statement()
     unrefined = finish(graph, solve(graph), PlacementOptions(refine=False))
     assert (unrefined.num_turned_pairs, unrefined.num_put_back) == (0, 0)
 

@@ -32,6 +32,8 @@ _THREAD_BYTES = 50_000_000  # stack and work space of one thread of the linear a
 _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
 """How Python, C++ and the dynamic linker say that there is no memory."""
 
+_COMPILING = "compiling kernels, which takes about a minute once; they are kept on disk"
+
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
 
@@ -108,7 +110,10 @@ def shown_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress |
     pycolmap writes between them, so there are none if those are wanted.
     """
     if verbose:
-        yield _say_stage
+        from sfm_shapefit.jit import on_compilation
+
+        with on_compilation(lambda: _say(_COMPILING)):
+            yield _say_stage
         return
     if not (enabled and sys.stderr.isatty()):
         yield None
@@ -117,10 +122,13 @@ def shown_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress |
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Display
 
+    from sfm_shapefit.jit import on_compilation
+
     columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with (
         os.fdopen(os.dup(2), "w") as stream,
         Display(*columns, console=Console(file=stream, force_terminal=True)) as display,
+        on_compilation(lambda: display.console.print(_COMPILING)),
     ):
         tasks: dict[str, Any] = {}
 

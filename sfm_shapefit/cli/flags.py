@@ -17,7 +17,11 @@ Command = TypeVar("Command", bound=Callable[..., None])
 
 # COLMAP's own names for paths are accepted beside the positional ones.
 ModelArgument = Annotated[
-    Path | None, typer.Argument(metavar="MODEL", help="COLMAP model folder (binary or text).")
+    Path | None,
+    typer.Argument(
+        metavar="MODEL",
+        help="COLMAP model folder, binary or text; or a file of Bundler, openMVG or OpenSfM.",
+    ),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]
 InputPath = Annotated[Path | None, typer.Option("--input_path", hidden=True)]

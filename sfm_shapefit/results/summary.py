@@ -10,7 +10,7 @@ from sfm_shapefit import __version__
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.placement import Placement
-from sfm_shapefit.report import SCHEMA_VERSION, PieceRow, solve_summary
+from sfm_shapefit.report import IN_MEMORY, SCHEMA_VERSION, PieceRow, solve_summary
 from sfm_shapefit.results.rows import name_of, piece_rows
 from sfm_shapefit.results.values import GraphResult, LocateResult, all_names
 from sfm_shapefit.results.warnings import graph_warnings
@@ -28,7 +28,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA_VERSION,
         "inputs": {
-            "model": str(found.inputs.folder or "in memory"),
+            "model": str(found.inputs.folder or IN_MEMORY),
             "database": found.inputs.database and str(found.inputs.database),
             "directions": found.inputs.statement,
         },

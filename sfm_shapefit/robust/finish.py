@@ -110,9 +110,11 @@ class Finish:
             return f"{self.start}, not refined: {self.reason}"
         median, largest = self.moved
         back = f"; {self.num_put_back} thrown out of the scene and put back" if self.num_put_back else ""
+        nodes = "cameras and points" if len(self.levels_deg) > 1 else "cameras"
         return (
-            f"{self.start}, refined in angles (moved by {median:.2%} of the scene's radius, at most "
-            f"{largest:.2%}; {self.num_turned_pairs} directions changed sides{back}): {self.reason}"
+            f"{self.start}, refined in angles ({nodes} moved by {median:.2%} of the scene's radius, at most "
+            f"{largest:.2%}; {self.num_turned_pairs} directions of theirs went from agreeing to "
+            f"contradicting or back{back}): {self.reason}"
         )
 
 
@@ -372,8 +374,9 @@ def _choose(
     difference = costs["LUD"] - costs["ShapeFit"]
     if apart <= COLLAPSED:
         name = "LUD" if difference < 0.0 else "ShapeFit"
-        apart_text = f"the starts' lengths differ by {apart:.0%}, not by a collapse"
-        return by_name[name], f"{apart_text}; {name} fits no worse"
+        return by_name[
+            name
+        ], f"the starts' lengths differ by {apart:.0%}, not by a collapse; {name} fits no worse"
     if abs(difference) <= _TIE * min(costs.values()):
         return by_name["LUD"], (
             f"the starts disagree (lengths by {apart:.0%}) and fit alike: LUD, whose lengths cannot collapse"

@@ -23,6 +23,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.report import IN_MEMORY
 from sfm_shapefit.visual.charts import MOST_CELLS, residual_histogram, view_graph_matrix
 from sfm_shapefit.visual.scene import MAX_POINTS, PairClass, Scene, frustum_corners
 from sfm_shapefit.visual.words import Hint, first_looks, shortened, summary_sentences
@@ -215,8 +216,11 @@ def _convergence(scene: Scene) -> dict[str, Any]:
 
 
 def _title(facts: dict[str, Any]) -> str:
+    """Name the input: a model in memory, as of `map`, by the database that its matches come from."""
     inputs = facts["inputs"]
-    return shortened(str(inputs.get("model") or inputs.get("graph")))
+    model, database = inputs.get("model"), inputs.get("database")
+    named = database if model == IN_MEMORY and database else model or inputs.get("graph")
+    return shortened(str(named))
 
 
 def _subtitle(facts: dict[str, Any]) -> str:
@@ -343,11 +347,9 @@ def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
 
 
 def _option(value: Any) -> str:
-    return {True: "yes", False: "no", None: "none"}.get(value, str(value)) if _is_plain(value) else str(value)
-
-
-def _is_plain(value: Any) -> bool:
-    return value is None or isinstance(value, bool)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "none" if value is None or value == "" else str(value)
 
 
 # --- the file --------------------------------------------------------------------------------------

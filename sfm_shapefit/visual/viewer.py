@@ -82,8 +82,9 @@ def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.V
     try:
         import viser
     except ImportError as error:
-        how = "pip install '.[viewer]' in the folder of sfm_shapefit"
-        raise InputError(f"the viewer needs viser: {how}") from error
+        raise InputError(
+            "the viewer needs viser: pip install '.[viewer]' in the folder of sfm_shapefit"
+        ) from error
     with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction(tuple(scene.axes[2].tolist()))

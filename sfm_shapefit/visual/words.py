@@ -14,6 +14,7 @@ from sfm_shapefit.visual.scene import PairClass, Scene
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
+_FAR_DEG = 1.0  # repeated structure and wrong rotations are off by more
 _LOW_TRUST = 0.75  # below it, reasons are given
 _SHOWN = 3  # items of a kind among the first things to look at
 
@@ -103,7 +104,7 @@ def _certainty(scene: Scene) -> Iterator[str]:
     median = float(np.median(sigmas[known]))
     yield (
         f"The median standard deviation of a position is {median:.2g} units, "
-        f"{median / scene.extent:.2%} of the extent of {scene.extent:.4g} units; the largest is "
+        f"{100.0 * median / scene.extent:.2g}% of the extent of {scene.extent:.4g} units; the largest is "
         f"{scene.cameras.sigmas[worst]:.2g}, of {shortened(scene.cameras.names[worst])}."
     )
 
@@ -148,9 +149,19 @@ def _least_trusted(scene: Scene) -> Iterator[Hint]:
 
 
 def _contradictions(scene: Scene) -> Iterator[Hint]:
-    """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations."""
+    """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
+
+    Those that are off by little, if by more than the others, come together in a sentence.
+    """
     pairs = scene.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
+    far = pairs.residuals_deg[against] >= _FAR_DEG
+    if len(against) and not far.any():
+        yield Hint(
+            text=f"{len(against):,} of the pairs contradict the solution, but by "
+            f"{pairs.residuals_deg[against].max():.2g} degrees at most"
+        )
+    against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
     for row in against[order][:_SHOWN].tolist():
         first, second = (shortened(scene.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
