@@ -1,5 +1,6 @@
 """The door to numba: kernels compile with or without a place to cache them."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -58,3 +59,68 @@ def test_memory_stays_sound_whichever_of_pycolmap_and_this_package_is_imported_f
         check=False,
     )
     assert done.returncode == 0, done.stderr[-500:]
+
+
+def is_kernel(function):
+    return any(isinstance(d, ast.Call) and ast.unparse(d.func) == "kernel" for d in function.decorator_list)
+
+
+def crossings(sources):
+    """Yield each call from Python of a kernel that is annotated to return a NamedTuple."""
+    trees = [ast.parse(source) for source in sources]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    functions = [node for node in nodes if isinstance(node, ast.FunctionDef)]
+    named = {
+        node.name
+        for node in nodes
+        if isinstance(node, ast.ClassDef) and "NamedTuple" in map(ast.unparse, node.bases)
+    }
+    risky = {
+        function.name
+        for function in functions
+        if is_kernel(function)
+        and function.returns is not None
+        and named & {n.id for n in ast.walk(function.returns) if isinstance(n, ast.Name)}
+    }
+    for function in functions:
+        if not is_kernel(function):
+            called = (node.func for node in ast.walk(function) if isinstance(node, ast.Call))
+            yield from (ast.unparse(f) for f in called if ast.unparse(f).split(".")[-1] in risky)
+
+
+def test_no_kernel_hands_a_named_tuple_to_python():
+    """Numba makes it by Python code inside native code, where an interrupt is a segmentation fault."""
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "sfm_shapefit").rglob("*.py")]
+    assert list(crossings(sources)) == []
+    sin = "class P(NamedTuple): pass\n@kernel()\ndef f() -> tuple[int, P]: pass\ndef g(): return f()"
+    assert list(crossings([sin])) == ["f"]
+
+
+INTERRUPTED = """
+import signal
+import numpy as np
+from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+drawn = random_graph_problem(40, 0.5, d=3, sigma=0.1, q=0.3, seed=1)
+graph = ViewGraph(40, drawn.edges, drawn.directions)
+caught = 0
+for solve in (solve_newton_dense, solve_newton_sparse):
+    solve(graph, 1e-8, 50)
+    for delay in np.linspace(2e-4, 2e-2, 60):
+        try:
+            signal.signal(signal.SIGALRM, signal.default_int_handler)
+            signal.setitimer(signal.ITIMER_REAL, delay)
+            for _ in range(100):
+                solve(graph, 1e-8, 50)
+        except KeyboardInterrupt:
+            caught += 1
+print(caught)
+"""
+
+
+def test_an_interrupt_during_a_solve_is_an_interrupt():
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout) == (0, "120\n"), done.stderr
