@@ -1,5 +1,6 @@
 """The door to numba: kernels compile with or without a place to cache them."""
 
+import ast
 import os
 import subprocess
 import sys
@@ -70,3 +71,73 @@ def test_memory_stays_sound_whichever_of_pycolmap_and_this_package_is_imported_f
         check=False,
     )
     assert done.returncode == 0, done.stderr[-500:]
+
+
+def is_kernel(function):
+    return any(isinstance(d, ast.Call) and ast.unparse(d.func) == "kernel" for d in function.decorator_list)
+
+
+def crossings(modules):
+    """Yield each call from Python of a kernel that is annotated to return a NamedTuple; modules: by name."""
+    nodes = {name: list(ast.walk(ast.parse(source))) for name, source in modules.items()}
+    functions = {name: [n for n in nodes[name] if isinstance(n, ast.FunctionDef)] for name in nodes}
+    classes = [n for name in nodes for n in nodes[name] if isinstance(n, ast.ClassDef)]
+    named = {c.name for c in classes if "NamedTuple" in map(ast.unparse, c.bases)}
+    risky = {
+        (name, function.name)
+        for name in functions
+        for function in functions[name]
+        if is_kernel(function)
+        and named & {n.id for n in ast.walk(function.returns or ast.Pass()) if isinstance(n, ast.Name)}
+    }
+    for name, inside in nodes.items():
+        imports = [n for n in inside if isinstance(n, ast.ImportFrom)]
+        known = {alias.name for n in imports for alias in n.names if (n.module, alias.name) in risky}
+        known |= {function.name for function in functions[name] if (name, function.name) in risky}
+        for function in functions[name]:
+            if not is_kernel(function):
+                calls = (n.func for n in ast.walk(function) if isinstance(n, ast.Call))
+                yield from (f.id for f in calls if isinstance(f, ast.Name) and f.id in known)
+
+
+def test_no_kernel_hands_a_named_tuple_to_python():
+    """Numba makes it by Python code inside native code, where an interrupt is a segmentation fault."""
+    files = {path: path.read_text(encoding="utf-8") for path in (ROOT / "sfm_shapefit").rglob("*.py")}
+    modules = {
+        ".".join(path.relative_to(ROOT).with_suffix("").parts): text
+        for path, text in files.items()
+        if "NamedTuple" in text or "kernel" in text or "/solver/" in str(path)
+    }
+    assert list(crossings(modules)) == []
+    sin = "class P(NamedTuple): pass\n@kernel()\ndef f() -> tuple[int, P]: pass\ndef g(): return f()"
+    assert list(crossings({"a": sin, "b": "from a import f\ndef h(): return f()"})) == ["f", "f"]
+
+
+INTERRUPTED = """
+import signal
+import numpy as np
+from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+drawn = random_graph_problem(40, 0.5, d=3, sigma=0.1, q=0.3, seed=1)
+graph = ViewGraph(40, drawn.edges, drawn.directions)
+caught = 0
+for solve in (solve_newton_dense, solve_newton_sparse):
+    solve(graph, 1e-8, 50)
+    for delay in np.linspace(2e-4, 2e-2, 60):
+        try:
+            signal.signal(signal.SIGALRM, signal.default_int_handler)
+            signal.setitimer(signal.ITIMER_REAL, delay)
+            for _ in range(100):
+                solve(graph, 1e-8, 50)
+        except KeyboardInterrupt:
+            caught += 1
+print(caught)
+"""
+
+
+def test_an_interrupt_during_a_solve_is_an_interrupt():
+    done = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False, cwd=ROOT
+    )
+    assert (done.returncode, done.stdout) == (0, "120\n"), done.stderr

@@ -315,6 +315,10 @@ def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
     flops = prediction.flops * 27
     assert chosen(sparse)[2] == f"{flops / 1e9:.2g} Gflop for a sparse factor"
 
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_LARGEST_DENSE", 470)  # a larger graph is predicted, dense or not
+        assert chosen(clique)[3]["prediction"].flops > 0
+
     monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", 0.99 * flops)
     assert chosen(sparse)[:2] == ("admm", "_run_admm")
     assert "splitting is faster" in chosen(sparse)[2]

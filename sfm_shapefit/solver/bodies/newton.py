@@ -31,17 +31,17 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
-    closed,
     dot,
+    ended,
     extend_step,
     linearise,
-    measure,
+    measured,
     pays,
     set_gradient,
     set_residuals,
     smoothing,
     start_from,
-    take,
+    taken,
 )
 from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
 from sfm_shapefit.solver.program import along, differences, normalized_locations, projected_length
@@ -113,7 +113,7 @@ def _solve(
     start = None if system is None else system.solve(np.zeros(bodies.num_unknowns), 1.0)[1]
     if start is None or not start_from(problem, bodies.expand(start), iterate):
         raise UnsolvableError("the directions do not determine the bodies; check which of them hang free")
-    progress = measure(problem, iterate)
+    progress = measured(problem, iterate)
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
         before = progress.gap
@@ -141,7 +141,7 @@ def _cycle(
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
-        return closed(iterate, progress, mu, first)
+        return ended(iterate, progress, mu, first)
     edge_work = EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.factor.panels.size
     work = factor.factor.symbolic.flops * factor.factor.block**3 + 0.5 * edge_work
@@ -151,11 +151,11 @@ def _cycle(
         target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress, target)
+        progress = taken(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return closed(iterate, progress, progress.mu, first)
+    return ended(iterate, progress, progress.mu, first)
 
 
 def _propose(

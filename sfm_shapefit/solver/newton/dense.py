@@ -20,6 +20,7 @@ from sfm_shapefit.solver.newton.steps import (
     STALL,
     STEPS_PER_FACTOR,
     Progress,
+    Scalars,
     allocate,
     allowed_violation,
     answer,
@@ -28,8 +29,9 @@ from sfm_shapefit.solver.newton.steps import (
     extend_step,
     is_cancelled,
     linearise,
-    measure,
+    measured,
     pays,
+    scalars,
     set_gradient,
     set_residuals,
     smoothing,
@@ -99,14 +101,15 @@ def solve_newton_dense(
     with one_blas_thread():
         if not _start(problem, iterate, model, factor):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure(problem, iterate)
+        progress = measured(problem, iterate)
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
             limit = min(chunk, max_iterations - count)
-            done, stalled, progress = _newton(
+            done, stalled, after = _newton(
                 problem, iterate, model, factor, step, progress, tol, limit, stalled
             )
+            progress = Progress(*after)
             count += done
             if is_cancelled(on_iteration, count, progress):
                 break
@@ -144,7 +147,7 @@ def _newton(
     tol: float,
     limit: int,
     stalled: int,
-) -> tuple[int, int, Progress]:
+) -> tuple[int, int, Scalars]:
     """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
     count = 0
     while count < limit and progress.gap > tol and stalled < factor.patience:
@@ -154,7 +157,7 @@ def _newton(
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
         if progress.gap == before and factor.right.itemsize == 4:
             stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
-    return count, stalled, progress
+    return count, stalled, scalars(progress)
 
 
 @kernel(inline=True)

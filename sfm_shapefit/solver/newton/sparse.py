@@ -35,18 +35,18 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
-    closed,
     dot,
+    ended,
     extend_step,
     is_cancelled,
     linearise,
-    measure,
+    measured,
     pays,
     set_gradient,
     set_residuals,
     smoothing,
     start_from,
-    take,
+    taken,
 )
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
@@ -92,7 +92,7 @@ def solve_newton_sparse(
         system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
         if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure(problem, iterate)
+        progress = measured(problem, iterate)
     else:
         progress = _begin_at(problem, *start, iterate)
     count, stalled = 0, 0
@@ -112,7 +112,7 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
     set_residuals(problem, iterate.t, iterate.r)
     iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
-    return measure(problem, iterate)
+    return measured(problem, iterate)
 
 
 class System(NamedTuple):
@@ -154,7 +154,7 @@ def _cycle(
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorise(problem, model, factor, longest)
     if system is None:
-        return closed(iterate, progress, mu, first)
+        return ended(iterate, progress, mu, first)
     edge_work = EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.panels.size
     work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
@@ -164,11 +164,11 @@ def _cycle(
         target, exact = _propose(problem, iterate, model, system, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress, target)
+        progress = taken(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return closed(iterate, progress, progress.mu, first)
+    return ended(iterate, progress, progress.mu, first)
 
 
 def _propose(

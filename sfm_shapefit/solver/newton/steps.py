@@ -460,3 +460,50 @@ def dot(x: Any, y: Any) -> float:
         for k in range(x.shape[1]):
             total += x[i, k] * y[i, k]
     return total
+
+
+# --- the same from Python ---------------------------------------------------------------------------
+#
+# What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while
+# the kernel ran would be raised there, and end the process by a segmentation fault: kernels that Python
+# calls return plain tuples.
+
+Scalars = tuple[float, float, float, float, bool]
+
+
+@kernel(inline=True)
+def scalars(progress: Any) -> Scalars:
+    """Return the scalars as a plain tuple."""
+    return progress.mu, progress.multiplier, progress.objective, progress.gap, progress.clips
+
+
+@kernel()
+def _measured(problem: Any, iterate: Any) -> Scalars:
+    return scalars(measure(problem, iterate))
+
+
+@kernel()
+def _taken(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Scalars:
+    return scalars(take(problem, iterate, step, mu, progress, target))
+
+
+@kernel()
+def _closed(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
+    return scalars(closed(iterate, progress, mu, first))
+
+
+def measured(problem: Problem, iterate: Iterate) -> Progress:
+    """Return the scalars at the iterate; see `measure`."""
+    return Progress(*_measured(problem, iterate))
+
+
+def taken(
+    problem: Problem, iterate: Iterate, step: Step, mu: float, progress: Progress, target: float
+) -> Progress:
+    """Take a step and return the scalars after it; see `take`."""
+    return Progress(*_taken(problem, iterate, step, mu, progress, target))
+
+
+def ended(iterate: Iterate, progress: Progress, mu: float, first: float) -> Progress:
+    """Return the scalars after a cycle; see `closed`."""
+    return Progress(*_closed(iterate, progress, mu, first))
