@@ -199,7 +199,7 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     factor = (2.2 * 8.0 * _BLOCK * work.factor_entries) if economy.factor else 0.0
     moved = 8.0 * 3 * _SAMPLES * 3.0 * nodes if samples else 0.0
     peaks["placing"] = held + solving + 2.5 * samples + moved + factor
-    seeds = 90.0 * work.num_keypoints
+    seeds = 66.0 * work.num_keypoints
     peaks["triangulating"] = held + 300.0 * edges + seeds + 46.0 * work.num_matches + 0.5 * batch
     return peaks
 

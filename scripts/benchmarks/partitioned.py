@@ -81,7 +81,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Measure, print the section and write it; a missed limit is no failure."""
-    about = environment(PACKAGES, f"python scripts/benchmark.py partitioned --cameras {args.cameras}")
+    chosen = f"--families {' '.join(args.families)} --cameras {args.cameras} --images {args.images}"
+    about = environment(PACKAGES, f"python scripts/benchmark.py partitioned {chosen}")
     rows = []
     for family in args.families:
         spec = GraphSpec(family=family, n=args.cameras, degree=DEGREES[family], sigma=0.01)
