@@ -210,7 +210,7 @@ def _times(work: Workload, economy: Economy) -> dict[str, float]:
     samples = work.num_sampled if economy.samples else 0
     has_points = work.has_points and economy.points
     times = {
-        "reading": 2.5 + 4.5e-7 * work.num_keypoints,
+        "reading": 1.7 + 4.5e-7 * work.num_keypoints,
         "measuring directions": 0.2 + 1.4e-6 * work.num_matches,
         "placing": 0.5
         + 8e-5 * edges

@@ -161,6 +161,11 @@ class MatchDatabase:
         """Keep no more bytes than these of the rays of keypoints that may be needed again."""
         self._cache_bytes = num_bytes
 
+    def forget_rays(self) -> None:
+        """Give back the memory of the rays that are kept; they are computed again where they are needed."""
+        self._rays.clear()
+        self._cached_bytes = 0
+
     @property
     def num_matches(self) -> int:
         """Number of these pairs' inlier matches."""

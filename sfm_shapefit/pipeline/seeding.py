@@ -110,7 +110,9 @@ def _seed_and_tracks(
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
-    return seed, correspondence_graph(seed, model.image_ids, batches)
+    graph = correspondence_graph(seed, model.image_ids, batches)
+    source.database.forget_rays()  # triangulation is where most memory is needed
+    return seed, graph
 
 
 def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
