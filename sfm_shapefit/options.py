@@ -87,7 +87,7 @@ class LocateOptions:
     column trust of cameras.csv."""
     factor_memory: int = 2000
     """What one sparse factor may take, in MB. Larger ones are replaced by iterations in the solve, and left
-    out where only they serve: in the refinement and for standard deviations."""
+    out elsewhere: on long chains in the refinement, and for standard deviations."""
     max_memory: int = 0
     """Peak memory in MB to stay below, 0 for no limit: smaller batches, then fewer helpers, see `inspect`. If
     nothing is enough, the run is refused with the number needed."""

@@ -30,6 +30,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.partition import partition
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish, finish_merged
 from sfm_shapefit.robust.options import PlacementOptions
@@ -100,7 +101,7 @@ def choose_pieces(graph: ViewGraph, options: PlacementOptions) -> IntArray | Non
     """
     if options.objective != "auto" or not options.refine:
         return None  # another answer is wanted
-    if plan_refinement(graph, options.factor_memory * 1_000_000) is not None:
+    if isinstance(plan_refinement(graph, options.factor_memory * 1_000_000), SymbolicFactor):
         return None
     count = max(_LEAST_PIECES, -(-graph.num_cameras // _CAMERAS_PER_PIECE))
     part_of = partition(adjacency(graph.num_cameras, graph.edges), count)

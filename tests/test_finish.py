@@ -12,7 +12,12 @@ from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.solver import angular
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.synthetic import random_graph_problem, street_problem, trajectory_graph_problem
+from sfm_shapefit.synthetic import (
+    box_graph_problem,
+    random_graph_problem,
+    street_problem,
+    trajectory_graph_problem,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 
 
@@ -165,8 +170,13 @@ def test_the_answer_has_the_scale_of_the_solver(expander):
 
 
 def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
-    monkeypatch.setattr(angular, "_MAX_FLOPS", 10.0)
-    found = finished(expander)
+    exact = finished(expander)
+    with monkeypatch.context() as patch:
+        patch.setattr(angular, "_MAX_FLOPS", 10.0)
+        found = finished(expander)  # without a factor, and as good
+        assert found.refined
+        np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
+    found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory=1)  # MB
     assert not found.refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it

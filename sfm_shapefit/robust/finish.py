@@ -176,8 +176,8 @@ def finish(
     )
 
 
-def _plan(graph: ViewGraph, bodies: Bodies | None, max_bytes: int) -> SymbolicFactor | ReducedFactor | None:
-    """Return what the refinement factors with, or None if its factor would be too large."""
+def _plan(graph: ViewGraph, bodies: Bodies | None, max_bytes: int) -> SymbolicFactor | NormalFactor | None:
+    """Return what the refinement solves its steps with, or None if its factor would be too large."""
     if bodies is None:
         return plan_refinement(graph, max_bytes)
     return ReducedFactor(graph.edges, bodies.normalised())

@@ -38,6 +38,7 @@ from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.solver.iterative import IterativeNormal
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -92,12 +93,16 @@ class AngularResult:
     """Factorisations."""
 
 
-def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFactor | None:
-    """Return the plan of the refinement's factor, or None if it would be too large to be worth it."""
+def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFactor | IterativeNormal | None:
+    """Return what the refinement solves its steps with; None if its factor would take too much memory.
+
+    Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
+    few steps. On long chains they need many, but there a factor is little work.
+    """
     neighbours = adjacency(graph.num_cameras, graph.edges)
     tree = best_order(neighbours)
     if tree.flops * graph.dimension**3 > _MAX_FLOPS:
-        return None
+        return IterativeNormal(graph)
     plan = plan_factorisation(neighbours, graph.edges, tree)
     return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
@@ -115,8 +120,8 @@ def refine_angles(
         graph: a connected view graph.
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
-        plan: of the factorisation, from `plan_refinement`; or memory for a factor, such as that over bodies,
-            in which case locations are and stay those of the bodies.
+        plan: what `plan_refinement` says; or memory for a factor, such as that over bodies, in which case
+            locations are and stay those of the bodies.
         rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
             as low as these, and where it clearly cannot.
 

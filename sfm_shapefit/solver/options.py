@@ -66,7 +66,7 @@ class SolverOptions:
     """Also examine whether the certificate proves the optimum unique; costs one sparse factorisation."""
     factor_memory: int = 2000
     """What one sparse factor may take, in MB. Larger ones are replaced by iterations in the solve, and left
-    out where only they serve: in the refinement and for standard deviations."""
+    out elsewhere: on long chains in the refinement, and for standard deviations."""
     threads: int = 1
     """Threads of the passes over edges; the answer does not depend on it."""
 
