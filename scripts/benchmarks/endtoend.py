@@ -50,7 +50,7 @@ class Located:
     num_matches: int
     num_placed: int
     median_error: float
-    """Of the cameras, as a share of the scene's radius."""
+    """Of the cameras, as a share of the scene's extent."""
     usage: Usage
     stages: dict[str, Usage]
 
@@ -111,13 +111,13 @@ def measure(folder: Path, num_images: int, threads: int) -> Located:
     stages = call(_located, scene, out, threads, environment=thread_environment(threads))
     facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
     truth = scene / "sparse" / "0"  # its centres are the true ones, which `locate` does not look at
-    _, errors = command("evaluate", out, truth, "--json")
+    found = json.loads(command("evaluate", out, truth, "--json")[1])
     located = Located(
         num_images=num_images,
         num_pairs=facts["num_pairs"],
         num_matches=_num_matches(scene / "database.db"),
         num_placed=facts["num_placed"],
-        median_error=json.loads(errors)["position"]["median"] / _radius(truth),
+        median_error=found["position_error"]["median"] / found["extent"],
         usage=Usage(
             wall_s=sum(one.wall_s for one in stages.values()),
             cpu_s=sum(one.cpu_s for one in stages.values()),
@@ -184,13 +184,6 @@ def _num_matches(database: Path) -> int:
         return int(opened.num_inlier_matches())
 
 
-def _radius(model: Path) -> float:
-    from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.geometry import median_spread
-
-    return median_spread(read_model(model).centers)
-
-
 def section(measured: Sequence[Located], about: str) -> str:
     """Return the Markdown of all sizes."""
     rows = []
@@ -213,7 +206,7 @@ def section(measured: Sequence[Located], about: str) -> str:
                 verdict(checks) if one.num_images >= LARGEST else "no target",
             ]
         )
-    header = ["images", "pairs", "matches", "placed", "error / radius", "s", "CPU s", "peak MB", "verdict"]
+    header = ["images", "pairs", "matches", "placed", "error / extent", "s", "CPU s", "peak MB", "verdict"]
     parts = ["## Reliability: end to end at scale\n", about, "", table(header, rows)]
     parts += ["\nSeconds / CPU seconds / peak MB by stage; exponents between smallest and largest:\n"]
     return "\n".join([*parts, _stages(measured)])
