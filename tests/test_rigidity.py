@@ -7,7 +7,12 @@ import pytest
 
 from sfm_shapefit import rigidity
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.rigidity import is_parallel_rigid, left_out_reasons, parallel_rigid_pieces, rigid_pieces
+from sfm_shapefit.rigidity import (
+    is_parallel_rigid,
+    left_out_reasons,
+    parallel_rigid_pieces,
+    rigid_pieces,
+)
 from sfm_shapefit.viewgraph import ViewGraph
 
 DIMENSIONS = (2, 3, 4)
@@ -235,7 +240,7 @@ def test_edges_are_joined_by_triangles_exactly_where_a_chain_of_them_leads(seed)
         sides = [number.get(frozenset(pair), -1) for pair in complete(triangle)]
         if min(sides) >= 0:
             chain[np.isin(chain, chain[sides])] = chain[sides].min()
-    np.testing.assert_array_equal(chain, rigidity._triangle_bodies(n, edges))
+    np.testing.assert_array_equal(chain, rigidity.growth.triangle_bodies(n, edges))
     assert 1 < len(np.unique(chain)) < m
 
 
@@ -248,10 +253,10 @@ def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
         for camera in range(n):
             partners = {int(i + j - camera) for i, j in edges if camera in (i, j)}
             members |= {camera} if len(partners & members) >= 2 else set()
-    assert rigidity._grows_from_first_pair(n, edges) == (len(members) == n)
+    assert rigidity.pieces._grows_from_first_pair(n, edges) == (len(members) == n)
     fan = np.array([(0, 1), *((i, k) for k in range(2, n) for i in (k - 2, k - 1))])
-    assert rigidity._grows_from_first_pair(n, fan)
-    assert not rigidity._grows_from_first_pair(n + 1, fan)
+    assert rigidity.pieces._grows_from_first_pair(n, fan)
+    assert not rigidity.pieces._grows_from_first_pair(n + 1, fan)
 
 
 def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():

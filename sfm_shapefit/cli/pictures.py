@@ -47,8 +47,8 @@ def view_command(
 
         drawn, facts = read_output(folder)
         server = serve(drawn, facts, host, port)
-        print(f"http://{host}:{server.get_port()}  (end with Ctrl-C)", flush=True)  # noqa: T201
         try:
+            print(f"http://{host}:{server.get_port()}  (end with Ctrl-C)", flush=True)  # noqa: T201
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:
