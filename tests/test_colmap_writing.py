@@ -377,7 +377,11 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         original.point3D(point_id).color = np.array([10, 20, 30], dtype=np.uint8)
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
     seed, graph = seeded(original)
-    structure = colored(triangulate(seed, graph), original)
+    black = triangulate(seed, graph)
+    structure = colored(black, original)
+    assert not any(point.color.any() for point in black.points3D.values())
+    assert colored(black, original, in_place=True) is black
+    assert all((p.color == structure.point3D(k).color).all() for k, p in black.points3D.items())
     assert structure.num_points3D() == 120
     for point in structure.points3D.values():
         # means 15, 20 and 31.5; a half is rounded to even

@@ -160,17 +160,17 @@ def filtered(
 
 
 def colored(
-    reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction
+    reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction, *, in_place: bool = False
 ) -> pycolmap.Reconstruction:
     """Return a copy whose points take the mean colour of the source's points seen at the same points2D.
 
     Images take part if their points2D are the same in both, in number and coordinates. Points without
     any common observation keep their colour. A source without any colour costs no copy: the
-    `reconstruction` itself is returned.
+    `reconstruction` itself is returned. So it is `in_place`, coloured: a copy of a large one is large.
     """
     if not any(point.color.any() for point in source.points3D.values()):
         return reconstruction
-    result = pycolmap.Reconstruction(reconstruction)
+    result = reconstruction if in_place else pycolmap.Reconstruction(reconstruction)
     ours, theirs = _common_observations(result, source)
     source_ids, source_rows = np.unique(theirs, return_inverse=True)
     source_colors = [source.point3D(i).color for i in source_ids.tolist()]

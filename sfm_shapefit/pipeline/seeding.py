@@ -60,9 +60,10 @@ def seeded_model(
             still = () if fixed is None else source.model.frame_ids[fixed].tolist()
             adjusted = bundle_adjust(seed, tracks, options.for_structure(), fixed_frames=still)
             seeded = adjusted.reconstruction
+    del tracks  # the graph of all matches is large
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
-            seeded = colored(seeded, source.model.reconstruction)
+            seeded = colored(seeded, source.model.reconstruction, in_place=True)
     return seeded if gauge.axes is None else turned(seeded, gauge.axes), adjusted
 
 
