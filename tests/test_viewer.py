@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import urllib.request
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from typer.testing import CliRunner
 from sfm_shapefit.cli import app
 from sfm_shapefit.visual.scene import PairClass
 from sfm_shapefit.visual.sources import read_output
-from sfm_shapefit.visual.viewer import Thresholds, drawn_pairs, input_centers, serve
+from sfm_shapefit.visual.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
 from tests.made_scenes import made_scene
 from tests.scenes import BUNDLED, FACADE, ROOT
 
@@ -111,6 +112,14 @@ def test_the_inputs_centres_are_brought_into_the_outputs_units():
     assert input_centers(replace(other, cameras=replace(other.cameras, poses=same))) is None
 
 
+def test_a_ray_picks_the_camera_that_it_meets():
+    scene, _ = made_scene()
+    eye = scene.cameras.centers[scene.cameras.placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
+    for camera in np.flatnonzero(scene.cameras.placed)[:5].tolist():
+        assert camera_at(scene, eye, 7.0 * (scene.cameras.centers[camera] - eye)) == camera
+    assert camera_at(scene, eye, np.array([0.0, 1.0, 0.0])) is None  # away from all
+
+
 def test_moving_a_control_redraws():
     scene, facts = made_scene()
     server = serve(scene, facts, "127.0.0.1", 8765)
@@ -120,6 +129,11 @@ def test_moving_a_control_redraws():
         controls["least matches"].value = 100
         assert controls["pairs drawn"].value != before
         assert "input's poses (grey)" in controls
+        (clicked,) = server.scene._scene_pointer_cb
+        middle = np.median(scene.cameras.centers[scene.cameras.placed], axis=0)
+        towards = scene.cameras.centers[3] - middle - np.array([50.0, 0.0, 0.0])
+        clicked.callback(SimpleNamespace(ray_origin=(50.0, 0.0, 0.0), ray_direction=tuple(towards)))
+        assert controls["pairs of"].value.endswith(scene.cameras.names[3])
     finally:
         server.stop()
 

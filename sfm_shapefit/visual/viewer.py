@@ -13,7 +13,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import fit_similarity_l1
+from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.visual.mesh import PAIR_COLORS, trust_colors
 from sfm_shapefit.visual.scene import PairClass, Scene, frustum_corners
 from sfm_shapefit.visual.words import shortened
@@ -28,6 +28,7 @@ _CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
 _FEWEST_FITTED = 3
+_PICKED_DEG = 2.0  # between a click and the centre of the camera that is meant
 _LEAST_DEG = 0.01  # the slider is logarithmic, up to 180 degrees
 
 
@@ -65,6 +66,23 @@ def drawn_pairs(scene: Scene, thresholds: Thresholds) -> DrawnPairs:
     worst = pairs.worst_first()
     rows = worst[kept[worst]][:_MAX_PAIRS]
     return DrawnPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
+
+
+def camera_at(scene: Scene, origin: FloatArray, direction: FloatArray) -> int | None:
+    """Return the placed camera whose centre is nearest to a ray in angle, within 2 degrees; None if none is.
+
+    Args:
+        scene: what is drawn.
+        origin: (3,) of the ray, in the output's units and axes.
+        direction: (3,) of any length.
+    """
+    rows = np.flatnonzero(scene.cameras.placed)
+    towards = scene.cameras.centers[rows] - origin
+    if len(rows) == 0:
+        return None
+    angles = angle_between_deg(normalized(towards), normalized(np.broadcast_to(direction, towards.shape)))
+    nearest = int(np.argmin(angles))
+    return int(rows[nearest]) if angles[nearest] <= _PICKED_DEG else None
 
 
 def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
@@ -145,6 +163,14 @@ class _View:
             shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
         for control in (self._residual, self._support, self._trust, self._picked):
             control.on_update(lambda _event: self._draw())
+        self._server.scene.on_click()(self._pick)
+
+    def _pick(self, event: "viser.SceneClickEvent") -> None:
+        """Choose the camera under a click."""
+        origin = np.asarray(event.ray_origin) + self._middle
+        row = camera_at(self._scene, origin, np.asarray(event.ray_direction))
+        if row is not None:
+            self._picked.value = next(name for name, own in self._choices.items() if own == row)
 
     def _draw(self) -> None:
         """Draw cameras and pairs anew; a name that is drawn again replaces what it named."""
