@@ -239,16 +239,7 @@ def _place_piece(
         history.append(info)
         return None if on_iteration is None else on_iteration(info)
 
-    part_of = None if executor is None else choose_pieces(piece, options)
-    if part_of is not None:
-        joined = place_partitioned(piece, part_of, options, known, classes, executor)
-        solved, finished = joined.solve, joined.finish
-    else:
-        if options.solves_shapefit:
-            solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
-        else:
-            solved = solve_baseline(piece, options.objective)
-        finished = finish(piece, solved, options, known, classes)
+    solved, finished = _solved(piece, options, known, classes, watch, executor)
     placed = int(np.sum(nodes < num_cameras))
     memory, back = options.factor_memory, finished.put_back
     assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory=memory)
@@ -265,3 +256,23 @@ def _place_piece(
         rival=None if rival is None else replace(rival, cameras=nodes[rival.cameras]),
         history=tuple(history),
     )
+
+
+def _solved(
+    piece: ViewGraph,
+    options: PlacementOptions,
+    covariance: FloatArray | None,
+    classes: IntArray,
+    watch: OnIteration,
+    executor: Executor | None,
+) -> tuple[SolverResult, Finish]:
+    """Solve and finish a rigid graph: in pieces where an executor is there and they serve, else whole."""
+    part_of = None if executor is None else choose_pieces(piece, options)
+    if part_of is not None:
+        joined = place_partitioned(piece, part_of, options, covariance, classes, executor)
+        return joined.solve, joined.finish
+    if options.solves_shapefit:
+        solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
+    else:
+        solved = solve_baseline(piece, options.objective)
+    return solved, finish(piece, solved, options, covariance, classes)
