@@ -9,6 +9,7 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
+from sfm_shapefit.solver.newton.approach import approach
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,
@@ -305,3 +306,28 @@ def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(
     assert np.abs(shape(single[0]) - shape(double[0])).max() < 1e-7  # both within 1e-11 of a curved minimum
     assert np.sum(scale_functional(graph) * single[0]) == pytest.approx(graph.weights.sum(), rel=1e-12)
     assert certify(graph, *single).equality_residual < 1e-12
+
+
+@pytest.mark.parametrize("weighted", [False, True])
+def test_on_a_dense_graph_the_start_is_near_the_optimum(weighted):
+    graph, _ = drawn(5, n=40, p=0.5, q=0.25, weighted=weighted)
+    problem, iterate, model, step = steps.allocate(graph)
+    assert approach(problem, iterate, step)
+    assert np.vdot(problem.c, iterate.t) == pytest.approx(problem.kappa, rel=1e-12)
+    assert np.linalg.norm(iterate.y, axis=1).max() < problem.w.max()
+    assert (np.linalg.norm(iterate.y, axis=1) <= problem.w).all()
+    optimum = objective(graph, solved(graph)[0])
+    above = objective(graph, iterate.t) - optimum
+    assert dense._start(problem, iterate, model, dense._allocate_factor(40, 3, np.float64))
+    # a tenth is what least squares leave; without a tenth of it, the seven rounds would not be worth a step
+    assert above < 0.1 * (objective(graph, iterate.t) - optimum)
+
+
+def test_where_gradients_do_not_converge_the_start_is_that_of_least_squares():
+    n = 60  # a chain of triangles
+    truth = np.cumsum(np.random.default_rng(2).uniform(0.5, 1.5, (n, 3)), axis=0)
+    edges = np.array([(i, i + k) for i in range(n) for k in (1, 2) if i + k < n])
+    graph = ViewGraph(n, edges, unit(differences(truth, edges)))
+    problem, iterate, _, step = steps.allocate(graph)
+    assert not approach(problem, iterate, step)
+    np.testing.assert_allclose(shape(solved(graph)[0]), shape(truth), atol=1e-6)

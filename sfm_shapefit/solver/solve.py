@@ -93,9 +93,11 @@ def solve(
     limit = options.max_iterations or _LIMITS[choice.method]
     watch = _Watch(on_iteration, limit)
     run = choice.run(graph, options, limit, watch if on_iteration else None)
-    if not (np.isfinite(run.locations).all() and projected_length(graph, run.locations) > 0.0):
+    centred = run.locations - run.locations.mean(axis=0)
+    length = projected_length(graph, centred)
+    if not (np.isfinite(centred).all() and length > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
-    locations = normalized_locations(graph, run.locations)
+    locations = centred * (float(graph.weights.sum()) / length)
     certificate = certify(
         graph,
         locations,

@@ -27,6 +27,9 @@ What makes it fast and safe:
   clipped duals can make M singular: after a cycle that leaves more than half of the gap the steps go on from
   the feasible dual, moved towards y+ as far as the ball allows or replaced by y+ / excess, whichever has
   the larger lambda.
+- *A start near the optimum.* On dense graphs with many wrong directions a few reweighted least-squares
+  problems, solved roughly by passes over the edges (`approach`), save the first factorisation and one or two
+  more. On all others the steps begin at the least-squares locations, whose residuals are a feasible dual.
 - *Steps with an old matrix.* After a step the conditions are evaluated anew and solved again with the
   factor in hand: g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, rho' and S from the factorisation. That costs a
   few passes over the edges. It goes on while the last step gained more per unit of work than the

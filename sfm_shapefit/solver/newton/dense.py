@@ -15,6 +15,7 @@ from sfm_shapefit.laplacian.dense import (
     solve_factored,
     work_integers,
 )
+from sfm_shapefit.solver.newton.approach import approach
 from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,
     STALL,
@@ -64,8 +65,6 @@ class DenseFactor(NamedTuple):
     """(n, d, d) scratch: the diagonal blocks of M."""
     half: FloatArray
     """(d, d - 1) scratch."""
-    translations: FloatArray
-    """(d, n * d), 1 / n on the coordinates of each axis."""
     routines: IntArray
     flags: Any
     integers: Any
@@ -99,7 +98,7 @@ def solve_newton_dense(
     single = n * d >= _SINGLE_FROM
     factor = _allocate_factor(n, d, np.float32 if single else np.float64)
     with one_blas_thread():
-        if not _start(problem, iterate, model, factor):
+        if not (approach(problem, iterate, step) or _start(problem, iterate, model, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
         progress = measured(problem, iterate)
         count, stalled = 0, 0
@@ -126,7 +125,6 @@ def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFact
         right=np.empty(n * d, dtype),
         diagonal=np.empty((n, d, d)),
         half=np.empty((d, d - 1)),
-        translations=np.tile(np.eye(d) / n, n),
         routines=routine_addresses(dtype),
         flags=FLAGS,
         integers=work_integers(),
@@ -220,14 +218,15 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
     order = problem.c.size
     c = problem.c.reshape(order)
-    along_c = size / dot(problem.c, problem.c)
+    along_c, along_axis = size / dot(problem.c, problem.c), size / len(problem.c)
     for q in range(order):
         column = factor.matrix[q * order + q : (q + 1) * order]
-        translation = factor.translations[q % len(problem.axes), q:]
         rest = c[q:]
         slope = along_c * c[q]
         for p in range(len(column)):  # of views that begin at 0: an index that may be negative is slow
-            column[p] = slope * rest[p] + size * translation[p]
+            column[p] = slope * rest[p]
+        for p in range(0, len(column), len(problem.axes)):
+            column[p] += along_axis
         column[0] += ridge
 
 

@@ -18,17 +18,17 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
-_MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
+MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
 _CLIPS_BELOW = 0.5  # a cycle that leaves more of the gap than this is the last one with a clipped dual
 STEPS_PER_FACTOR = 10
-_LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
+LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
 REFINEMENTS = 3
 STALL = 6  # factorisations without progress after which more will not help
 EDGE_WORK = 500.0  # a step passes over one edge in the time of so many operations of a factorisation
 SOLVE_WORK = 5.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
 
 _EQUALITY = 1e-3  # allowed violation of D^T y = lambda c, per squared gap and mean degree
-_LEAST_EQUALITY = 1e-13  # allowed in any case, per mean degree
+_LEAST_EQUALITY = 5e-13  # allowed in any case, per mean degree
 _TO_BOUNDARY = 0.99  # how far towards the surface of the ball
 _MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
 _HALVINGS = 20
@@ -197,7 +197,20 @@ def answer(
     """Return locations and dual. Where the objective is 0 up to the tolerance, y = 0 proves it best."""
     if progress.objective <= tol:
         iterate.feasible[:] = 0.0
-    return iterate.t, np.einsum("ekq,eq->ek", problem.basis, iterate.feasible)
+    dual = np.empty_like(problem.v)
+    _set_dual(problem.basis, iterate.feasible, dual)
+    return iterate.t, dual
+
+
+@kernel()
+def _set_dual(basis: Any, y: Any, dual: Any) -> None:
+    """Write B_e y_e."""
+    for e in range(len(dual)):
+        for k in range(basis.shape[1]):
+            x = 0.0
+            for q in range(basis.shape[2]):
+                x += basis[e, k, q] * y[e, q]
+            dual[e, k] = x
 
 
 @kernel(inline=True)
@@ -222,7 +235,7 @@ def smoothing(progress: Any, mu: float) -> float:
     share = 1.0
     if progress.clips and progress.gap < progress.objective:
         share = np.sqrt(progress.gap / progress.objective)
-    return float(min(mu, _MU_PER_GAP * share * progress.gap))
+    return float(min(mu, MU_PER_GAP * share * progress.gap))
 
 
 @kernel(inline=True)
@@ -231,7 +244,7 @@ def closed(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
     clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
     if progress.clips and not clips:
         iterate.y[:] = iterate.feasible
-        mu = _MU_PER_GAP * progress.gap
+        mu = MU_PER_GAP * progress.gap
     return Progress(mu, progress.multiplier, progress.objective, progress.gap, clips)
 
 
@@ -254,7 +267,7 @@ def allowed_violation(problem: Any, gap: float) -> float:
 def linearise(problem: Any, iterate: Any, mu: float, model: Any) -> None:
     """Take S at the iterate."""
     y, r = iterate.y, iterate.r
-    floor = max(mu, _LEAST_MU)
+    floor = max(mu, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):
