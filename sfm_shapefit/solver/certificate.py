@@ -133,7 +133,7 @@ def certify(
     worst = _project(graph.edges, graph.directions, w, y, c, total, degrees)
     degree = float(degrees.max())
     multiplier = _multiplier(total, c, t)
-    if _largest(total - multiplier * c) > degree * _exact(value - multiplier / max(1.0, worst)):
+    if _unbalanced(total, c, multiplier) > degree * _exact(value - multiplier / max(1.0, worst)):
         repair = _repair(graph, t, y, factor, threads)
         gap = _clip_in_rounds(repair, c, t, value, _ENOUGH * tol)
         allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
@@ -143,15 +143,16 @@ def certify(
     if scale < 1.0:
         y *= scale
         total *= scale
-    bound = float(np.sum(total * c) / np.sum(c * c))
+    bound = float(np.vdot(total, c) / np.vdot(c, c))
+    violation = _unbalanced(total, c, bound)
     # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
-    if not (bound > 0.0 and _largest(total - bound * c) <= _UNREPAIRED * degree):
-        y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
+    if not (bound > 0.0 and violation <= _UNREPAIRED * degree):
+        y, bound, violation = np.zeros_like(y), 0.0, 0.0
     return Certificate(
         objective=value,
         dual_bound=bound,
         dual=frozen(y),
-        equality_residual=_largest(total - bound * c) / degree,
+        equality_residual=violation / degree,
         unique=_is_unique(graph, t, y) if uniqueness else None,
     )
 
@@ -161,9 +162,16 @@ def _multiplier(total: FloatArray, c: FloatArray, t: FloatArray) -> float:
     return float(np.vdot(total, t) / np.vdot(c, t))
 
 
-def _largest(vectors: FloatArray) -> float:
-    """Return the largest norm of a row."""
-    return float(np.sqrt(np.einsum("ij,ij->i", vectors, vectors).max()))
+@kernel(exact=True)
+def _unbalanced(total: Any, c: Any, multiplier: float) -> float:
+    """Return the largest norm of a row of total - multiplier c: the violation at a camera."""
+    worst = 0.0
+    for i in range(len(c)):
+        square = 0.0
+        for k in range(c.shape[1]):
+            square += (total[i, k] - multiplier * c[i, k]) ** 2
+        worst = max(worst, square)
+    return float(np.sqrt(worst))
 
 
 def _exact(gap: float) -> float:
@@ -256,7 +264,7 @@ def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: flo
         violation = _violation(repair.metric, c, t)[1]
         reduction = fine / max(float(np.linalg.norm(violation)), fine)
         worst = _restore(repair, violation, reduction)
-        if _largest(_violation(repair.metric, c, t)[1]) <= allowed:
+        if _unbalanced(_violation(repair.metric, c, t)[1], c, 0.0) <= allowed:
             break
     return worst
 

@@ -25,7 +25,7 @@ from sfm_shapefit.solver.newton.steps import LEAST_MU, MU_PER_GAP, dot, measure,
 
 _FIRST_STEPS, _STEPS = 4, 2  # of conjugate gradients: for plain least squares, and for each reweighted one
 _ROUNDS = 7  # of reweighting; with half of them Newton needs a factorisation more, twice gain nothing
-_EPS, _SHRINK = 0.3, 0.7  # smoothing of the first weights, per mean residual; its factor per round
+_EPS, _SHRINK = 0.5, 0.7  # smoothing of the first weights, per mean residual; its factor per round
 _LEFT = 3e-3  # share of the energy that the first steps may leave; dense random graphs 1e-3, real ones 5e-2
 
 
@@ -35,10 +35,11 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     t, gradient = iterate.t, np.empty_like(iterate.t)
     degrees, downhill = np.empty(len(t)), np.empty_like(t)
     t[:] = (problem.kappa / dot(problem.c, problem.c)) * problem.c
-    mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
+    weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
     if left > _LEFT * dot(t, gradient):
         return False
+    mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     eps = _EPS
     for _ in range(_ROUNDS):
         mean = weigh(problem, t, eps * mean, step.ratios, gradient, degrees)
