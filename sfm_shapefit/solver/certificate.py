@@ -39,6 +39,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
@@ -185,11 +186,11 @@ class _Metric(NamedTuple):
     edges: IntArray
     v: FloatArray
     w: FloatArray
-    stiffness: FloatArray
-    """(m,) H_e."""
+    stiffness: npt.NDArray[np.float32]
+    """(m,) H_e; single precision saves memory, and the bound does not rest on a metric."""
     y: FloatArray
     """(m, d) the dual that is repaired, in place."""
-    normal: FloatArray
+    normal: npt.NDArray[np.float32]
     """(m,) sqrt(_ALONG_SURFACE) / ||y_e|| on the surface of a ball, else 0: what makes u_e of y_e."""
     axes: tuple[int, ...]
     """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls the loops over it."""
@@ -222,8 +223,8 @@ def _repair(
 ) -> _Repair:
     """Return the metric of the residuals at t, with no pair on the surface of its ball so far."""
     edges, v = np.ascontiguousarray(graph.edges), np.ascontiguousarray(graph.directions)
-    stiffness = _stiffness(graph, t)
-    normal, axes = np.zeros(graph.num_edges), tuple(range(graph.dimension))
+    stiffness = _stiffness(graph, t).astype(np.float32)
+    normal, axes = np.zeros(graph.num_edges, np.float32), tuple(range(graph.dimension))
     metric = _Metric(edges, v, graph.weights, stiffness, y, normal, axes)
     blocks = _EDGE_BLOCKS if graph.num_edges >= _LARGE else 1
     precondition = _preconditioner(graph, stiffness, factor, threads)
@@ -293,15 +294,17 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
     """Return H_e = w_e / max(||r_e||, floor), in units of the mean residual, (m,)."""
     residuals = np.empty(graph.num_edges)
     _residuals(graph.edges, graph.directions, t, residuals)
-    mean = float(np.average(residuals, weights=graph.weights))
+    mean = float(np.vdot(graph.weights, residuals) / graph.weights.sum())
     if not mean > 0.0:
         return graph.weights
-    stiffness: FloatArray = graph.weights / np.maximum(residuals / mean, _RESIDUAL_FLOOR)
-    return stiffness
+    np.maximum(residuals, _RESIDUAL_FLOOR * mean, out=residuals)
+    np.divide(graph.weights, residuals, out=residuals)  # in place: on large graphs memory is short here
+    residuals *= mean
+    return residuals
 
 
 def _preconditioner(
-    graph: ViewGraph, stiffness: FloatArray, factor: LaplacianFactor | None, threads: int
+    graph: ViewGraph, stiffness: npt.NDArray[Any], factor: LaplacianFactor | None, threads: int
 ) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
     if factor is None:  # whoever has a factor has looked, and on large graphs the look takes much memory

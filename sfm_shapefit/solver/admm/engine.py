@@ -294,7 +294,7 @@ class Iteration:
 
 def _mean(residuals: FloatArray, weights: FloatArray) -> float:
     """Return the weighted mean residual, kept away from 0 (the mean edge has length about 1)."""
-    return max(float(np.average(residuals, weights=weights)), 1e-6)
+    return max(float(np.vdot(weights, residuals) / weights.sum()), 1e-6)
 
 
 def _cancelled(on_iteration: OnIteration | None, iteration: int, objective: float) -> bool:
