@@ -215,6 +215,24 @@ def test_an_error_that_native_code_makes_of_an_interrupt_is_an_interrupt(capsys,
     assert capsys.readouterr().err == "sfm-shapefit: interrupted; nothing was written\n"
 
 
+def test_an_interrupt_that_a_callback_of_native_code_loses_comes_again_without_a_traceback():
+    script = """
+import ctypes, os, signal, sys, time
+from sfm_shapefit.cli import console
+console.catch_termination()
+console.repeat_lost_interrupts()
+try:
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
 def test_lack_of_memory_is_one_sentence(capsys, error):
     with pytest.raises(console.typer.Exit) as caught:
