@@ -425,6 +425,27 @@ def test_acceleration_is_astray_far_above_the_objective_that_it_began_with():
     assert not Iteration._is_astray(asked, state, 4)
 
 
+@pytest.mark.parametrize(
+    ("accelerate", "inside", "before", "accelerated"),
+    [
+        (True, 90, np.inf, False),
+        (True, 90, 0.91, True),
+        (True, 20, 0.9, False),
+        (True, 1, 0.01, False),
+        (False, 90, 0.91, False),
+    ],
+)
+def test_acceleration_begins_where_the_fitting_edges_stay(accelerate, inside, before, accelerated):
+    x = np.zeros((100, 3))
+    sums = np.zeros(5)
+    sums[INTERIOR] = inside
+    passes = SimpleNamespace(data=SimpleNamespace(bounds=(0, 100)))
+    asked = SimpleNamespace(settings=SimpleNamespace(accelerate=accelerate), passes=passes)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(100), sums=sums, interior=before)
+    assert (Iteration._accelerator(asked, state) is not None) == accelerated
+    assert state.interior == inside / 100
+
+
 @pytest.mark.parametrize(("change", "restarts"), [(10.0, 0), (1e9, 1)])
 def test_acceleration_forgets_its_history_after_a_step_that_made_things_much_worse(change, restarts):
     calls = []

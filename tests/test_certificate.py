@@ -342,6 +342,8 @@ def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
     result = hybrid._newton(
         graph, factor, split, 1e-8, 10**9, lambda info: seen.append(info) or (False if stops else None)
     )
+    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 26.9 * factor.symbolic.flops)
+    assert hybrid._newton(graph, factor, split, 1e-8, 10**9, None).finish is Finish.TOO_LARGE
     assert begun == begins
     assert result.finish is finish
     assert result.factorisations == 10 * len(begins)
