@@ -193,6 +193,24 @@ def test_an_empty_folder_that_appears_meanwhile_is_not_replaced(tmp_path, monkey
     assert list((tmp_path / "out").iterdir()) == []
 
 
+@pytest.mark.parametrize(("module", "name"), [("shutil", "rmtree"), ("fcntl", "flock")])
+def test_an_interrupt_while_a_claim_is_made_or_removed_leaves_nothing(tmp_path, monkeypatch, module, name):
+    calls, plain = [], getattr(getattr(output, module), name)
+
+    def interrupted(*arguments, **how):
+        calls.append(name)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return plain(*arguments, **how)
+
+    monkeypatch.setattr(getattr(output, module), name, interrupted)
+    with pytest.raises(KeyboardInterrupt), output.locked_folder(tmp_path / "claim") as folder:
+        (folder / "file").touch()
+    assert list(tmp_path.iterdir()) == []
+    with output.locked_folder(tmp_path / "claim"):  # its lock is free again
+        pass
+
+
 # --- faults --------------------------------------------------------------------------------------------
 
 
