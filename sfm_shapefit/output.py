@@ -160,12 +160,27 @@ def locked_folder(path: Path) -> Iterator[Path]:
         FileExistsError: if somebody alive holds it, or its lock cannot tell.
         OSError: if it cannot be made.
     """
-    descriptor = _lock(path)
+    try:
+        descriptor = _lock(path)
+    except KeyboardInterrupt:
+        remove_abandoned(path.parent, path.name)
+        raise
     try:
         yield path
     finally:
-        shutil.rmtree(path, ignore_errors=True)
-        os.close(descriptor)  # only now: an unlocked folder counts as abandoned
+        try:
+            _remove(path)
+        finally:
+            os.close(descriptor)  # only now: an unlocked folder counts as abandoned
+
+
+def _remove(folder: Path) -> None:
+    """Remove a folder with all it holds; an interrupt meanwhile goes on when it is gone."""
+    try:
+        shutil.rmtree(folder, ignore_errors=True)
+    except KeyboardInterrupt:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def remove_abandoned(parent: Path, pattern: str) -> None:
@@ -191,6 +206,9 @@ def _lock(path: Path) -> int:
             except BlockingIOError:
                 os.close(descriptor)
                 continue
+            except KeyboardInterrupt:
+                os.close(descriptor)
+                raise
             except OSError:  # a file system without locks: the folder's existence has to do
                 return descriptor
             if _is_same(path, descriptor):

@@ -1,11 +1,20 @@
 """Splitting for ShapeFit and LUD: agreement with the conic reference, exactness, and how it ends."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from sfm_shapefit.solver.admm import IterativeSolver, Stop, laplacian_factor, linear, solve_admm, solve_lud
+from sfm_shapefit.solver.admm import (
+    IterativeSolver,
+    Stop,
+    engine,
+    laplacian_factor,
+    linear,
+    solve_admm,
+    solve_lud,
+)
 from sfm_shapefit.solver.admm.anderson import Anderson
 from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
 from sfm_shapefit.solver.admm.engine import Iteration
@@ -310,7 +319,8 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
     rng = np.random.default_rng(d)
     rho = rng.uniform(0.2, 5.0, size=graph.num_edges)
     x = rng.normal(size=graph.directions.shape)
-    passes = EdgePasses(edge_data(graph, least), 1)
+    data = edge_data(graph, least)
+    passes = EdgePasses(replace(data, bounds=(0, 50, 90, graph.num_edges)), 1)  # in three chunks
     order = passes.data.order
     ours = np.empty_like(x)
     pull, sums = passes.step(x[order], ours, t, rho[order], 1.7)
@@ -319,6 +329,8 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
     np.testing.assert_allclose(pull, expected_pull, atol=1e-11)
     np.testing.assert_allclose(sums, expected_sums, rtol=1e-12, atol=1e-11)
     np.testing.assert_allclose(passes.pull(ours, t, rho[order]), expected_pull, atol=1e-11)
+    pushed = adjoint(rho[:, None] * differences(t, graph.edges), graph.edges, graph.num_cameras)
+    np.testing.assert_allclose(passes.laplacian(t, rho[order]), pushed, atol=1e-11)
     np.testing.assert_allclose(passes.imbalance(x[order], ours, t, rho[order]), residuals, rtol=1e-12)
 
 
@@ -411,6 +423,45 @@ def test_acceleration_is_astray_far_above_the_objective_that_it_began_with():
     assert Iteration._is_astray(asked, state, 3)
     state.anderson = None
     assert not Iteration._is_astray(asked, state, 4)
+
+
+@pytest.mark.parametrize(
+    ("accelerate", "inside", "before", "accelerated"),
+    [
+        (True, 90, np.inf, False),
+        (True, 90, 0.91, True),
+        (True, 20, 0.9, False),
+        (True, 1, 0.01, False),
+        (False, 90, 0.91, False),
+    ],
+)
+def test_acceleration_begins_where_the_fitting_edges_stay(accelerate, inside, before, accelerated):
+    x = np.zeros((100, 3))
+    sums = np.zeros(5)
+    sums[INTERIOR] = inside
+    passes = SimpleNamespace(data=SimpleNamespace(bounds=(0, 100)))
+    asked = SimpleNamespace(settings=SimpleNamespace(accelerate=accelerate), passes=passes)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(100), sums=sums, interior=before)
+    assert (Iteration._accelerator(asked, state) is not None) == accelerated
+    assert state.interior == inside / 100
+
+
+@pytest.mark.parametrize(("change", "restarts"), [(10.0, 0), (1e9, 1)])
+def test_acceleration_forgets_its_history_after_a_step_that_made_things_much_worse(change, restarts):
+    calls = []
+    history = SimpleNamespace(restart=lambda: calls.append("restart"), advance=lambda _x, f, _rho: f)
+    x = np.zeros((4, 3))
+    passes = SimpleNamespace(
+        step=lambda *_: (None, np.array([0.0, 0.0, 0.0, change, 0.0])), pull=lambda *_: np.ones((3, 3))
+    )
+    asked = SimpleNamespace(settings=SimpleNamespace(relaxation=1.7), passes=passes)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(4), previous=10.0, anderson=history)
+    Iteration._pass(asked, state)
+    assert calls == ["restart"] * restarts
+    assert state.spare is x
+    assert state.x is not x
+    assert state.previous == change
+    np.testing.assert_array_equal(state.pull, 1.0)
 
 
 @pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])

@@ -185,20 +185,21 @@ def test_cameras_at_one_place_do_no_harm():
     assert error(found.locations, t) < 1e-2  # the one random direction drives the two a little apart
 
 
-def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_length():
+@pytest.mark.parametrize("steep", [False, True])
+def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_length(steep):
     problem = random_graph_problem(12, 1.0, sigma=0.02, seed=6)
     t = unit(problem.locations)
     graph = graph_of(problem)
     floor = angular._SHORTEST * np.median(np.linalg.norm(differences(t, graph.edges), axis=1))
     t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = angular._information(graph, None, np.full(graph.num_edges, 0.05))
-    _, _, per_edge = angular._linearised(graph, information, t)
+    _, _, per_edge = angular._linearised(graph, information, t, steep)
     gradient = angular.adjoint(per_edge, graph.edges, 12)
     h = 1e-9
     for camera, axis in [(0, 0), (1, 2), (5, 1)]:
         shift = np.zeros_like(t)
         shift[camera, axis] = h
-        up, down = (angular._cost(graph, information, t + s * shift) for s in (1.0, -1.0))
+        up, down = (angular._cost(graph, information, t + s * shift, steep) for s in (1.0, -1.0))
         # Differences of a cost of some hundreds have 1e-13 / 1e-9 of rounding.
         assert gradient[camera, axis] == pytest.approx((up - down) / (2.0 * h), rel=1e-3, abs=1e-2)
 

@@ -1,5 +1,7 @@
 """ShapeFit over rigid bodies: the program, its dual and certificate, what hangs free, and the refinement."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -7,10 +9,13 @@ from sfm_shapefit.bodies import Bodies, separate
 from sfm_shapefit.body_placement import place_bodies
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.admm import solve_lud
 from sfm_shapefit.solver.bodies import certify_bodies, largest_tied, lud_over_bodies, solve_bodies
+from sfm_shapefit.solver.bodies import newton as bodies_newton
+from sfm_shapefit.solver.bodies.reduced import ReducedFactor, factor_pinned
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.options import Status
-from sfm_shapefit.solver.program import adjoint, scale_functional
+from sfm_shapefit.solver.options import SolverOptions, Status
+from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -87,6 +92,63 @@ def test_bodies_with_fixed_nodes_become_one_whole_frames_with_them():
 def test_bodies_that_make_no_sense_are_refused(labels, offsets, message):
     with pytest.raises(InputError, match=message):
         Bodies(body_of=labels, offsets=offsets)
+
+
+def written_out(edges, bodies, blocks):
+    """A^T D^T S D A and A, dense."""
+    n, d = bodies.offsets.shape
+    expand = np.stack([bodies.expand(x).ravel() for x in np.eye(bodies.num_unknowns)], axis=1)
+    baselines = np.zeros((len(edges), n))
+    baselines[np.arange(len(edges)), edges[:, 0]] = 1.0
+    baselines[np.arange(len(edges)), edges[:, 1]] -= 1.0
+    difference = np.kron(baselines, np.eye(d)) @ expand
+    stiff = (blocks @ difference.reshape(len(edges), d, -1)).reshape(len(edges) * d, -1)
+    return difference.T @ stiff, expand
+
+
+@pytest.mark.parametrize("metric", [True, False])
+def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric):
+    graph, bodies, _ = rig_problem(13, frames=5)
+    between = outer(graph, bodies)[0]
+    edges, v, n = between.edges, between.directions, graph.num_cameras
+    unit = bodies.normalised() if metric else Bodies(body_of=bodies.body_of, offsets=0.0 * bodies.offsets)
+    rng = np.random.default_rng(2)
+    roots = rng.normal(size=(len(edges), 3, 3))
+    blocks = np.eye(3) + roots @ roots.transpose(0, 2, 1)
+    matrix, expand = written_out(edges, unit, blocks)
+    factor = ReducedFactor(edges, unit)
+    factor.refactor(blocks)
+    g = adjoint(rng.normal(size=v.shape), edges, n)
+    x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
+    np.testing.assert_allclose(centred(factor.solve(g)), centred((expand @ x).reshape(-1, 3)), atol=1e-10)
+    # Of one pinned pair, tau v v^T is taken away again.
+    tau, pinned = 2.5, 4
+    lifted = blocks.copy()
+    lifted[pinned] += tau * np.outer(v[pinned], v[pinned])
+    c = unit.reduce(scale_functional(between))
+    i, j = edges[pinned]
+    system = factor_pinned(factor, lifted, c, ((int(i), int(j)), v[pinned]), tau)
+    right = unit.reduce(g)
+    multiplier, x = system.solve(right, 0.7)
+    np.testing.assert_allclose(matrix @ x, multiplier * c + right, atol=1e-9)
+    assert c @ x == pytest.approx(0.7, rel=1e-10)
+    multiplier, h = system.balance(right)
+    moved = matrix @ h + tau * system.rows[1] * (system.rows[1] @ h)
+    np.testing.assert_allclose(moved, right - multiplier * c, atol=1e-9)
+    assert abs(system.rows[1] @ h) < 1e-10
+    at = unit.expand(h)
+    assert (at[i] - at[j]) @ v[pinned] == pytest.approx(0.0, abs=1e-10)
+
+
+def test_a_scale_that_nothing_holds_is_refused():
+    graph, bodies, _ = rig_problem(13, frames=5, wrong=0.0)
+    between = outer(graph, bodies)[0]
+    edges, v = between.edges, between.directions
+    factor = ReducedFactor(edges, bodies.normalised())
+    with pytest.raises(UnsolvableError, match="do not determine a scale"):  # all may grow along the solution
+        factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
+    factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
+    assert 0.0 < factor.smallest_pivot <= 1.0
 
 
 # --- the program -------------------------------------------------------------------------------------
@@ -172,6 +234,51 @@ def test_locations_that_are_not_those_of_the_bodies_are_not_certified():
         certify_bodies(graph, bodies, -result.locations, result.dual)
 
 
+def test_what_cannot_be_certified_is_refused():
+    graph, bodies, t = rig_problem(7, wrong=0.0)
+    dual = np.zeros_like(graph.directions)
+    inside = bodies.body_of[graph.edges[:, 0]] == bodies.body_of[graph.edges[:, 1]]
+    inner = ViewGraph(graph.num_cameras, graph.edges[inside], graph.directions[inside])
+    for refused, message in (
+        ((graph, bodies, t[1:], dual), "have shapes"),
+        ((graph, bodies, t, dual[1:]), "have shapes"),
+        ((graph, bodies, t, np.vstack([dual, dual])), "have shapes"),
+        ((graph, separate(graph.num_cameras + 1, 3), t, dual), "have shapes"),
+        ((graph, bodies, np.where(np.arange(len(t))[:, None] == 2, np.nan, t), dual), "must be finite"),
+        ((graph, bodies, t, dual + np.inf), "must be finite"),
+        ((inner, bodies, t, dual[inside]), "no pair joins two bodies"),
+    ):
+        with pytest.raises(InputError, match=message):
+            certify_bodies(*refused)
+    with pytest.raises(UnsolvableError, match="no pair joins two bodies"):
+        solve_bodies(inner, bodies)
+
+
+def test_a_dual_that_balances_is_kept_as_it_is_and_any_is_shrunk_into_its_balls():
+    graph, bodies, _ = rig_problem(6, noise=0.02)
+    result = solve_bodies(graph, bodies)
+    again = certify_bodies(graph, bodies, result.locations, result.dual)
+    np.testing.assert_allclose(again.dual, result.dual, atol=1e-13)
+    large = certify_bodies(graph, bodies, result.locations, 3.0 * result.dual)
+    ratios = np.linalg.norm(large.dual, axis=1) / graph.weights
+    assert ratios.max() == pytest.approx(1.0, abs=1e-12)
+    assert large.dual_bound == pytest.approx(
+        result.dual_bound / (np.linalg.norm(result.dual, axis=1) / graph.weights).max(), rel=1e-9
+    )
+
+
+def test_what_is_not_certified_is_not_called_converged(monkeypatch):
+    graph, bodies, _ = rig_problem(6, noise=0.02)
+    early = solve_bodies(graph, bodies, SolverOptions(max_iterations=2))
+    assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
+    assert early.gap > SolverOptions().tol
+    certify = bodies_newton.certify_bodies
+    monkeypatch.setattr(
+        bodies_newton, "certify_bodies", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
+    )
+    assert solve_bodies(graph, bodies).status is Status.INACCURATE
+
+
 def test_the_same_problem_gives_the_same_bits():
     graph, bodies, _ = rig_problem(8, noise=0.02)
     first, second = solve_bodies(graph, bodies), solve_bodies(graph, bodies)
@@ -237,6 +344,19 @@ def test_lud_over_bodies_stays_with_the_bodies_and_near_the_truth():
     assert apart < 1e-9 * np.abs(locations).max()
     errors = np.linalg.norm(locations / x[-1] - centred(t), axis=1)
     assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centred(t), axis=1))
+
+
+def test_lud_over_single_nodes_has_the_optimum_of_lud():
+    graph, _, _ = rig_problem(14, noise=0.05)
+
+    def value(t):
+        baselines = differences(t, graph.edges)
+        lengths = np.maximum(along(baselines, graph.directions), 1.0)
+        return graph.weights @ np.linalg.norm(baselines - lengths[:, None] * graph.directions, axis=1)
+
+    least = value(solve_lud(graph, 2000, tol=1e-9).locations)
+    ours = value(lud_over_bodies(graph, separate(graph.num_cameras, 3), 1500))
+    assert ours == pytest.approx(least, rel=1e-5)
 
 
 def test_the_placement_has_the_errors_that_it_states():

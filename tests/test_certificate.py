@@ -1,5 +1,8 @@
 """The certificate: what it makes of approximate duals, of spoilt ones, and of graphs it cannot serve."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from graph_families import FAMILIES
@@ -8,11 +11,12 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver import certificate, hybrid
-from sfm_shapefit.solver.admm import solve_admm
+from sfm_shapefit.solver.admm import Stop, solve_admm
 from sfm_shapefit.solver.admm.linear import IterativeSolver, laplacian_factor
 from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
+from sfm_shapefit.solver.hybrid import Finish, HybridResult, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -280,6 +284,70 @@ def test_the_hybrid_ends_where_it_is_told_to():
     cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < 20)
     assert cancelled.finish is Finish.CANCELLED
     assert cancelled.iterations == 20
+
+
+def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatch):
+    asked = []
+
+    def run(_absolute, target, *_):
+        asked.append(target)
+        return SimpleNamespace(locations=None, dual=None, iterations=7, stop=Stop.ACCURATE)
+
+    gaps = iter((4e-8, 1.5e-8, 1e-3, 2e-8))
+    monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=next(gaps)))
+    result = hybrid._split(SimpleNamespace(run=run), None, None, 1e-8, 2000, 1, None)
+    np.testing.assert_allclose(asked, 0.15e-8 * np.cumprod([1.0, 0.3 / 4.0, 0.3 / 1.5, 1e-3]), rtol=1e-12)
+    assert result.finish is Finish.INACCURATE
+
+
+@pytest.mark.parametrize(
+    ("gaps", "cheap", "stops", "begins", "finish"),
+    [
+        ((1e-9,), True, False, ["there"], Finish.NEWTON),
+        ((1e-3, 1e-9), True, False, ["there", "anew"], Finish.NEWTON),
+        ((1e-3, 1e-4), True, False, ["there", "anew"], Finish.INACCURATE),
+        ((1e-3,), False, False, ["there"], Finish.INACCURATE),
+        ((1e-3,), True, True, ["there"], Finish.CANCELLED),
+        ((1e-9,), True, True, ["there"], Finish.NEWTON),
+    ],
+)
+def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
+    gaps, cheap, stops, begins, finish, monkeypatch
+):
+    graph = drawn("geo", 60, 12)
+    factor = laplacian_factor(graph)
+    monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", (27.0 if cheap else 26.9) * factor.symbolic.flops)
+    begun, left = [], iter(gaps)
+
+    def newton(_graph, _tol, _limit, report, *, start, plan):
+        assert plan is factor.symbolic
+        begun.append("anew" if start is None else "there")
+        report(IterationInfo(3, 0.5, 0.25))
+        return None, None, 10
+
+    monkeypatch.setattr(hybrid, "solve_newton_sparse", newton)
+    monkeypatch.setattr(
+        hybrid,
+        "_better",
+        lambda _graph, result, *_: replace(result, certificate=SimpleNamespace(gap=next(left))),
+    )
+    seen = []
+    split = HybridResult(
+        locations=None,
+        certificate=SimpleNamespace(gap=1e-2, dual=None),
+        iterations=40,
+        factorisations=0,
+        finish=Finish.INACCURATE,
+    )
+    result = hybrid._newton(
+        graph, factor, split, 1e-8, 10**9, lambda info: seen.append(info) or (False if stops else None)
+    )
+    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 26.9 * factor.symbolic.flops)
+    assert hybrid._newton(graph, factor, split, 1e-8, 10**9, None).finish is Finish.TOO_LARGE
+    assert begun == begins
+    assert result.finish is finish
+    assert result.factorisations == 10 * len(begins)
+    assert [(i.iteration, i.objective, i.dual_bound) for i in seen] == [(43, 0.5, 0.25)] * len(begins)
 
 
 def test_the_hybrid_gives_the_same_bits_for_one_and_two_threads():

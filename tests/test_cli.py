@@ -17,6 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sfm_shapefit
+from sfm_shapefit import output
 from sfm_shapefit.cli import app
 from sfm_shapefit.options import LocateOptions
 from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
@@ -258,6 +259,26 @@ def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(files, "write_rows", interrupted)
     assert "interrupted" in refused(run("locate", RING_MODEL, tmp_path / "out"), 130)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, monkeypatch):
+    move = output._move_into_place
+
+    def interrupted(*arguments, **how):
+        move(*arguments, **how)
+        raise KeyboardInterrupt
+
+    def stopped(*_arguments, **_how):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(output, "_move_into_place", interrupted)
+    for extra in ((), ("--overwrite",)):
+        said = refused(run("locate", RING_MODEL, tmp_path / "out", "--no-report", *extra), 130)
+        assert "interrupted; the output is complete" in said
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+    monkeypatch.setattr(output, "_move_into_place", stopped)
+    said = refused(run("locate", RING_MODEL, tmp_path / "out", "--no-report", "--overwrite"), 130)
+    assert "the output" not in said  # what stands there is the earlier one
 
 
 def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):

@@ -290,6 +290,14 @@ def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step
     assert np.linalg.norm(shape(t) - shape(truth)) < 5e-12  # 16 times the gap on this graph
 
 
+def test_one_refinement_suffices_for_steps_by_a_factor_in_double_precision(monkeypatch):
+    graph, _ = drawn(67, n=10, sigma=0.05)
+    monkeypatch.setitem(dense._REFINEMENTS, 8, 1)
+    _, _, count = solve_newton_dense(graph, 1e-8, 100)
+    monkeypatch.undo()
+    assert count == solve_newton_dense(graph, 1e-8, 100)[2]
+
+
 def test_larger_noiseless_graphs_are_recovered_to_rounding_too():
     graph, truth = drawn(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
     t, _ = solved(graph, tol=1e-13)

@@ -193,6 +193,24 @@ def test_an_empty_folder_that_appears_meanwhile_is_not_replaced(tmp_path, monkey
     assert list((tmp_path / "out").iterdir()) == []
 
 
+@pytest.mark.parametrize(("module", "name"), [("shutil", "rmtree"), ("fcntl", "flock")])
+def test_an_interrupt_while_a_claim_is_made_or_removed_leaves_nothing(tmp_path, monkeypatch, module, name):
+    calls, plain = [], getattr(getattr(output, module), name)
+
+    def interrupted(*arguments, **how):
+        calls.append(name)
+        if len(calls) == 1:
+            raise KeyboardInterrupt
+        return plain(*arguments, **how)
+
+    monkeypatch.setattr(getattr(output, module), name, interrupted)
+    with pytest.raises(KeyboardInterrupt), output.locked_folder(tmp_path / "claim") as folder:
+        (folder / "file").touch()
+    assert list(tmp_path.iterdir()) == []
+    with output.locked_folder(tmp_path / "claim"):  # its lock is free again
+        pass
+
+
 # --- faults --------------------------------------------------------------------------------------------
 
 
@@ -213,6 +231,24 @@ def test_an_error_that_native_code_makes_of_an_interrupt_is_an_interrupt(capsys,
         failing(RuntimeError("Caught an unknown exception!"))
     assert caught.value.exit_code == 130
     assert capsys.readouterr().err == "sfm-shapefit: interrupted; nothing was written\n"
+
+
+def test_an_interrupt_that_a_callback_of_native_code_loses_comes_again_without_a_traceback():
+    script = """
+import ctypes, os, signal, sys, time
+from sfm_shapefit.cli import console
+console.catch_termination()
+console.repeat_lost_interrupts()
+try:
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "")
 
 
 @pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])

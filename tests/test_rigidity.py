@@ -425,3 +425,30 @@ def test_a_random_graph_of_few_triangles_is_decided_by_the_game_in_steps():
         np.testing.assert_array_equal(parallel_rigid_pieces(3000, edges, 3), label)
     assert np.bincount(label)[0] > 1000
     assert label.max() > 100
+
+
+def test_growth_ends_with_the_seed_at_which_its_work_is_used_up(monkeypatch):
+    part = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3]])  # a triangle, and a camera joined to it twice
+    edges, body = np.concatenate([part, part + 4]), np.array([0, 0, 0, 1, 2, 3, 3, 3, 4, 5])
+    np.testing.assert_array_equal(rigidity.growth.grown(8, edges, body), [0] * 5 + [1] * 5)
+    monkeypatch.setattr(rigidity.growth, "_GROWTH_WORK", 0)
+    monkeypatch.setattr(rigidity.growth, "_GROWTH_ROUNDS", 1)
+    np.testing.assert_array_equal(rigidity.growth.grown(8, edges, body), [0] * 5 + [1, 1, 1, 2, 3])
+
+
+def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
+    ends = np.array([[0, 1], [0, 2], [1, 2], [0, 3], [1, 3], [2, 3]])  # in the plane five of the six suffice
+    seen, place = [], rigidity.game._place_links
+    monkeypatch.setattr(rigidity.game, "_place_links", lambda *given: seen.append(place(*given)) or seen[-1])
+    game = rigidity.game.Game(
+        num_cameras=4,
+        ends=ends,
+        copies=np.ones(6, np.int64),
+        owner=np.arange(6),
+        num_bodies=6,
+        is_whole=False,
+    )
+    united, is_final = rigidity.game.play(game, 2)
+    assert is_final
+    assert not united.any()
+    assert (seen[0] == -1).all()  # the sixth, which would show a rigid set, was not looked at

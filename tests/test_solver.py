@@ -1,5 +1,8 @@
 """ShapeFit solved and certified: exactness, invariances, optimality, and refusals."""
 
+import importlib
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,6 +10,7 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.hybrid import Finish
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     across,
@@ -23,6 +27,7 @@ from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, ra
 from sfm_shapefit.viewgraph import ViewGraph
 
 TOL = SolverOptions().tol
+solving = importlib.import_module("sfm_shapefit.solver.solve")
 
 
 def problem(seed, *, n=20, p=0.6, d=3, sigma=0.0, q=0.2):
@@ -336,6 +341,51 @@ def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
     module._run_sparse(sparse, SolverOptions(), 1, None, prediction)
     module._run_sparse(sparse, SolverOptions(), 1, None)
     assert seen == [prediction.tree, None]
+
+
+@pytest.mark.parametrize(
+    ("method", "n", "share", "flops", "run", "reason"),
+    [
+        ("auto", 150, 0.05, 1.0, "_run_dense", "450 unknowns: dense"),
+        ("auto", 100, 0.05, 1.0, "_run_dense", "300 unknowns: dense"),
+        ("auto", 151, 0.3, 1.0, "_run_dense", "453 unknowns, dense graph"),
+        ("auto", 151, 0.29, 453**3 / 12 / 27 - 1, "_run_sparse", "0.0077 Gflop for a sparse factor"),
+        ("auto", 151, 0.29, 453**3 / 12 / 27 + 1, "_run_dense", "453 unknowns, dense graph"),
+        ("auto", 600, 0.3, 1.0, "_run_dense", "1800 unknowns, dense graph"),
+        ("auto", 601, 1.0, 1e8, "_run_sparse", "2.7 Gflop for a sparse factor"),
+        ("auto", 601, 0.1, 2e8, "_run_admm", "5.4 Gflop for a sparse factor: splitting is faster"),
+        ("auto", 601, 0.1, np.inf, "_run_admm", "no order would keep a factor sparse: splitting is faster"),
+        ("newton", 601, 0.1, np.inf, "_run_sparse", "asked for"),
+        ("newton", 100, 0.1, 1.0, "_run_dense", "asked for"),
+        ("newton", 151, 0.3, 1.0, "_run_dense", "asked for"),
+        ("admm", 100, 0.1, 1.0, "_run_admm", "asked for"),
+        ("conic", 100, 0.1, 1.0, "_run_conic", "asked for"),
+    ],
+)
+def test_the_table_of_choices(method, n, share, flops, run, reason, monkeypatch):
+    pairs = int(np.ceil(share * n * (n - 1) / 2))
+    graph = SimpleNamespace(num_cameras=n, dimension=3, num_edges=pairs)
+    monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops))
+    choice = solving.choose_method(graph, SolverOptions(method=method))
+    assert getattr(choice.run, "func", choice.run).__name__ == run
+    assert choice.method == {"_run_admm": "admm", "_run_conic": "conic"}.get(run, "newton")
+    assert choice.reason == reason
+
+
+def test_the_splitting_is_given_the_options_in_bytes_and_says_how_it_ended(monkeypatch):
+    graph, options, seen = problem(1)[0], SolverOptions(tol=1e-5, factor_memory=3, threads=2), {}
+
+    def solved(*arguments, **named):
+        seen.update(named, arguments=arguments)
+        certificate = SimpleNamespace(dual="dual")
+        return SimpleNamespace(locations="t", certificate=certificate, iterations=7, finish=seen["finish"])
+
+    monkeypatch.setattr(solving, "solve_hybrid", solved)
+    for finish, note in ((Finish.CERTIFIED, ""), (Finish.TOO_LARGE, Finish.TOO_LARGE.value)):
+        seen["finish"] = finish
+        assert solving._run_admm(graph, options, 9, None) == ("t", "dual", 7, note)
+    assert seen["arguments"] == (graph, 1e-5, 9)
+    assert (seen["memory_bytes"], seen["threads"]) == (3_000_000, 2)
 
 
 def test_auto_leaves_newton_where_its_factor_would_explode(monkeypatch):

@@ -122,21 +122,23 @@ def _be_child(
     """Run the function and end the process; never returns."""
     code = 1
     try:
-        _redirect(logs, encoding)
-        os.chdir(work)
-        _limit()
-        _watch(writable, os.open(logs[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND))
-        os.close(ready)
-        function()
-        code = 0
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else int(end.code is not None)
-    except BaseException:
-        traceback.print_exc()
-    with contextlib.suppress(Exception):
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(code)
+        try:
+            _redirect(logs, encoding)
+            os.chdir(work)
+            _limit()
+            _watch(writable, os.open(logs[2], os.O_WRONLY | os.O_CREAT | os.O_APPEND))
+            os.close(ready)
+            function()
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        except BaseException:
+            traceback.print_exc()
+        with contextlib.suppress(Exception):
+            sys.stdout.flush()
+            sys.stderr.flush()
+    finally:  # also of an interrupt that comes this late: the child must not go on as its parent
+        os._exit(code)
 
 
 def _redirect(logs: Sequence[Path], encoding: str) -> None:

@@ -7,7 +7,12 @@ import typer
 from typer.core import TyperGroup
 
 from sfm_shapefit import __version__
-from sfm_shapefit.cli.console import EXIT_INTERRUPTED, catch_termination, refuse_little_memory
+from sfm_shapefit.cli.console import (
+    EXIT_INTERRUPTED,
+    catch_termination,
+    refuse_little_memory,
+    repeat_lost_interrupts,
+)
 
 _ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
 """Of the commands in the help, by importance."""
@@ -51,6 +56,7 @@ def root(
 def main() -> None:
     """Run the command line. A request to terminate ends it like an interrupt from the keyboard."""
     catch_termination()
+    repeat_lost_interrupts()
     try:
         refuse_little_memory()
         app()

@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -34,19 +35,31 @@ _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "C
 
 _COMPILING = "compiling kernels, which takes about a minute once; they are kept on disk"
 
+_AGAIN_S = 0.02  # after which an interrupt that was lost comes again: native code has returned by then
+
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
 
 
 @contextmanager
-def reported(interrupted: str = "interrupted; nothing was written") -> Iterator[None]:
-    """Turn every known error into one sentence on stderr and its exit code."""
+def reported(out: Path | None = None) -> Iterator[None]:
+    """Turn every known error into one sentence on stderr and its exit code.
+
+    Args:
+        out: what the block makes, in one step. Whether an interrupt came before or after that step is seen
+            from what stands there: a new output is another folder, also where it replaces one.
+    """
+    before = _identity(out)
     try:
         yield
     except (KeyboardInterrupt, Exception) as error:
         # Native code that a signal interrupts may turn the interrupt into an error of its own.
         if isinstance(error, KeyboardInterrupt) or _received:
-            _fail(interrupted, EXIT_INTERRUPTED)
+            is_made = _identity(out) not in (None, before)
+            _fail(
+                f"interrupted; {'the output is complete' if is_made else 'nothing was written'}",
+                EXIT_INTERRUPTED,
+            )
         if isinstance(error, UnsolvableError):
             _fail(str(error), EXIT_UNSOLVABLE)
         if isinstance(error, ShapeFitError):
@@ -57,6 +70,15 @@ def reported(interrupted: str = "interrupted; nothing was written") -> Iterator[
                 EXIT_INPUT,
             )
         raise
+
+
+def _identity(path: Path | None) -> tuple[int, int] | None:
+    """Return what tells a file or folder from any other that exists; None if there is none."""
+    try:
+        status = None if path is None else path.stat()
+    except OSError:
+        return None
+    return status and (status.st_dev, status.st_ino)
 
 
 def catch_termination() -> None:
@@ -72,6 +94,20 @@ def catch_termination() -> None:
 def _interrupt(number: int, _frame: object) -> None:
     _received.append(number)
     raise KeyboardInterrupt
+
+
+def repeat_lost_interrupts() -> None:
+    """Let an interrupt that a callback of native code loses, with a traceback on stderr, come again."""
+    otherwise = sys.unraisablehook
+
+    def again(lost: "sys.UnraisableHookArgs") -> None:
+        if not (_received and isinstance(lost.exc_value, KeyboardInterrupt)):
+            otherwise(lost)
+        elif signal.getsignal(signal.SIGALRM) in (signal.SIG_DFL, _interrupt):
+            signal.signal(signal.SIGALRM, _interrupt)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+
+    sys.unraisablehook = again
 
 
 def refuse_little_memory() -> None:

@@ -35,7 +35,7 @@ def convert_command(
     target = one_path(out, output_path, "OUT")
     if target_format is not None and target_format not in _FORMATS:
         raise typer.BadParameter(f"--format must be one of {', '.join(_FORMATS)}, got {target_format!r}")
-    with reported():
+    with reported(target):
         from sfm_shapefit.conversion import convert
 
         written = convert(source, target, target_format, overwrite=overwrite)  # type: ignore[arg-type]

@@ -72,7 +72,7 @@ def locate_command(
     """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
-    with reported():
+    with reported(target):
         from sfm_shapefit.output import claimed_output
 
         options = options_from(LocateOptions, given, config)
@@ -92,7 +92,6 @@ def locate_command(
             ):
                 found = locate(source, database, options, progress, priors, workers)
                 write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
-    with reported("interrupted; the output is complete"):
         if as_json:
             print_json(summary(found))
         elif not quiet:

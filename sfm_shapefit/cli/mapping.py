@@ -58,7 +58,7 @@ def map_command(
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
-    with reported():
+    with reported(target):
         from sfm_shapefit.output import claimed_output
 
         options = options_from(MapOptions, given, config)
@@ -74,7 +74,6 @@ def map_command(
                 write_map_result(
                     found, target, overwrite=overwrite, protect=protect, report=report, scene=scene
                 )
-    with reported("interrupted; the output is complete"):
         if as_json:
             print_json(map_summary(found))
         elif not quiet:

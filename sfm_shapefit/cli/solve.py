@@ -86,7 +86,7 @@ def solve_command(
     """Place the nodes of a bare view GRAPH of directions, or of relative poses; write tables to OUT."""
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
-    with reported():
+    with reported(target):
         from sfm_shapefit.output import claimed_output
 
         options = options_from(PlacementOptions, given)
@@ -120,7 +120,6 @@ def solve_command(
                 report=report,
                 scene=scene,
             )
-    with reported("interrupted; the output is complete"):
         if as_json:
             print_json(graph_summary(found))
         elif not quiet:

@@ -26,7 +26,7 @@ def synth_command(
 ) -> None:
     """Make a synthetic COLMAP workspace in OUT: a database, a model, the exact truth, and images if asked."""
     target = one_path(out, output_path, "OUT")
-    with reported():
+    with reported(target):
         scene = options_from(SceneOptions, fields_of(SceneOptions, given))
         workspace = options_from(WorkspaceOptions, fields_of(WorkspaceOptions, given))
         render = options_from(RenderOptions, fields_of(RenderOptions, given))
