@@ -243,6 +243,30 @@ def test_a_solver_without_fill_serves_as_well():
     assert certificate.gap <= 3.0 * direct.gap
 
 
+def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
+    graph = drawn("geo", 300, 16)
+    split = solve_admm(graph, 1e-4, 200)
+    given = split.dual.copy()
+    aside = certify(graph, split.locations, split.dual)
+    assert np.array_equal(split.dual, given)
+    in_place = certify(graph, split.locations, split.dual, overwrite_dual=True)
+    assert np.shares_memory(in_place.dual, split.dual)
+    assert np.array_equal(in_place.dual, aside.dual)
+    assert in_place.dual_bound == aside.dual_bound
+
+
+def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
+    graph = drawn("geo", 300, 16)
+    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
+    used, new = IterativeSolver(neighbours), IterativeSolver(neighbours)
+    used.refactor(graph.weights)
+    for solver in (used, new):
+        solver.refactor(weights)
+    c = scale_functional(graph)
+    assert np.array_equal(used.solve(c), new.solve(c))
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
 def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma):
     graph = drawn("geo", 400, 24, sigma=sigma)

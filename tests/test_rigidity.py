@@ -274,6 +274,29 @@ def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():
 # --- invariance ---------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("flaw", "verdict"), [("none", True), ("pendant", False), ("hinge", False)])
+def test_many_pairs_without_triangles_are_judged_by_a_few_of_each_camera_first(flaw, verdict, monkeypatch):
+    rng = np.random.default_rng(7)
+    half = 60
+    left, right = np.nonzero(rng.random((half, half)) < 0.5)
+    edges = np.column_stack([left, half + right])
+    n = 2 * half
+    if flaw == "pendant":
+        edges, n = np.vstack([edges, [[0, n]]]), n + 1
+    if flaw == "hinge":  # a second copy, with the last camera of the first as its first one
+        edges, n = np.vstack([edges, edges + n - 1]), 2 * n - 1
+    searched = []
+
+    def noting(num_cameras, pairs, dimension):
+        searched.append(len(pairs))
+        return parallel_rigid_pieces(num_cameras, pairs, dimension)
+
+    monkeypatch.setattr(rigidity.pieces, "parallel_rigid_pieces", noting)
+    assert is_parallel_rigid(n, edges, 3) == verdict
+    assert searched[0] <= len(edges) / 2
+    assert searched[1:] == ([] if verdict else [len(edges)])  # a verdict against needs all of the pairs
+
+
 @pytest.mark.parametrize("dimension", DIMENSIONS)
 def test_labels_do_not_depend_on_the_order_or_orientation_of_the_edges(dimension):
     rng = np.random.default_rng(11)

@@ -254,12 +254,16 @@ class LaplacianOperator:
         """Copy the weights, (m,), to the entries of the adjacency."""
         self._graph = graph
         self._entries = np.empty(len(graph.edge_of), np.float32)
-        _write_entries(graph.edge_of, weights, self._entries)
+        self.reweigh(weights)
         self._workers = workers
         entries = len(graph.neighbours)
         blocks = _ROW_BLOCKS if entries >= _ENTRIES_WORTH_A_THREAD and workers.threads > 1 else 1
         cuts = np.searchsorted(graph.pointers, np.arange(1, blocks) * (entries // blocks))
         self._bounds = [0, *(int(cut) for cut in cuts), graph.num_nodes]
+
+    def reweigh(self, weights: FloatArray) -> None:
+        """Take other weights, (m,), in place of those before."""
+        _write_entries(self._graph.edge_of, weights, self._entries)
 
     @property
     def num_nodes(self) -> int:

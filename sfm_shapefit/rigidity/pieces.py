@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.errors import InputError
@@ -12,6 +13,7 @@ from sfm_shapefit.rigidity.growth import compact, grown, incidence, triangle_bod
 from sfm_shapefit.viewgraph import ViewGraph
 
 _FIRST_GAME_CAMERAS = 500  # a pebble game of this size takes milliseconds
+_FEW_LINKS = 6  # per camera: twice what rigidity needs in space, and mostly enough where pairs abound
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +73,18 @@ def is_parallel_rigid(num_cameras: int, edges: IntArray, dimension: int) -> bool
     checked = _checked_edges(num_cameras, edges, dimension)
     if len(checked) and _grows_from_first_pair(num_cameras, checked):
         return True
-    label = parallel_rigid_pieces(num_cameras, checked, dimension)
+    few = checked[_among_first_links(num_cameras, checked, _FEW_LINKS)]
+    if 2 * len(few) <= len(checked) and _is_one_piece(num_cameras, few, dimension):
+        return True  # more pairs only hold the cameras faster; the search takes memory by the pair
+    return _is_one_piece(num_cameras, checked, dimension)
+
+
+def _is_one_piece(num_cameras: int, edges: IntArray, dimension: int) -> bool:
+    """Return whether the checked pairs are one rigid piece, and touch every camera."""
+    label = parallel_rigid_pieces(num_cameras, edges, dimension)
     if len(label) == 0:
         return num_cameras == 1
-    touched = np.unique(np.asarray(edges))
-    return bool(label.max() == 0) and len(touched) == num_cameras
+    return bool(label.max() == 0) and len(np.unique(edges)) == num_cameras
 
 
 def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
@@ -128,6 +137,20 @@ def _grows_from_first_pair(num_cameras: int, edges: IntArray) -> bool:
                 size += 1
             last[other] = camera
     return bool(size == num_cameras)
+
+
+@kernel()
+def _among_first_links(num_cameras: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
+    """Return which pairs are among the first `few` kept at one of their cameras, at least, (m,)."""
+    kept = np.zeros(num_cameras, dtype=np.int64)
+    is_kept = np.zeros(len(edges), dtype=np.bool_)
+    for e in range(len(edges)):
+        i, j = edges[e, 0], edges[e, 1]
+        if kept[i] < few or kept[j] < few:
+            is_kept[e] = True
+            kept[i] += 1
+            kept[j] += 1
+    return is_kept
 
 
 @kernel()

@@ -109,6 +109,7 @@ def certify(
     uniqueness: bool = False,
     factor: LaplacianFactor | None = None,
     threads: int = 1,
+    overwrite_dual: bool = False,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -121,6 +122,7 @@ def certify(
         factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
             graph; it serves as preconditioner and cannot make the bound wrong.
         threads: of a repair; the bound does not depend on it.
+        overwrite_dual: make `dual` itself feasible where that saves a copy of it.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
@@ -129,7 +131,7 @@ def certify(
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, dual)
     n, d, w = graph.num_cameras, graph.dimension, graph.weights
-    y = np.array(dual, dtype=np.float64, order="C")
+    y = np.array(dual, dtype=np.float64, order="C", copy=None if overwrite_dual else True)
     c, total, degrees = np.zeros((n, d)), np.zeros((n, d)), np.zeros(n)
     worst = _project(graph.edges, graph.directions, w, y, c, total, degrees)
     degree = float(degrees.max())

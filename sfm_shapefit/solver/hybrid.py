@@ -116,7 +116,9 @@ def _split(
     target = _SHARE * tol
     for _ in range(_CERTIFICATES):
         step = splitting.run(0.0, target, max_iterations, on_iteration)
-        certificate = certify(graph, step.locations, step.dual, tol=tol, factor=factor, threads=threads)
+        certificate = certify(
+            graph, step.locations, step.dual, tol=tol, factor=factor, threads=threads, overwrite_dual=True
+        )
         finish = _verdict(certificate, step.stop, tol)
         result = HybridResult(
             locations=step.locations,

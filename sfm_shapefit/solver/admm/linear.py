@@ -63,11 +63,11 @@ class IterativeSolver:
     def __init__(self, graph: Adjacency, threads: int = 1) -> None:
         """Keep the graph; `refactor` must come before `solve`. The answers do not depend on `threads`."""
         self._graph = graph
-        self._workers = Workers(threads)
+        self._operator = LaplacianOperator(graph, np.ones(len(graph.edge_of) // 2), Workers(threads))
 
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,), and choose the preconditioner by a probe."""
-        self._operator = LaplacianOperator(self._graph, weights, self._workers)
+        self._operator.reweigh(weights)
         self._preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
         if not _diagonal_suffices(self._operator, self._preconditioner):
             self._preconditioner = approximate_cholesky(self._graph, weights, _SEED)
