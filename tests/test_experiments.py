@@ -115,6 +115,18 @@ def test_every_panel_of_every_figure_names_a_known_method():
         assert {panel.method for panel in module.panels(figure)} <= set(METHODS)
 
 
+def test_solvers_may_be_apart_only_where_the_optimum_is_not_certified_to_be_unique():
+    phase = script("phase_transition")
+    cells = (Cell(16, 0.425), Cell(40, 0.2), Cell(6, 0.5))  # a flat optimum, a unique one, a graph that bends
+    errors = np.array([[0.3, 0.3001], [1e-12, 2e-7], [1.0, 1.0]])
+    values = np.repeat(errors[:, :, None, None], 4, axis=3)
+    said = phase._apart(trials.Results(cells, ("a", "b"), values, 0.0))
+    assert said.startswith("largest difference of a cell between a and b: 1.0e-04; 2.0e-07 without 1 cells")
+    values[1, 1] = 1e-3
+    said = phase._apart(trials.Results(cells[1:], ("a", "b"), values[1:], 0.0))
+    assert said == "largest difference of a cell between a and b: 1.0e-03"
+
+
 def test_only_sizes_that_double_are_drawn_on_a_logarithmic_axis():
     module = script("phase_transition")
     doubling = [name for name in module.FIGURES if any(panel.doubles for panel in module.panels(name))]
