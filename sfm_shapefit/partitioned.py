@@ -13,7 +13,9 @@ A piece ties to another one by four shared cameras or more; with fewer its scale
 map would tear there. Pieces outside the largest body of tied ones start at their neighbours instead. The
 pieces' certificates prove their own optima, not one of the whole. Where one machine holds the factor of the
 graph the whole solve is better: as exact, and in less time in all. Where most pairs would join two pieces, as
-in random graphs, pieces know too little, and the whole solve goes on without a factor (`choose_pieces`).
+in random graphs, pieces know too little, and the whole solve goes on without a factor (`choose_pieces`). It
+does so, too, where a piece cannot be certified: its parts are held together by what was cut, as communities
+that few pairs join, and it would tear the map.
 
 Partition and merge follow Zhu et al., "Very large-scale global SfM by distributed motion averaging", CVPR
 2018.
@@ -48,6 +50,7 @@ _LARGEST_CUT = 0.5  # share of pairs between parts
 _OVERLAP = 0.15  # of a part; 10 % costs twice the error of 25 % before the refinement, none after it
 _LEAST_LINKS = 3  # pairs of a neighbour with the part
 _LEAST_SHARED = 4  # cameras, to tie two pieces
+_LARGEST_GAP = 0.01  # of a piece; 1e-4 on areas and chains, 0.2 on communities, torn by 0.2 of their radius
 _MOST_RATIOS = 4000  # length ratios per pair of pieces
 _IRLS_STEPS = 50
 _FLOOR = 1e-3  # of the median residual, under the weights
@@ -116,8 +119,10 @@ def place_partitioned(
     covariance: FloatArray | None = None,
     classes: IntArray | None = None,
     executor: Executor | None = None,
-) -> PartitionedResult:
+) -> PartitionedResult | None:
     """Place a rigid view graph in overlapping pieces, and refine it as a whole.
+
+    Returns None as soon as a piece turns out that cannot be certified by itself: place the whole then.
 
     Args:
         graph: connected and parallel rigid.
@@ -134,11 +139,12 @@ def place_partitioned(
     options, start = options or PlacementOptions(), time.perf_counter()
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     tasks = piece_tasks(graph, part_of, options, covariance, classes)
-    if executor is None:
-        found = [solve_piece(task) for task in tasks]
-    else:
-        found = list(answers(executor, solve_piece, tasks))
-    pieces = tuple(piece for part in found for piece in part)
+    solved_pieces = map(solve_piece, tasks) if executor is None else answers(executor, solve_piece, tasks)
+    pieces: tuple[PieceSolution, ...] = ()
+    for part in solved_pieces:
+        if any(piece.gap > _LARGEST_GAP for piece in part):
+            return None
+        pieces += tuple(part)
     if not pieces:
         raise UnsolvableError("no piece has four rigid cameras; leave out the executor")
     merged, num_merged, num_spread = merge(graph, pieces)

@@ -27,6 +27,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
+_NOT_IN_PIECES = "not in pieces, which few pairs would hold together: one of them could not be certified"
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
@@ -270,9 +271,12 @@ def _solved(
     part_of = None if executor is None else choose_pieces(piece, options)
     if part_of is not None:
         joined = place_partitioned(piece, part_of, options, covariance, classes, executor)
-        return joined.solve, joined.finish
+        if joined is not None:
+            return joined.solve, joined.finish
     if options.solves_shapefit:
         solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
     else:
         solved = solve_baseline(piece, options.objective)
+    if part_of is not None:
+        solved = replace(solved, method_reason=f"{solved.method_reason}; {_NOT_IN_PIECES}")
     return solved, finish(piece, solved, options, covariance, classes)

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit import partitioned
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian import partition as partitioning
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.partition import partition
-from sfm_shapefit.partitioned import PieceSolution, choose_pieces, merge, place_partitioned
+from sfm_shapefit.partitioned import PieceSolution, choose_pieces, merge, place_partitioned, solve_piece
 from sfm_shapefit.placement import place
 from sfm_shapefit.robust.options import PlacementOptions
 from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles
@@ -118,10 +119,31 @@ def test_a_part_that_falls_apart_is_several_pieces(box):
     graph = graph_of(box)
     along = np.argsort(np.argsort(box.locations[:, 0])) // 120
     found = place_partitioned(graph, np.where(along == 4, 0, along), SMALL)  # both ends are one part
+    assert found is not None
     assert len(found.pieces) == found.num_merged == 5
     assert found.num_spread == 0
     assert error(found.finish.locations, box.locations) < 0.0011  # 0.00094 as a whole
     assert max(piece.gap for piece in found.pieces) < 1e-8
+
+
+def test_where_a_piece_cannot_be_certified_the_whole_is_placed(box, monkeypatch):
+    graph, solved = graph_of(box), []
+
+    def loose(task):
+        solved.append(task)
+        pieces = solve_piece(task)
+        return [replace(piece, gap=0.1 if len(solved) == 2 else piece.gap) for piece in pieces]
+
+    monkeypatch.setattr(partitioned, "solve_piece", loose)
+    parts = choose_pieces(graph, SMALL)
+    assert place_partitioned(graph, parts, SMALL) is None
+    assert len(solved) == 2  # the others are not waited for
+    solved.clear()
+    with ThreadPoolExecutor(1) as executor:
+        found = place(graph, SMALL, executor=executor)
+    assert found.solve.status is Status.CONVERGED
+    assert found.solve.method_reason.endswith("one of them could not be certified")
+    np.testing.assert_array_equal(found.locations, place(graph, SMALL).locations)
 
 
 def test_a_graph_of_which_no_piece_is_rigid_is_refused():
