@@ -180,8 +180,8 @@ def _apart(results: Results) -> str:
     said = f"largest difference of a cell between {' and '.join(results.methods)}: {apart.max():.1e}"
     if far:
         said += (
-            f"; {np.delete(apart, far).max():.1e} without {len(far)} cells with a problem whose optimum is not"
-            " certified to be unique"
+            f"; {np.delete(apart, far).max():.1e} without {len(far)} cells with a problem whose optimum is"
+            " not certified to be unique"
         )
     return said
 
