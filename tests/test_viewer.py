@@ -152,7 +152,8 @@ def test_view_serves_a_page_on_this_machine_only_and_ends_when_told(located):
             with urllib.request.urlopen(address, timeout=30) as answer:
                 assert answer.status == 200
                 assert b"<html" in answer.read().lower()
-        finally:
             process.send_signal(signal.SIGINT)
-        process.wait(timeout=60)
+            process.wait(timeout=60)
+        finally:
+            process.kill()
     assert process.returncode == 0

@@ -151,23 +151,20 @@ def place_graph(spec: GraphSpec, in_pieces: bool) -> Placed:
     truth = problem.locations[nodes]
     options = PlacementOptions(tol=1e-4, factor_memory=500 if in_pieces else 100_000, threads=WORKERS)
     start, used = time.perf_counter(), _cpu_s()
+    executor, joined = FreshProcesses(), None
     if in_pieces:
-        count = max(4, graph.num_cameras // PIECE)
-        part_of = partition(adjacency(graph.num_cameras, graph.edges), count)
-        executor = FreshProcesses()
+        part_of = partition(adjacency(graph.num_cameras, graph.edges), max(4, graph.num_cameras // PIECE))
         joined = place_partitioned(graph, part_of, options, executor=executor)
-        solved, found, memory = joined.solve, joined.finish, executor.peak_mb
-    else:
-        solved = solve(graph, options)
-        found = finish(graph, solved, options)
-        memory = peak_memory_mb()
+    solved = solve(graph, options) if joined is None else joined.solve
+    found = finish(graph, solved, options) if joined is None else joined.finish
+    given_up = "a piece could not be certified, so the whole: " if in_pieces and joined is None else ""
     return Placed(
         error=_error(found.locations, truth),
         wall_s=time.perf_counter() - start,
         cpu_s=_cpu_s() - used,
-        memory_mb=memory,
+        memory_mb=executor.peak_mb if in_pieces else peak_memory_mb(),
         merging_mb=peak_memory_mb(),
-        statement=f"{solved.method}: {solved.method_reason}",
+        statement=f"{given_up}{solved.method}: {solved.method_reason}",
     )
 
 
