@@ -30,6 +30,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.partition import partition
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
@@ -211,6 +212,7 @@ def _overlap(graph: ViewGraph, inside: BoolArray) -> IntArray:
     return np.asarray(order[links[order] >= _LEAST_LINKS], dtype=np.int64)
 
 
+@one_blas_thread()
 def solve_piece(task: PieceTask) -> list[PieceSolution]:
     """Return the rigid bodies of a piece, most cameras first, solved, certified and refined each."""
     found = []

@@ -14,6 +14,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.partitioned import choose_pieces, place_partitioned
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.robust.finish import Finish, finish
@@ -213,6 +214,7 @@ def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_came
         )
 
 
+@one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
 def _place_piece(
     graph: ViewGraph,
     parts: tuple[IntArray, list[RigidPiece]],
