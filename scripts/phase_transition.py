@@ -179,10 +179,8 @@ def _apart(results: Results) -> str:
     far = [k for k in np.flatnonzero(apart > AGREE) if not _are_unique(results.cells[k], trials)]
     said = f"largest difference of a cell between {' and '.join(results.methods)}: {apart.max():.1e}"
     if far:
-        said += (
-            f"; {np.delete(apart, far).max():.1e} without {len(far)} cells with a problem whose optimum is"
-            " not certified to be unique"
-        )
+        near = np.delete(apart, far).max(initial=0.0)
+        said += f"; {near:.1e} without {len(far)} cells with a problem whose optimum is not certified to be unique"
     return said
 
 

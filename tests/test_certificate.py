@@ -139,6 +139,24 @@ def test_no_spoilt_dual_proves_more_than_the_optimum():
     assert 0.9 * optimum <= certificate.dual_bound <= optimum
 
 
+@pytest.mark.parametrize("size", [1e155, 1e300])
+def test_a_dual_whose_sums_overflow_proves_nothing(size):
+    graph, t = complete(12)
+    spoilt = np.zeros((graph.num_edges, 3))
+    spoilt[0] = size
+    certificate = certify(graph, t, spoilt)
+    assert_feasible(graph, certificate)
+    assert np.isfinite(certificate.dual_bound)
+    assert certificate.dual_bound <= objective(graph, t) + 1e-12
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_violation_that_is_not_a_number_is_the_largest(row):
+    total = np.ones((2, 3))
+    total[row, 1] = np.nan
+    assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
+
+
 def test_the_metric_of_wrong_locations_still_proves_a_bound():
     graph = drawn("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)

@@ -100,6 +100,7 @@ class Certificate:
         return self.objective - self.dual_bound
 
 
+@one_blas_thread()  # more would round the sums over all cameras differently
 def certify(
     graph: ViewGraph,
     locations: FloatArray,
@@ -144,8 +145,9 @@ def certify(
         total = apply_incidence_transposed(graph.edges, y, n)
     scale = 1.0 / max(1.0, worst)
     if scale < 1.0:
-        y *= scale
-        total *= scale
+        with np.errstate(invalid="ignore"):  # sums that overflowed prove nothing below
+            y *= scale
+            total *= scale
     bound = float(np.vdot(total, c) / np.vdot(c, c))
     violation = _unbalanced(total, c, bound)
     # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
@@ -173,6 +175,8 @@ def _unbalanced(total: Any, c: Any, multiplier: float) -> float:
         square = 0.0
         for k in range(c.shape[1]):
             square += (total[i, k] - multiplier * c[i, k]) ** 2
+        if not square < np.inf:  # also NaN, which a maximum may lose: nothing may be proved by it
+            return np.inf
         worst = max(worst, square)
     return float(np.sqrt(worst))
 
