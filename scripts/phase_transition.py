@@ -180,7 +180,7 @@ def _apart(results: Results) -> str:
     said = f"largest difference of a cell between {' and '.join(results.methods)}: {apart.max():.1e}"
     if far:
         near = np.delete(apart, far).max(initial=0.0)
-        said += f"; {near:.1e} without {len(far)} cells with a problem whose optimum is not certified to be unique"
+        said += f"; {near:.1e} without {len(far)} cells where an optimum is not certified to be unique"
     return said
 
 

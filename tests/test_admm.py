@@ -455,13 +455,29 @@ def test_acceleration_forgets_its_history_after_a_step_that_made_things_much_wor
         step=lambda *_: (None, np.array([0.0, 0.0, 0.0, change, 0.0])), pull=lambda *_: np.ones((3, 3))
     )
     asked = SimpleNamespace(settings=SimpleNamespace(relaxation=1.7), passes=passes)
-    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(4), previous=10.0, anderson=history)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(4), steps=[10.0], anderson=history)
     Iteration._pass(asked, state)
     assert calls == ["restart"] * restarts
     assert state.spare is x
     assert state.x is not x
-    assert state.previous == change
+    assert state.steps == [10.0, change]
     np.testing.assert_array_equal(state.pull, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("steps", "left"),
+    [
+        ([0.96 ** (2 * k) for k in range(20)], 25.0),  # each step 0.96 times the one before
+        ([0.5 ** (2 * k) for k in range(20)], 10.0),  # 2 would do
+        ([1.0] * 20, 1000.0),  # sliding on and on
+        ([1.0, *[2.0] * 20], 1000.0),
+        ([0.0] * 20, 10.0),
+        ([0.96 ** (2 * k) for k in range(10)], 77.0),  # too few: what was known before holds
+    ],
+)
+def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
+    state = engine.State(x=np.zeros((1, 3)), t=np.zeros((2, 3)), rho=np.ones(1), steps=steps, steps_left=77.0)
+    assert engine._steps_left(state) == pytest.approx(left, rel=1e-9)
 
 
 @pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])

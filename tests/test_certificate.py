@@ -335,11 +335,23 @@ def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatc
         asked.append(target)
         return SimpleNamespace(locations=None, dual=None, iterations=7, stop=Stop.ACCURATE)
 
-    gaps = iter((4e-8, 1.5e-8, 1e-3, 2e-8))
-    monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=next(gaps)))
+    within = iter((None, None, None))
+    monkeypatch.setattr(hybrid, "certify_within", lambda *_, **__: next(within))
+    monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=2e-8))
     result = hybrid._split(SimpleNamespace(run=run), None, None, 1e-8, 2000, 1, None)
-    np.testing.assert_allclose(asked, 0.15e-8 * np.cumprod([1.0, 0.3 / 4.0, 0.3 / 1.5, 1e-3]), rtol=1e-12)
+    np.testing.assert_allclose(asked, [0.15e-8, 0.15e-9, 0.15e-10, 0.15e-11], rtol=1e-12)
     assert result.finish is Finish.INACCURATE
+
+
+def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_given_up(monkeypatch):
+    graph = drawn("comm", 1200, 30)
+    split = solve_admm(graph, 1e-4, 200)
+    whole = certify(graph, split.locations, split.dual)
+    within = certificate.certify_within(graph, split.locations, split.dual.copy(), 2.0 * whole.gap)
+    assert whole.gap <= within.gap <= 2.0 * whole.gap  # rounds may end earlier than for the best bound
+    assert_feasible(graph, within)
+    monkeypatch.setattr(certificate, "_restore_exactly", None)  # out of reach, it comes to no exact repair
+    assert certificate.certify_within(graph, split.locations, split.dual.copy(), 0.3 * whole.gap) is None
 
 
 @pytest.mark.parametrize(

@@ -17,14 +17,14 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 from sfm_shapefit.solver.admm import Splitting, Stop, laplacian_factor
 from sfm_shapefit.solver.admm.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor, Prediction
-from sfm_shapefit.solver.certificate import Certificate, certify
+from sfm_shapefit.solver.certificate import Certificate, certify, certify_within
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
 _SHARE = 0.15  # of the gap, that the splitting is asked for first
-_TIGHTER = 0.3  # of the gap missed, when it is asked again
+_TIGHTER = 0.1  # of the first share, when it is asked again
 _CERTIFICATES = 4
 _NEWTON_STEPS = 30
 _CHEAP_FLOPS = 4e9  # of one factorisation in blocks: Newton's method may take over early, and begin twice
@@ -114,23 +114,24 @@ def _split(
 ) -> HybridResult:
     """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
     target = _SHARE * tol
-    for _ in range(_CERTIFICATES):
+    for attempts_left in reversed(range(_CERTIFICATES)):
         step = splitting.run(0.0, target, max_iterations, on_iteration)
-        certificate = certify(
-            graph, step.locations, step.dual, tol=tol, factor=factor, threads=threads, overwrite_dual=True
-        )
-        finish = _verdict(certificate, step.stop, tol)
-        result = HybridResult(
-            locations=step.locations,
-            certificate=certificate,
-            iterations=step.iterations,
-            factorisations=0,
-            finish=finish,
-        )
-        if step.stop is not Stop.ACCURATE or finish is Finish.CERTIFIED:
+        t, y = step.locations, step.dual
+        if step.stop is Stop.ACCURATE and attempts_left:
+            certificate = certify_within(graph, t, y, tol, factor=factor, threads=threads)
+        else:
+            certificate = certify(graph, t, y, tol=tol, factor=factor, threads=threads, overwrite_dual=True)
+        if certificate is not None:
             break
-        target *= max(_TIGHTER * tol / certificate.gap, 1e-3)
-    return result
+        target *= _TIGHTER
+    assert certificate is not None, "the last one is taken as it is"
+    return HybridResult(
+        locations=t,
+        certificate=certificate,
+        iterations=step.iterations,
+        factorisations=0,
+        finish=_verdict(certificate, step.stop, tol),
+    )
 
 
 def _verdict(certificate: Certificate, stop: Stop, tol: float) -> Finish:

@@ -45,7 +45,9 @@ _ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise wou
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _ASTRAY = 10.0  # times the first objective: acceleration with more history than a tiny problem has dimensions
 _LEAST_OBJECTIVE = 1e-6  # what a first objective counts as at least: of exact data it is rounding
-_STEP_FACTOR = 10.0
+_STEPS_LEFT = 10.0  # that the fixed point is away at least, in steps of the present length, for `_error`
+_MOST_STEPS_LEFT = 1000.0
+_CONTRACTION_WINDOW = 10  # iterations over which the shrinking of the steps is measured
 _STALL_WINDOW = 150
 
 
@@ -95,8 +97,10 @@ class State:
     sums: FloatArray = field(default_factory=lambda: np.zeros(5))
     spare: FloatArray = field(default_factory=lambda: np.empty(0))
     """Room for the next x while acceleration needs the old one."""
-    previous: float = np.inf
-    """Squared step of the iteration before."""
+    steps: list[float] = field(default_factory=list)
+    """Squared steps since the penalties were renewed."""
+    steps_left: float = _STEPS_LEFT
+    """How many steps of the present length the fixed point is away."""
     interior: float = np.inf
     """Fraction of edges inside their ball at the last renewal."""
     anderson: Anderson | None = None
@@ -230,20 +234,24 @@ class Iteration:
             state.spare = np.empty_like(state.x)
         target = state.x if anderson is None else state.spare
         state.pull, state.sums = self.passes.step(state.x, target, state.t, state.rho, relaxation)
-        change, previous = float(state.sums[CHANGE]), state.previous
-        state.previous = change
+        state.steps.append(float(state.sums[CHANGE]))
+        state.steps_left = _steps_left(state) if anderson is None else _STEPS_LEFT
         if anderson is None:
             return
-        if change > _ANDERSON_GIVE_UP**2 * previous:
+        if len(state.steps) > 1 and state.steps[-1] > _ANDERSON_GIVE_UP**2 * state.steps[-2]:
             anderson.restart()
         state.x, state.spare = anderson.advance(state.x, target, state.rho), state.x
         state.pull = self.passes.pull(state.x, state.t, state.rho)
 
     def _error(self, state: State) -> float:
-        """Return the estimate of the error of the objective, in its own units."""
+        """Return the estimate of the error of the objective, in its own units.
+
+        By Cauchy and Schwarz it is at most the step times the distance to the fixed point, both in the norm
+        in which the iteration contracts.
+        """
         objective, pairing, along, change = state.sums[:4]
         dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
-        return float(max(abs(objective - dual_value), _STEP_FACTOR * change)) / self.kappa
+        return float(max(abs(objective - dual_value), state.steps_left * change)) / self.kappa
 
     def _floor(self, renewal: int, anderson: Anderson | None) -> float:
         """Return the least residual that penalties take seriously, relative to the mean residual."""
@@ -262,7 +270,7 @@ class Iteration:
         np.maximum(rho, floor * _mean(rho, passes.data.weights), out=rho)
         np.divide(state.scale * _PENALTY * passes.data.weights, rho, out=rho)
         passes.change_penalties(state.x, state.rho, rho)
-        state.rho, state.previous = rho, np.inf
+        state.rho, state.steps = rho, []
         self._factor(state)
         state.pull = passes.pull(state.x, state.t, state.rho)
 
@@ -295,6 +303,21 @@ class Iteration:
 def _mean(residuals: FloatArray, weights: FloatArray) -> float:
     """Return the weighted mean residual, kept away from 0 (the mean edge has length about 1)."""
     return max(float(np.vdot(weights, residuals) / weights.sum()), 1e-6)
+
+
+def _steps_left(state: State) -> float:
+    """Return how many steps of the present length are left, if they go on to shrink as they do.
+
+    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. Just after a renewal, when the
+    steps jump, the last answer is kept.
+    """
+    if len(state.steps) <= _CONTRACTION_WINDOW:
+        return state.steps_left
+    now, before = state.steps[-1], state.steps[-1 - _CONTRACTION_WINDOW]
+    if not before > 0.0:
+        return _STEPS_LEFT
+    shrinking = (now / before) ** (0.5 / _CONTRACTION_WINDOW)  # the steps are squared
+    return float(np.clip(1.0 / max(1.0 - shrinking, 1.0 / _MOST_STEPS_LEFT), _STEPS_LEFT, None))
 
 
 def _cancelled(on_iteration: OnIteration | None, iteration: int, objective: float) -> bool:
