@@ -58,7 +58,8 @@ _ROUNDS = (
     8  # of clipping; three do mostly, on loosely joined communities the sixth still gained half of the gap
 )
 _ROUND_REDUCTION = 0.1  # of the equality residual per round; exact solves would gain no round
-_NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap
+_NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap, or than this one
+_NEGLIGIBLE_MISSED = 0.3  # where the gap misses what was asked for in any case
 _RESIDUAL_FLOOR = 0.1  # least residual, relative to the mean one, that the metric takes seriously
 _ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away
 _ON_SURFACE = 0.99  # ||y_e|| / w_e from which a pair counts as on the surface
@@ -176,7 +177,7 @@ def _proved(
     multiplier = _multiplier(total, c, t)
     if _unbalanced(total, c, multiplier) > degree * _exact(value - multiplier / max(1.0, worst)):
         repair = _repair(graph, t, y, factor, threads)
-        gap = _clip_in_rounds(repair, c, t, value, _ENOUGH * tol, hopeless)
+        gap = _clip_in_rounds(repair, c, t, value, tol, hopeless)
         if gap > hopeless:
             return None
         allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
@@ -277,13 +278,13 @@ def _repair(
 
 
 def _clip_in_rounds(
-    repair: _Repair, c: FloatArray, t: FloatArray, value: float, enough: float, hopeless: float
+    repair: _Repair, c: FloatArray, t: FloatArray, value: float, tol: float, hopeless: float
 ) -> float:
     """Clip y and restore the equality roughly, in turns, until its excess costs little.
 
     Args:
         value: the objective at t, to tell how far the bound is.
-        enough: a gap at which it ends in any case.
+        tol: the gap wanted; it ends somewhat below it in any case.
         hopeless: a gap from which an end has no use; from the second clipping on, lambda hardly rises again.
 
     Returns:
@@ -298,7 +299,8 @@ def _clip_in_rounds(
         worst = _restore(repair, violation, _ROUND_REDUCTION)
         multiplier = _violation(repair.metric, c, t)[0]
         gap = value - multiplier / max(1.0, worst)
-        if gap <= enough or (worst - 1.0) * multiplier <= _NEGLIGIBLE * (value - multiplier):
+        share = _NEGLIGIBLE_MISSED if 0.0 < tol < value - multiplier else _NEGLIGIBLE
+        if gap <= _ENOUGH * tol or (worst - 1.0) * multiplier <= share * (value - multiplier):
             break
     return gap
 
