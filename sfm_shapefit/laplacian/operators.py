@@ -9,6 +9,7 @@ each edge goes (its slots); `assemble` then only writes, without sorting or allo
 `LaplacianOperator` multiplies without a matrix, by row blocks on several threads.
 """
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -222,21 +223,49 @@ def _assemble(edges: Any, diagonal: Any, upper: Any, lower: Any, weights: Any, d
 
 
 class Workers:
-    """Runs jobs that do not touch each other's results, on up to so many threads."""
+    """Runs jobs that do not touch each other's results, on up to so many threads, the caller's among them."""
 
     def __init__(self, threads: int) -> None:
         """Start no thread yet; `threads` >= 1."""
         self.threads = threads
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None  # ends when it is forgotten
+        self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None  # end when it is forgotten
+
+    def close(self) -> None:
+        """End the threads now."""
+        if self._helpers is not None:
+            self._helpers.shutdown()
 
     def run(self, jobs: Sequence[Callable[[], object]]) -> None:
-        """Run all jobs, in order where there is one thread; raise what the first failed one raised."""
-        if self._pool is None or len(jobs) == 1:
+        """Run all jobs, in order where there is one thread; raise what the first failed one raised.
+
+        Passes are so short that waking a thread counts: the caller begins at once, and helpers join it.
+        """
+        if self._helpers is None or len(jobs) == 1:
             for job in jobs:
                 job()
             return
-        for done in [self._pool.submit(job) for job in jobs]:
-            done.result()
+        waiting = deque(enumerate(jobs))
+        failures: dict[int, BaseException] = {}
+
+        def work() -> None:
+            while waiting:
+                try:
+                    k, job = waiting.popleft()
+                except IndexError:  # another thread took the last one
+                    return
+                try:
+                    job()
+                except BaseException as failure:
+                    failures[k] = failure
+
+        helpers = [self._helpers.submit(work) for _ in range(min(self.threads, len(jobs)) - 1)]
+        try:
+            work()
+        finally:
+            for helper in helpers:
+                helper.result()
+        if failures:
+            raise failures[min(failures)]
 
 
 _ROW_BLOCKS = 8

@@ -30,8 +30,18 @@ from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 Ordering = Literal["auto", "metis", "dissection", "minimum-degree"]
 
 _MINIMUM_DEGREE_LIMIT = 400_000  # edges; above, minimum degree takes longer than it can save
-_MINIMUM_DEGREE_FLOPS = 100_000  # operations per edge of the dissection; above, the graph is an expander, on
-# which minimum degree takes many seconds to find as much fill
+_BAND_FLOPS = (
+    600  # operations per edge of METIS's order; above, the graph is no band, and on no family, box or
+)
+# community did minimum degree find a better one
+_EXPANDER_FLOPS = (
+    100_000  # the same for our dissection; above, the graph is an expander, on which minimum degree
+)
+# takes many seconds to find as much fill
+_METIS_REFINEMENTS = (
+    1  # per level; METIS's own 10 take half as long again for 2 % fewer operations at 1e5 boxes,
+)
+# 5 % at 1e4, and 13 % more at communities of 1e5
 _LEAF = 48  # nodes; smaller parts are not cut further
 _SMOOTHING = 6  # averaging sweeps over the integer graph distances, to make cuts straight
 _PASSES = 6  # refinement passes over a separator
@@ -48,7 +58,8 @@ def best_order(
     Args:
         graph: the neighbours of each node.
         method: one method, or "auto": metis where installed, else our dissection; on graphs of up to 400,000
-            edges minimum degree as well, and the one whose factorisation takes fewer operations is kept.
+            edges minimum degree as well, where it can be better, and the one whose factorisation takes fewer
+            operations is kept.
         coordinates: (n, d) approximate positions that our dissection may cut by; graph distances if None.
 
     Raises:
@@ -62,8 +73,9 @@ def best_order(
         candidates.append(dissection_order(graph, coordinates))
     trees = [elimination_tree(graph, order) for order in candidates]
     edges = len(graph.neighbours) // 2
-    small = edges <= _MINIMUM_DEGREE_LIMIT and all(t.flops <= _MINIMUM_DEGREE_FLOPS * edges for t in trees)
-    if method == "minimum-degree" or (method == "auto" and small):
+    limit = (_BAND_FLOPS if use_metis else _EXPANDER_FLOPS) * edges
+    worthwhile = edges <= _MINIMUM_DEGREE_LIMIT and all(t.flops <= limit for t in trees)
+    if method == "minimum-degree" or (method == "auto" and worthwhile):
         trees.append(elimination_tree(graph, minimum_degree_order(graph)))
     return min(trees, key=lambda tree: tree.flops)  # the first of equals
 
@@ -76,7 +88,8 @@ def metis_order(graph: Adjacency) -> IntArray:
         return np.arange(graph.num_nodes)
     unique = without_repeats(graph)
     csr = pymetis.CSRAdjacency(unique[0].astype(np.int32), unique[1])
-    return np.asarray(pymetis.nested_dissection(adjacency=csr)[0], dtype=np.int64)
+    options = pymetis.Options(niter=_METIS_REFINEMENTS)
+    return np.asarray(pymetis.nested_dissection(adjacency=csr, options=options)[0], dtype=np.int64)
 
 
 def minimum_degree_order(graph: Adjacency) -> IntArray:

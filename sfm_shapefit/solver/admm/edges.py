@@ -16,9 +16,8 @@ the order of the chunks: the result does not depend on the number of threads, to
 """
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.viewgraph import ViewGraph
 
 _CHUNKS = 4
@@ -82,12 +82,11 @@ class EdgePasses:
         chunks, d = len(data.bounds) - 1, data.directions.shape[1]
         self._sums = np.zeros((chunks, data.num_nodes, d))
         self._totals = np.zeros((chunks, 5))
-        self._pool = ThreadPoolExecutor(min(threads, chunks)) if min(threads, chunks) > 1 else None
+        self._workers = Workers(min(threads, chunks))
 
     def close(self) -> None:
         """End the threads."""
-        if self._pool is not None:
-            self._pool.shutdown()
+        self._workers.close()
 
     def step(
         self, x: FloatArray, x_next: FloatArray, t: FloatArray, rho: FloatArray, relaxation: float
@@ -196,13 +195,7 @@ class EdgePasses:
     def over_chunks(self, run: Callable[[int, int, int], None]) -> None:
         """Call run(k, first, last) for every chunk of edges."""
         bounds = self.data.bounds
-        jobs = [(k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)]
-        if self._pool is None:
-            for job in jobs:
-                run(*job)
-        else:
-            for done in [self._pool.submit(run, *job) for job in jobs]:
-                done.result()
+        self._workers.run([partial(run, k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)])
 
 
 # The kernels are made per dimension: with d a constant the loops over coordinates unroll.
