@@ -29,6 +29,7 @@ from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.viewgraph import ViewGraph
 
 _CHUNKS = 4
+_BLOCK = 64  # edges that are gathered and then worked on together
 _EDGES_WORTH_A_THREAD = 20_000  # below, handing work to a thread costs more than the work
 
 OBJECTIVE, PAIRING, ALONG, CHANGE, INTERIOR = range(5)
@@ -222,43 +223,86 @@ def _clip_factor(d: int) -> Any:
 
 @cache
 def _step(d: int) -> Any:
-    clip_factor = _clip_factor(d)
+    advance = _advance(d)
 
     @kernel()
     def step(
         first: int, last: int, ends: Any, v: Any, w: Any, least: float,
         rho: Any, relaxation: float, t: Any, x: Any, x_next: Any, sums: Any, totals: Any,
     ) -> None:  # fmt: skip
+        block = np.empty((3 * d + 2, _BLOCK))  # one array: several might overlap, for all the compiler knows
+        for begin in range(first, last, _BLOCK):
+            count = min(_BLOCK, last - begin)
+            for b in range(count):
+                e = begin + b
+                i, j = ends[e, 0], ends[e, 1]
+                for k in range(d):
+                    block[k, b] = t[i, k] - t[j, k]
+                    block[d + k, b] = x[e, k]
+                    block[2 * d + k, b] = v[e, k]
+                block[3 * d, b] = w[e]
+                block[3 * d + 1, b] = rho[e]
+            advance(block, count, least, relaxation, totals)
+            for b in range(count):
+                e = begin + b
+                i, j = ends[e, 0], ends[e, 1]
+                for k in range(d):
+                    x_next[e, k] = block[d + k, b]
+                    sums[i, k] += block[k, b]
+                    sums[j, k] -= block[k, b]
+
+    return step
+
+
+@cache
+def _advance(d: int) -> Any:
+    @kernel(inline=True)
+    def advance(block: Any, count: int, least: float, relaxation: float, totals: Any) -> None:
+        """Take the step for edges side by side, coordinate by coordinate, so that it is vectorised.
+
+        The rows of `block` are D t, x, v, w and rho; D t becomes what is pulled, and x what follows it.
+        """
+        baseline, x, v, w, rho = block[:d], block[d:], block[2 * d :], block[3 * d], block[3 * d + 1]
         objective, pairing, along, change, interior = 0.0, 0.0, 0.0, 0.0, 0.0
-        for e in range(first, last):
-            i, j = ends[e, 0], ends[e, 1]
-            radius = w[e] / rho[e]
-            a, shrink = clip_factor(x, v, e, least, radius)
+        for b in range(count):
+            radius = w[b] / rho[b]
+            a = 0.0
+            for k in range(d):
+                a += x[k, b] * v[k, b]
+            a = max(a, least)
+            square = 0.0
+            for k in range(d):
+                r = x[k, b] - a * v[k, b]
+                square += r * r
+            shrink = radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
             moved, length = 0.0, 0.0
             for k in range(d):
-                baseline = t[i, k] - t[j, k]
-                u = shrink * (x[e, k] - a * v[e, k])
-                g = relaxation * (baseline - x[e, k] + u)
+                u = shrink * (x[k, b] - a * v[k, b])
+                g = relaxation * (baseline[k, b] - x[k, b] + u)
                 moved += g * g
-                length += baseline * v[e, k]
-                x_next[e, k] = x[e, k] + g
-            a, shrink = clip_factor(x_next, v, e, least, radius)
-            length = max(length, least)
-            square, paired, projected = 0.0, 0.0, 0.0
+                length += baseline[k, b] * v[k, b]
+                x[k, b] += g
+            a = 0.0
             for k in range(d):
-                baseline = t[i, k] - t[j, k]
-                r = baseline - length * v[e, k]
+                a += x[k, b] * v[k, b]
+            a, length = max(a, least), max(length, least)
+            square, missed = 0.0, 0.0
+            for k in range(d):
+                r = x[k, b] - a * v[k, b]
                 square += r * r
-                u = shrink * (x_next[e, k] - a * v[e, k])
-                paired += u * baseline
-                projected += u * v[e, k]
-                p = rho[e] * (x_next[e, k] - 2.0 * u - baseline)
-                sums[i, k] += p
-                sums[j, k] -= p
-            objective += w[e] * np.sqrt(square)
-            pairing += rho[e] * paired
-            along += rho[e] * projected
-            change += rho[e] * moved
+                r = baseline[k, b] - length * v[k, b]
+                missed += r * r
+            shrink = radius / max(np.sqrt(square), radius)
+            paired, projected = 0.0, 0.0
+            for k in range(d):
+                u = shrink * (x[k, b] - a * v[k, b])
+                paired += u * baseline[k, b]
+                projected += u * v[k, b]
+                baseline[k, b] = rho[b] * (x[k, b] - 2.0 * u - baseline[k, b])
+            objective += w[b] * np.sqrt(missed)
+            pairing += rho[b] * paired
+            along += rho[b] * projected
+            change += rho[b] * moved
             interior += 1.0 if shrink == 1.0 else 0.0
         totals[0] += objective
         totals[1] += pairing
@@ -266,7 +310,7 @@ def _step(d: int) -> Any:
         totals[3] += change
         totals[4] += interior
 
-    return step
+    return advance
 
 
 @cache
