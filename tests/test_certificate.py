@@ -339,7 +339,7 @@ def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatc
     monkeypatch.setattr(hybrid, "certify_within", lambda *_, **__: next(within))
     monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=2e-8))
     result = hybrid._split(SimpleNamespace(run=run), None, None, 1e-8, 2000, 1, None)
-    np.testing.assert_allclose(asked, [0.15e-8, 0.15e-9, 0.15e-10, 0.15e-11], rtol=1e-12)
+    np.testing.assert_allclose(asked, [0.3e-8, 0.3e-9, 0.3e-10, 0.3e-11], rtol=1e-12)
     assert result.finish is Finish.INACCURATE
 
 

@@ -1,9 +1,9 @@
 """Large graphs to a proven gap: splitting, then a certificate, then Newton steps only if it must be.
 
 Splitting is cheap but proves nothing; the certificate makes its dual feasible at the price of some twenty
-iterations, and the gap it then proves is mostly within ten times the error that the splitting estimates for
-itself. So the splitting is asked for a tenth of the gap, and its answer certified. If that misses, it goes on
-where it was. Where it stalls, as on long chains, the sparse Newton solver takes over from the certified
+iterations, and the gap it then proves is mostly below the error that the splitting estimates for itself, and
+hardly ever above three times it. So the splitting is asked for a third of the gap, and its answer certified.
+If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes over from the certified
 point, if its factor fits. Newton's method converges from near a solution or from its own beginning: if the
 point was of no use, it begins again there.
 """
@@ -23,7 +23,7 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
-_SHARE = 0.15  # of the gap, that the splitting is asked for first
+_SHARE = 0.3  # of the gap, that the splitting is asked for first
 _TIGHTER = 0.1  # of the first share, when it is asked again
 _CERTIFICATES = 4
 _NEWTON_STEPS = 30
