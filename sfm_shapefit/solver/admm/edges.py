@@ -21,7 +21,6 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.jit import kernel
@@ -42,7 +41,7 @@ class EdgeData:
     """The edges in the order of the passes (ascending first node, so that memory is read in order)."""
 
     num_nodes: int
-    ends: npt.NDArray[np.int32]
+    ends: IntArray
     """(m, 2) nodes (i, j)."""
     directions: FloatArray
     """(m, d) unit v_e."""
@@ -65,7 +64,7 @@ def edge_data(graph: ViewGraph, least: float) -> EdgeData:
     chunks = _CHUNKS if m >= _EDGES_WORTH_A_THREAD else 1
     return EdgeData(
         num_nodes=graph.num_cameras,
-        ends=frozen(graph.edges.astype(np.int32)[order]),
+        ends=graph.edges if is_sorted else frozen(graph.edges[order]),
         directions=graph.directions if is_sorted else frozen(graph.directions[order]),
         weights=graph.weights if is_sorted else frozen(graph.weights[order]),
         least=least,
