@@ -3,9 +3,9 @@
 Splitting is cheap but proves nothing; the certificate makes its dual feasible at the price of some twenty
 iterations, and the gap it then proves is mostly below the error that the splitting estimates for itself, and
 hardly ever above three times it. So the splitting is asked for a third of the gap, and its answer certified.
-If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes over from the certified
-point, if its factor fits. Newton's method converges from near a solution or from its own beginning: if the
-point was of no use, it begins again there.
+If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes
+over from the certified point, if its factor fits. Newton's method converges from near a solution or from its
+own beginning: if the point was of no use, it begins again there.
 """
 
 import enum
