@@ -106,6 +106,29 @@ def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(mon
     assert np.array_equal(again.dual, found.dual)
 
 
+@pytest.mark.parametrize(
+    ("excess", "tol", "hopeless", "rounds"),
+    [
+        ((1e-3, 1e-4, 1e-5, 1e-6), 1e-4, np.inf, 3),  # after two the gap is small, but not what comes of it
+        ((1e-3, 1e-4, 1e-5, 1e-6), 1e-3, np.inf, 2),
+        ((1e-3, 1e-4, 1e-5, 1e-6), 0.0, np.inf, 4),  # the best bound: 1e-6 of excess is 2 % of the gap
+        ((1e-3, 1e-4, 1e-5, 1e-6), 5e-6, np.inf, 3),  # missed anyway: 20 % will do
+        ((1e-3, 1e-4, 1e-5, 1e-6), 5e-6, 5e-6, 1),  # given up at the second clipping
+    ],
+)
+def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
+    excess, tol, hopeless, rounds, monkeypatch
+):
+    restored = iter(excess)
+    done = []
+    monkeypatch.setattr(certificate, "_clip", lambda _: None)
+    monkeypatch.setattr(certificate, "_violation", lambda *_: (0.2, None))
+    monkeypatch.setattr(certificate, "_restore", lambda *_: done.append(1) or 1.0 + next(restored))
+    gap = certificate._clip_in_rounds(SimpleNamespace(metric=None), None, None, 0.20001, tol, hopeless)
+    assert len(done) == rounds
+    assert gap == pytest.approx(1e-5 + (0.2 * excess[rounds - 1] if hopeless > 1.0 else 0.0), rel=1e-2)
+
+
 def test_on_a_collapsing_chain_the_repaired_dual_is_feasible_though_it_proves_little():
     graph = drawn("seq", 400, 24)
     split = solve_admm(graph, 1e-12, 50)

@@ -374,6 +374,26 @@ def test_the_operator_multiplies_by_the_laplacian_whatever_the_threads(columns):
     np.testing.assert_allclose(products[0], exact, atol=1e-7 * np.abs(exact).max() * 3)  # float32 weights
 
 
+@pytest.mark.parametrize("threads", [1, 2, 3])
+def test_workers_run_every_job_once_and_raise_what_the_first_failed_one_raised(threads):
+    done = []
+
+    def job(k):
+        def run():
+            done.append(k)
+            if k in failing:
+                raise ValueError(f"job {k}")
+
+        return run
+
+    failing = ()
+    Workers(threads).run([job(k) for k in range(20)])
+    assert sorted(done) == list(range(20))
+    failing = (7, 3, 15)
+    with pytest.raises(ValueError, match="job 3"):
+        Workers(threads).run([job(k) for k in range(20)])
+
+
 @pytest.mark.parametrize("n", [1, 2])
 def test_the_smallest_graphs_are_solved(n):
     edges = np.array([[1, 0]])[: n - 1]
@@ -419,6 +439,20 @@ def test_the_automatic_order_is_the_one_of_least_work(monkeypatch):
     tried = [ordering.best_order(graph, m).flops for m in ("dissection", "minimum-degree")]
     assert best.flops == min(tried)
     assert tried[0] != tried[1]
+
+
+@pytest.mark.parametrize(("name", "asked"), [("seq", True), ("comm", False)])
+def test_beside_metis_minimum_degree_is_tried_only_where_it_can_win(name, asked, monkeypatch):
+    pytest.importorskip("pymetis", reason="pymetis (extra `fast`) is not installed")
+    n, edges, _ = family(name)
+    graph, calls = adjacency(n, edges), []
+    monkeypatch.setattr(
+        ordering, "minimum_degree_order", lambda g: calls.append(g) or np.arange(g.num_nodes)[::-1]
+    )
+    metis = elimination_tree(graph, ordering.metis_order(graph)).flops
+    assert (metis < ordering._BAND_FLOPS * len(edges)) == asked
+    ordering.best_order(graph)
+    assert bool(calls) == asked
 
 
 def test_metis_gives_a_good_order_where_it_is_installed():
