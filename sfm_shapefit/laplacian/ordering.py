@@ -30,18 +30,11 @@ from sfm_shapefit.laplacian.symbolic import EliminationTree, elimination_tree
 Ordering = Literal["auto", "metis", "dissection", "minimum-degree"]
 
 _MINIMUM_DEGREE_LIMIT = 400_000  # edges; above, minimum degree takes longer than it can save
-_BAND_FLOPS = (
-    600  # operations per edge of METIS's order; above, the graph is no band, and on no family, box or
-)
-# community did minimum degree find a better one
-_EXPANDER_FLOPS = (
-    100_000  # the same for our dissection; above, the graph is an expander, on which minimum degree
-)
-# takes many seconds to find as much fill
-_METIS_REFINEMENTS = (
-    1  # per level; METIS's own 10 take half as long again for 2 % fewer operations at 1e5 boxes,
-)
-# 5 % at 1e4, and 13 % more at communities of 1e5
+# Operations per edge: of METIS's order, above which the graph is no band, and minimum degree found a better
+# order on no box or community; of our dissection, above which the graph is an expander, and minimum degree
+# takes many seconds.
+_BAND_FLOPS, _EXPANDER_FLOPS = 600, 100_000
+_METIS_REFINEMENTS = 1  # per level; its own 10 take half as long again and save at most 5 % of the operations
 _LEAF = 48  # nodes; smaller parts are not cut further
 _SMOOTHING = 6  # averaging sweeps over the integer graph distances, to make cuts straight
 _PASSES = 6  # refinement passes over a separator

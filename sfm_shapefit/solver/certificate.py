@@ -54,9 +54,7 @@ from sfm_shapefit.solver.admm.linear import IterativeSolver, LaplacianFactor, la
 from sfm_shapefit.solver.program import along, differences, objective
 from sfm_shapefit.viewgraph import ViewGraph
 
-_ROUNDS = (
-    8  # of clipping; three do mostly, on loosely joined communities the sixth still gained half of the gap
-)
+_ROUNDS = 8  # of clipping; three do mostly, but on loose communities the sixth still gained half of the gap
 _ROUND_REDUCTION = 0.1  # of the equality residual per round; exact solves would gain no round
 _NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap, or than this one
 _NEGLIGIBLE_MISSED = 0.3  # where the gap misses what was asked for in any case
