@@ -20,6 +20,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
+from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.admm.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.admm.engine import Iteration, Settings, Stop
 from sfm_shapefit.solver.admm.linear import LaplacianFactor, laplacian_factor
@@ -52,6 +53,7 @@ class LudResult:
     """Why the iteration ended."""
 
 
+@one_blas_thread()  # more would split, and round, the sums of long vectors differently
 def solve_lud(
     graph: ViewGraph,
     max_iterations: int = 50,
