@@ -122,6 +122,10 @@ from sfm_shapefit.viewgraph import ViewGraph
 drawn = random_graph_problem(40, 0.5, d=3, sigma=0.1, q=0.3, seed=1)
 graph = ViewGraph(40, drawn.edges, drawn.directions)
 caught = 0
+
+def origin(error):
+    return error if error.__cause__ is None else origin(error.__cause__)
+
 for solve in (solve_newton_dense, solve_newton_sparse):
     solve(graph, 1e-8, 50)
     for delay in np.linspace(2e-4, 2e-2, 60):
@@ -131,7 +135,7 @@ for solve in (solve_newton_dense, solve_newton_sparse):
             for _ in range(100):
                 solve(graph, 1e-8, 50)
         except (KeyboardInterrupt, SystemError) as error:  # numba makes arrays by some Python code, too
-            if isinstance(error, SystemError) and not isinstance(error.__cause__, KeyboardInterrupt):
+            if not isinstance(origin(error), KeyboardInterrupt):
                 raise
             caught += 1
 print(caught)

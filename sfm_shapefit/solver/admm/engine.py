@@ -45,7 +45,7 @@ _ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise wou
 _ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
 _ASTRAY = 10.0  # times the first objective: acceleration with more history than a tiny problem has dimensions
 _LEAST_OBJECTIVE = 1e-6  # what a first objective counts as at least: of exact data it is rounding
-_STEPS_LEFT = 10.0  # that the fixed point is away at least, in steps of the present length, for `_error`
+_STEPS_LEFT = 10.0  # that the fixed point is away at least, in steps of the present length
 _MOST_STEPS_LEFT = 1000.0
 _CONTRACTION_WINDOW = 10  # iterations over which the shrinking of the steps is measured
 _STALL_WINDOW = 150
@@ -157,11 +157,12 @@ class Iteration:
             if self._is_astray(state, k):
                 state, best, best_at = self._begin_again(), np.inf, k
                 continue
-            error = self._error(state)
-            if error <= max(settings.tol * self.objective(state), settings.absolute_tol):
+            residual = self._residual(state)
+            allowed = max(settings.tol * self.objective(state), settings.absolute_tol)
+            if max(residual, self._error(state)) <= allowed:
                 return Outcome(state=state, iterations=k, stop=Stop.ACCURATE)
-            if error < 0.5 * best:
-                best, best_at = error, k
+            if residual < 0.5 * best:
+                best, best_at = residual, k
             elif k - best_at > max(_STALL_WINDOW, k // 2):
                 return Outcome(state=state, iterations=k, stop=Stop.STALLED)
             if before is not None:
@@ -243,15 +244,19 @@ class Iteration:
         state.x, state.spare = anderson.advance(state.x, target, state.rho), state.x
         state.pull = self.passes.pull(state.x, state.t, state.rho)
 
+    def _residual(self, state: State) -> float:
+        """Return how far the iterate is from a fixed point: the gap to its dual value, or ten steps."""
+        objective, pairing, along, change = state.sums[:4]
+        dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
+        return float(max(abs(objective - dual_value), _STEPS_LEFT * change)) / self.kappa
+
     def _error(self, state: State) -> float:
         """Return the estimate of the error of the objective, in its own units.
 
         By Cauchy and Schwarz it is at most the step times the distance to the fixed point, both in the norm
         in which the iteration contracts.
         """
-        objective, pairing, along, change = state.sums[:4]
-        dual_value = pairing - (along if self.passes.data.least > -np.inf else 0.0)
-        return float(max(abs(objective - dual_value), state.steps_left * change)) / self.kappa
+        return state.steps_left * float(state.sums[CHANGE]) / self.kappa
 
     def _floor(self, renewal: int, anderson: Anderson | None) -> float:
         """Return the least residual that penalties take seriously, relative to the mean residual."""
