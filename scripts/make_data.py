@@ -10,8 +10,6 @@ import sqlite3
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from sfm_shapefit.colmap.photographs import write_rendered_workspace
-from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.formats import graph_text
 from sfm_shapefit.synthetic import (
     RenderOptions,
@@ -21,6 +19,8 @@ from sfm_shapefit.synthetic import (
     make_scene,
     random_graph_problem,
 )
+from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
 
 

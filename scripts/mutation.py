@@ -58,8 +58,8 @@ GROUPS = {
         f"solver/admm/{name}.py" for name in ("anderson", "edges", "engine", "linear", "lud", "shapefit")
     ],
     "program": ["solver/program.py", "solver/options.py"],
-    "solve": ["solver/solve.py", "solver/hybrid.py"],
-    "angular": ["solver/angular.py"],
+    "solve": ["solver/solve.py", "solver/splitting/split_then_newton.py"],
+    "angular": ["refinement/angular.py"],
     "bodies": [f"solver/bodies/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")],
 }
 TESTS = {

@@ -16,28 +16,32 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sfm_shapefit.conversion import convert
+    from sfm_shapefit.commands.convert import convert
+    from sfm_shapefit.commands.evaluate import evaluate
+    from sfm_shapefit.commands.inspect import inspect
+    from sfm_shapefit.commands.locate import locate
+    from sfm_shapefit.commands.map import map_database
+    from sfm_shapefit.commands.write import write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
-    from sfm_shapefit.mapping.options import MapOptions
-    from sfm_shapefit.mapping.results import MapResult, write_map_result
-    from sfm_shapefit.mapping.run import map_database
-    from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline import evaluate, inspect, locate
-    from sfm_shapefit.results import LocateResult, write_result
+    from sfm_shapefit.options import LocateOptions, MapOptions
+    from sfm_shapefit.results import LocateResult
+    from sfm_shapefit.results.map_result import MapResult
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
     from sfm_shapefit.viewgraph import ViewGraph
 
 _HOMES = {
-    "conversion": ("convert",),
+    "commands.convert": ("convert",),
+    "commands.evaluate": ("evaluate",),
+    "commands.inspect": ("inspect",),
+    "commands.locate": ("locate",),
+    "commands.map": ("map_database",),
+    "commands.write": ("write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "mapping.options": ("MapOptions",),
-    "mapping.results": ("MapResult", "write_map_result"),
-    "mapping.run": ("map_database",),
-    "options": ("LocateOptions",),
-    "pipeline": ("evaluate", "inspect", "locate"),
-    "results": ("LocateResult", "write_result"),
+    "options": ("LocateOptions", "MapOptions"),
+    "results": ("LocateResult",),
+    "results.map_result": ("MapResult",),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),

@@ -7,17 +7,21 @@ import os
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal, get_args, get_type_hints
 
-from sfm_shapefit.robust.options import Filter, Objective
+from sfm_shapefit.placement.gauge import Scale
+from sfm_shapefit.refinement.options import Filter, Objective
 from sfm_shapefit.solver.options import Method
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.structure import StructureOptions
     from sfm_shapefit.directions import DirectionOptions
-    from sfm_shapefit.robust.options import PlacementOptions
+    from sfm_shapefit.refinement.options import PlacementOptions
 
 Points = Literal["auto", "never", "always"]
-Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
+Relative = Literal["matches", "stored"]
+
+LEAST_MATCHES = 15
+"""Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
 
 FIX_SOLVED = "solved"
 """In place of a file of names: fix every image that observes a 3D point of the input."""
@@ -168,7 +172,7 @@ class LocateOptions:
 
     def for_placement(self) -> "PlacementOptions":
         """Return the share of the solver and of what follows it."""
-        from sfm_shapefit.robust.options import PlacementOptions
+        from sfm_shapefit.refinement.options import PlacementOptions
 
         return PlacementOptions(
             method=self.solver,
@@ -202,3 +206,31 @@ class LocateOptions:
     def num_threads(self) -> int:
         """Return the number of threads to use."""
         return self.threads or min(os.cpu_count() or 1, MAX_THREADS)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapOptions(LocateOptions):
+    """Settings of `map`."""
+
+    refine_rotations: bool = True
+    """Refine the averaged rotations on the matches before cameras are placed, camera by camera where there
+    is evidence. With bundle_adjust a draft is adjusted instead, and its rotations are taken."""
+    relative: Relative = "matches"
+    """Relative rotations to be averaged: estimated from each pair's inlier matches, or those the database
+    stores, which is faster but less exact and keeps more false pairs."""
+    min_matches: int = 0
+    """Pairs with fewer inlier matches are left out of the averaging. 0 tries 15, 20, 30, 50 and 80 and keeps
+    the rotations that the matches agree with most."""
+    min_model_size: int = 3
+    """Components with fewer images make no model."""
+
+    def __post_init__(self) -> None:
+        LocateOptions.__post_init__(self)
+        if self.relative not in get_args(Relative):
+            raise ValueError(f"relative must be one of matches, stored, got {self.relative!r}")
+        if self.directions == "tracks":
+            raise ValueError("a database has no tracks; directions must be auto, matches or relative-poses")
+        if self.min_matches and self.min_matches < LEAST_MATCHES:
+            raise ValueError(f"min_matches must be 0 or at least {LEAST_MATCHES}, got {self.min_matches}")
+        if self.min_model_size < 3:
+            raise ValueError(f"min_model_size must be at least 3, got {self.min_model_size}")

@@ -6,7 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_shapefit.solver.admm import (
+from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
+from sfm_shapefit.solver.splitting import (
     IterativeSolver,
     Stop,
     engine,
@@ -15,14 +18,19 @@ from sfm_shapefit.solver.admm import (
     solve_admm,
     solve_lud,
 )
-from sfm_shapefit.solver.admm.anderson import Anderson
-from sfm_shapefit.solver.admm.edges import ALONG, CHANGE, INTERIOR, OBJECTIVE, PAIRING, EdgePasses, edge_data
-from sfm_shapefit.solver.admm.engine import Iteration
-from sfm_shapefit.solver.admm.linear import predict_factor
-from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.hybrid import solve_hybrid
-from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
+from sfm_shapefit.solver.splitting.anderson import Anderson
+from sfm_shapefit.solver.splitting.edges import (
+    ALONG,
+    CHANGE,
+    INTERIOR,
+    OBJECTIVE,
+    PAIRING,
+    EdgePasses,
+    edge_data,
+)
+from sfm_shapefit.solver.splitting.engine import Iteration
+from sfm_shapefit.solver.splitting.linear import predict_factor
+from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
 from sfm_shapefit.synthetic import (
     box_graph_problem,
     community_graph_problem,
@@ -129,7 +137,7 @@ def test_acceleration_saves_more_than_half_of_the_iterations_without_noise(monke
     edges, t = geo(400, 40, 3)
     graph = view_graph(edges, t, sigma=0.0, q=0.2, seed=3)
     accelerated = solve_admm(graph, 1e-8, 2000).iterations
-    monkeypatch.setattr("sfm_shapefit.solver.admm.engine._ANDERSON_INTERIOR", 2.0)
+    monkeypatch.setattr("sfm_shapefit.solver.splitting.engine._ANDERSON_INTERIOR", 2.0)
     assert accelerated < 0.5 * solve_admm(graph, 1e-8, 2000).iterations
 
 

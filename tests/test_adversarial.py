@@ -11,9 +11,9 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, UnsolvableError
-from sfm_shapefit.diagnosis import diagnose
 from sfm_shapefit.geometry import fit_similarity_l1, normalized
-from sfm_shapefit.placement import Placement, place, place_further
+from sfm_shapefit.placement.diagnosis import diagnose
+from sfm_shapefit.placement.place import Placement, place, place_further
 from sfm_shapefit.results import camera_rows, graph_warnings, quality_warnings
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import differences

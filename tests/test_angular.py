@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import median_spread, normalized, tangent_bases
-from sfm_shapefit.solver import angular
-from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles, residual_levels, robust_cost
-from sfm_shapefit.solver.iterative import IterativeNormal
+from sfm_shapefit.refinement import angular
+from sfm_shapefit.refinement.angular import (
+    Metric,
+    plan_refinement,
+    refine_angles,
+    residual_levels,
+    robust_cost,
+)
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import (

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.colmap.averaging import average_rotations
+from sfm_shapefit.colmap.rotation_averaging import average_rotations
 from sfm_shapefit.errors import InputError
 
 

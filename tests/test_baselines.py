@@ -5,7 +5,7 @@ import pytest
 
 from sfm_shapefit import baselines
 from sfm_shapefit.baselines.onedsfm import onedsfm_scores
-from sfm_shapefit.baselines.triangles import triangle_scores
+from sfm_shapefit.directions.triangles import triangle_scores
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve

@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.bodies import Bodies, separate
-from sfm_shapefit.body_placement import place_bodies
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.solver.admm import solve_lud
-from sfm_shapefit.solver.bodies import certify_bodies, largest_tied, lud_over_bodies, solve_bodies
-from sfm_shapefit.solver.bodies import newton as bodies_newton
-from sfm_shapefit.solver.bodies.reduced import ReducedFactor, factor_pinned
+from sfm_shapefit.placement.rigs import place_bodies
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
+from sfm_shapefit.solver.rigs import certify_bodies, largest_tied, lud_over_bodies, solve_bodies
+from sfm_shapefit.solver.rigs import newton as bodies_newton
+from sfm_shapefit.solver.rigs.groups import Bodies, separate
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor, factor_pinned
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.splitting import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
 

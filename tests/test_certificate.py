@@ -10,14 +10,15 @@ from graph_families import FAMILIES
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.solver import certificate, hybrid
-from sfm_shapefit.solver.admm import Stop, solve_admm
-from sfm_shapefit.solver.admm.linear import IterativeSolver, laplacian_factor
+from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.hybrid import Finish, HybridResult, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
+from sfm_shapefit.solver.splitting import Stop, solve_admm
+from sfm_shapefit.solver.splitting import split_then_newton as hybrid
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
+from sfm_shapefit.solver.splitting.split_then_newton import Finish, HybridResult, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 
 

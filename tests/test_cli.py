@@ -17,7 +17,7 @@ import pytest
 from typer.testing import CliRunner
 
 import sfm_shapefit
-from sfm_shapefit import output
+from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.cli import app
 from sfm_shapefit.options import LocateOptions
 from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
@@ -251,7 +251,7 @@ def test_an_unwritable_place_is_refused_before_any_work(tmp_path):
 
 
 def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    from sfm_shapefit.results import files
+    from sfm_shapefit.commands import write as files
 
     def interrupted(*_arguments):
         raise KeyboardInterrupt
@@ -377,7 +377,7 @@ def test_a_signal_while_writing_leaves_nothing(tmp_path, number):
     script = f"""
 import os, sys
 from sfm_shapefit import cli
-from sfm_shapefit.results import files
+from sfm_shapefit.commands import write as files
 files.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()

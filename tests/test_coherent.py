@@ -8,7 +8,7 @@ import pytest
 
 from sfm_shapefit import ViewGraph
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.placement import place
+from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import box_graph_problem, community_graph_problem, random_graph_problem

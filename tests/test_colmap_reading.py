@@ -16,9 +16,9 @@ import pytest
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
 from sfm_shapefit.colmap.model import read_model, track_matches, world_rays
+from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.pipeline import evaluate
 
 EPS = np.finfo(np.float64).eps
 SHARED = Path(__file__).parents[1].parent / "shared" / "data"

@@ -14,9 +14,10 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit import LocateOptions, locate, output
+from sfm_shapefit import LocateOptions, locate
+from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.atomic_folder import atomic_folder, check_output
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
-from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import pycolmap_heard, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
@@ -27,9 +28,9 @@ from sfm_shapefit.colmap.structure import (
     filtered,
     triangulate,
 )
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
-from sfm_shapefit.output import atomic_folder, check_output
 
 SHARED_DATA = Path(__file__).parents[1].parent / "shared" / "data"
 NUM_IMAGES = 8

@@ -9,11 +9,11 @@ from typer.testing import CliRunner
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
 from sfm_shapefit.cli import app
-from sfm_shapefit.diagnosis import diagnose, direction_spread, theory_of
 from sfm_shapefit.formats import graph_text
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement import place
-from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.placement.diagnosis import diagnose, direction_spread, theory_of
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import (
     box_graph_problem,
@@ -161,7 +161,7 @@ def test_theory_is_given_in_words_or_left_out_with_the_reason():
     assert found.conditions.granted_in_space > 0.0
     assert "coincide" in theory_of(graph, np.zeros((12, 3))).statement
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("sfm_shapefit.diagnosis.MAX_THEORY_CAMERAS", 11)
+        patch.setattr("sfm_shapefit.placement.diagnosis.MAX_THEORY_CAMERAS", 11)
         assert theory_of(graph, problem.locations).conditions is None
     chain = exact(problem.locations, [(k, k + 1) for k in range(11)])
     assert "p-typical for no p" in theory_of(chain, problem.locations).statement

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.directions import (
     DirectionOptions,
     DirectionStatus,
@@ -14,7 +15,6 @@ from sfm_shapefit.directions import (
     from_relative_poses,
 )
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
-from sfm_shapefit.pipeline import locate
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.scenes import COURTYARD

@@ -12,17 +12,17 @@ import pytest
 
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras, read_model
-from sfm_shapefit.colmap.workspace import write_workspace
-from sfm_shapefit.directions import DirectionOptions, concatenate
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.pipeline.execution import (
+from sfm_shapefit.commands.stages.execution import (
     DirectionTask,
     WorkerError,
     measure_task,
     open_executor,
     shared_out,
 )
+from sfm_shapefit.directions import DirectionOptions, concatenate
+from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def _die(_task):
 
 @pytest.mark.slow
 def test_a_worker_that_dies_in_a_pool_is_reported(workspace, model, monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", _die)
+    monkeypatch.setattr("sfm_shapefit.commands.stages.execution.measure_task", _die)
     with (
         ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool,
         pytest.raises(WorkerError, match=r"a worker failed .* run again"),
@@ -120,7 +120,7 @@ def test_an_error_of_the_input_passes_as_it_is(workspace, model, monkeypatch):
     def refuse(_task):
         raise InputError("the database is damaged")
 
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", refuse)
+    monkeypatch.setattr("sfm_shapefit.commands.stages.execution.measure_task", refuse)
     with ThreadPoolExecutor(1) as pool, pytest.raises(InputError, match="the database is damaged"):
         shared(workspace, model, pool)
 
@@ -139,7 +139,7 @@ def _die_once(flag, task):
 def test_dask_gives_the_work_of_a_killed_worker_to_another(workspace, model, monkeypatch, tmp_path):
     pytest.importorskip("distributed")
     flag = tmp_path / "killed"
-    monkeypatch.setattr("sfm_shapefit.pipeline.execution.measure_task", partial(_die_once, str(flag)))
+    monkeypatch.setattr("sfm_shapefit.commands.stages.execution.measure_task", partial(_die_once, str(flag)))
     with open_executor("dask", 2) as pool:
         found, _ = shared(workspace, model, pool)
     assert flag.exists()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement import place
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement import angular
+from sfm_shapefit.refinement import starts as finishing
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, finish
 from sfm_shapefit.results import quality_warnings
-from sfm_shapefit.robust import finish as finishing
-from sfm_shapefit.robust.finish import COLLAPSED, Start, disagreement, finish
-from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.solver import angular
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import (

@@ -14,10 +14,10 @@ from sfm_shapefit import InputError, LocateOptions, locate
 from sfm_shapefit.cli import app
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.priors import database_priors, table_priors
-from sfm_shapefit.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.solver.anchored import Anchors, refine_anchored
-from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
+from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.viewgraph import ViewGraph
 
 RING_MODEL = RING / "sparse" / "0"

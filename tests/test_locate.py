@@ -10,7 +10,8 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.check import check_model_files
-from sfm_shapefit.results import summary, write_result
+from sfm_shapefit.commands.write import write_result
+from sfm_shapefit.results import summary
 from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
 
 
@@ -98,8 +99,8 @@ def test_points_keep_the_inputs_colours():
 
 
 def test_relative_poses_serve_when_asked_for(tmp_path):
-    from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
     scene = make_scene(SceneOptions(shape="ring", num_images=8, num_points=1500, seed=3))
     write_workspace(scene, tmp_path / "ring", WorkspaceOptions(relative_poses=True))

@@ -12,12 +12,12 @@ from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit.cli import app
+from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.relative import RelativeRotations, relative_rotations
-from sfm_shapefit.colmap.unposed import read_images
+from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
+from sfm_shapefit.commands.stages.averaging import averaged
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
-from sfm_shapefit.mapping.averaging import averaged
 
 PAIR = 2147483647
 FAST = {"points": "never", "refine_rotations": False}

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.directions import DirectionOptions, DirectionStatus, estimate_directions
 from sfm_shapefit.results import match_warnings
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.scenes import project_points
+from sfm_shapefit.synthetic.workspace import write_workspace
 
 NO_DIRECTION = DirectionOptions(min_inliers=200)
 PERIOD = np.array([2.0, 0.0, 0.0])  # along the wall, in metres

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from sfm_shapefit.visual.mesh import PAIR_COLORS, trust_colors, write_meshes
-from sfm_shapefit.visual.scene import PairClass
+from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors, write_meshes
 from tests.made_scenes import made_scene
 
 

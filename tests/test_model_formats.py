@@ -21,8 +21,8 @@ from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit.cli import app
-from sfm_shapefit.colmap.foreign import reconstruction_of, relative_poses_of, scene_of
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.other_programs import reconstruction_of, relative_poses_of, scene_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_relative_poses, relative_poses_text
 from sfm_shapefit.formats.models import read_scene
@@ -390,8 +390,8 @@ def relative_poses_of_ring():
 
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
+    from sfm_shapefit.commands.place import solve_graph_file
     from sfm_shapefit.formats import EpipolarGeometries
-    from sfm_shapefit.pipeline import solve_graph_file
 
     model, pairs, rotations, units = relative_poses_of_ring()
     poses = EpipolarGeometries(names=model.names, pairs=pairs, rotations=rotations, to_second=units)

@@ -9,7 +9,7 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
-from sfm_shapefit.solver.newton.approach import approach
+from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import (
     across,

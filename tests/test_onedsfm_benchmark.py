@@ -10,7 +10,7 @@ sys.path.insert(0, str(ROOT / "scripts"))
 import benchmark
 from benchmarks import onedsfm
 
-from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.refinement.options import PlacementOptions
 
 
 def test_without_the_scene_the_benchmark_says_so_and_writes_nothing(tmp_path, capsys):

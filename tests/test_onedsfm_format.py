@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.commands.place import solve_graph_file
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import (
     g2o_text,
@@ -16,7 +17,6 @@ from sfm_shapefit.formats import (
     read_rotations,
 )
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.pipeline import solve_graph_file
 from tests.scenes import real_scene
 
 IDENTITY = "1 0 0 0 1 0 0 0 1"

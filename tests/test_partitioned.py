@@ -6,16 +6,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit import partitioned
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian import partition as partitioning
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.partition import partition
-from sfm_shapefit.partitioned import PieceSolution, choose_pieces, merge, place_partitioned, solve_piece
-from sfm_shapefit.placement import place
-from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.solver.angular import Metric, plan_refinement, refine_angles
-from sfm_shapefit.solver.iterative import IterativeNormal
+from sfm_shapefit.placement import partitioned
+from sfm_shapefit.placement.partitioned import (
+    PieceSolution,
+    choose_pieces,
+    merge,
+    place_partitioned,
+    solve_piece,
+)
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.solver.options import Status
 from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph

@@ -7,7 +7,7 @@ import pytest
 
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement import place, place_further
+from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sfm_shapefit import output
+from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.atomic_folder import atomic_folder, claimed_output
 from sfm_shapefit.cli import console
+from sfm_shapefit.commands.place import solve_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.output import atomic_folder, claimed_output
-from sfm_shapefit.pipeline import solve_graph_file
 from tests.scenes import COURTYARD, FACADE, RING, ROOT
 
 SCRIPT = ROOT / "scripts" / "reliability.py"
@@ -115,7 +115,7 @@ def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_p
     with claimed_output(out), atomic_folder(out) as partial:
         (partial / "locate.json").write_text("first")
         script = (
-            "import sys\nfrom sfm_shapefit.output import claimed_output\n"
+            "import sys\nfrom sfm_shapefit.atomic_folder import claimed_output\n"
             f"with claimed_output({str(out)!r}): pass"
         )
         second = subprocess.run(
@@ -129,7 +129,7 @@ def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_p
 def test_what_a_killed_run_left_is_removed_by_the_next_into_any_place_beside_it(tmp_path):
     script = f"""
 import os, signal
-from sfm_shapefit.output import atomic_folder
+from sfm_shapefit.atomic_folder import atomic_folder
 with atomic_folder({str(tmp_path / "a")!r}) as partial:
     (partial / "file").write_text("x")
     os.kill(os.getpid(), signal.SIGKILL)

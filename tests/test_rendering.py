@@ -10,9 +10,8 @@ from typer.testing import CliRunner
 
 from sfm_shapefit import evaluate, locate
 from sfm_shapefit.cli import app
-from sfm_shapefit.colmap.photographs import judge_matches, write_rendered_workspace
+from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.mapping.run import map_database
 from sfm_shapefit.synthetic import (
     RenderedScene,
     RenderOptions,
@@ -24,6 +23,7 @@ from sfm_shapefit.synthetic import (
     project_distorted,
     surface_points,
 )
+from sfm_shapefit.synthetic.photographs import judge_matches, write_rendered_workspace
 from sfm_shapefit.synthetic.surfaces import Surfaces
 from tests.scenes import BUNDLED
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from sfm_shapefit.report import CameraRow, PairRow, dumps, write_json, write_rows
+from sfm_shapefit.results.tables import CameraRow, PairRow, dumps, write_json, write_rows
 from tests.scenes import RING, ROOT
 
 SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]

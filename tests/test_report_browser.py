@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.visual.report_page import write_report
+from sfm_shapefit.report.page import write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
 from tests.made_scenes import made_scene
 from tests.test_report_page import HOSTILE

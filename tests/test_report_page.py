@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sfm_shapefit.visual.charts import residual_histogram, view_graph_matrix
-from sfm_shapefit.visual.report_page import MAX_PAIRS, page_data, report_html
-from sfm_shapefit.visual.scene import PairClass, frustum_corners, view_axes
-from sfm_shapefit.visual.words import first_looks, shortened, summary_sentences
+from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
+from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
+from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
+from sfm_shapefit.report.sentences import first_looks, shortened, summary_sentences
 from tests.made_scenes import made_scene
 
 HOSTILE = [

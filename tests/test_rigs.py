@@ -10,10 +10,11 @@ import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
-from sfm_shapefit.colmap.workspace import write_workspace
+from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.results import summary, write_result
+from sfm_shapefit.results import summary
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import RING, copied
 
 

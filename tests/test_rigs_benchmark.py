@@ -6,8 +6,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import ROOT
 
 sys.path.insert(0, str(ROOT / "scripts"))  # as `python scripts/benchmark.py` does

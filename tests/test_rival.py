@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.placement import place
+from sfm_shapefit.judgement.second_configuration import find_rival
+from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import quality_warnings
-from sfm_shapefit.robust.rival import find_rival
 from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 

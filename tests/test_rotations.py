@@ -8,12 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from sfm_shapefit import LocateOptions, epipolar
+from sfm_shapefit import LocateOptions
 from sfm_shapefit.colmap.model import read_model, with_turned_cameras
-from sfm_shapefit.epipolar import RayMatches, State, at_state
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.results import summary
-from sfm_shapefit.rotations import refine_rotations
+from sfm_shapefit.rotations import joint_refinement as epipolar
+from sfm_shapefit.rotations.acceptance import refine_rotations
+from sfm_shapefit.rotations.joint_refinement import RayMatches, State, at_state
 from tests.scenes import COURTYARD, RING, ROOT, real_scene
 
 PIXEL = 1e-3  # angle of a pixel in radians

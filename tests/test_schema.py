@@ -63,7 +63,7 @@ def test_a_graph_solved_in_pieces_keeps_to_the_schema_and_says_so(tmp_path, monk
         tmp_path / "graph.txt", np.column_stack([box.edges, box.directions]), "%d %d %.17g %.17g %.17g"
     )
     monkeypatch.setattr(
-        "sfm_shapefit.pipeline.execution.open_executor", lambda *_: ThreadPoolExecutor(1)
+        "sfm_shapefit.commands.stages.execution.open_executor", lambda *_: ThreadPoolExecutor(1)
     )  # processes take seconds to start
     arguments = ("solve", tmp_path / "graph.txt", tmp_path / "out", "--no-report", "--json")
     facts = printed(*arguments, "--executor", "processes", "--factor-memory", 1)

@@ -76,7 +76,7 @@ def refuse(event, arguments):
         print(event, arguments, file=sys.stderr)
         sys.stderr.flush()
         raise SystemExit(99)
-import sfm_shapefit.pipeline
+import sfm_shapefit.commands
 sys.addaudithook(refuse)
 from sfm_shapefit.cli import main
 sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]

@@ -12,8 +12,8 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.placement import place
-from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.scenes import BUNDLED, real_scene

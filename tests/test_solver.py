@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.solver.certificate import certify
-from sfm_shapefit.solver.hybrid import Finish
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     across,
@@ -23,6 +22,7 @@ from sfm_shapefit.solver.program import (
     scale_functional,
 )
 from sfm_shapefit.solver.solve import solve
+from sfm_shapefit.solver.splitting.split_then_newton import Finish
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 

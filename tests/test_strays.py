@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import median_spread, normalized
-from sfm_shapefit.placement import place
-from sfm_shapefit.robust.finish import finish
-from sfm_shapefit.robust.options import PlacementOptions
-from sfm_shapefit.robust.strays import left_scene, openness, put_back, strays
-from sfm_shapefit.solver.angular import KERNEL_WIDTH
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.angular import KERNEL_WIDTH
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.resets import left_scene, openness, put_back, strays
+from sfm_shapefit.refinement.starts import finish
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import random_graph_problem

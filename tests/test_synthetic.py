@@ -13,7 +13,6 @@ import numpy as np
 import pycolmap
 import pytest
 
-from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import (
@@ -33,6 +32,7 @@ from sfm_shapefit.synthetic import (
     street_problem,
     trajectory_graph_problem,
 )
+from sfm_shapefit.synthetic.workspace import write_workspace
 
 ROOT = Path(__file__).parents[1]
 SHAPES = ("ring", "facade", "drive", "cloud", "courtyard")

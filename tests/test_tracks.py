@@ -5,12 +5,12 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.directions import estimate_directions
+from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.tracks import Tracks, build_tracks, covering_set, join_points
 from sfm_shapefit.evaluation import evaluate_poses
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement import place
-from sfm_shapefit.tracks import Tracks, build_tracks, covering_set, join_points
+from sfm_shapefit.placement.place import place
 
 PIXEL = 1e-3  # rad
 NUM_POINTS = 60

@@ -5,10 +5,10 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.judgement.conditioning import condition
+from sfm_shapefit.judgement.trust import Evidence, judge_cameras, main_body
+from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.robust.conditioning import condition
-from sfm_shapefit.robust.trust import Evidence, judge_cameras, main_body
-from sfm_shapefit.robust.verdicts import assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.scenes import COURTYARD, real_scene

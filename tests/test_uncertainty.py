@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
+from sfm_shapefit.judgement.correlated_errors import sample_direction_errors
+from sfm_shapefit.judgement.uncertainty import propagate
 from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
-from sfm_shapefit.robust.shared_noise import sample_direction_errors
-from sfm_shapefit.robust.uncertainty import propagate
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import SceneOptions, box_graph_problem, make_scene
 

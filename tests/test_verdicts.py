@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
-from sfm_shapefit.robust.conditioning import Looseness
-from sfm_shapefit.robust.trust import Evidence
-from sfm_shapefit.robust.verdicts import Verdict, assess
+from sfm_shapefit.judgement.conditioning import Looseness
+from sfm_shapefit.judgement.trust import Evidence
+from sfm_shapefit.judgement.verdicts import Verdict, assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 

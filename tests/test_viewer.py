@@ -14,9 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
-from sfm_shapefit.visual.scene import PairClass
-from sfm_shapefit.visual.sources import read_output
-from sfm_shapefit.visual.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
+from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.read_back import read_output
+from sfm_shapefit.report.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
 from tests.made_scenes import made_scene
 from tests.scenes import BUNDLED, FACADE, ROOT
 

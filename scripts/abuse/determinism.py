@@ -121,9 +121,9 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
 
 def reordered_difference(scene: Path, work: Path, seed: int) -> float:
     """Return by how much of the extent positions move when everything is listed in another order."""
+    from sfm_shapefit.commands.locate import locate
+    from sfm_shapefit.commands.write import write_result
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline import locate
-    from sfm_shapefit.results import write_result
 
     copy = reordered(scene, work / f"order{seed}", np.random.default_rng(seed))
     tables = []

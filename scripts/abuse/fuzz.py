@@ -120,8 +120,8 @@ def make_base(folder: Path) -> Path:
     """Write a small sound scene in every form that is read, of COLMAP and of others."""
     import pycolmap
 
-    from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
     options = SceneOptions(shape="cloud", num_images=6, num_points=60, pixel_noise_px=0.2, min_matches=15)
     shutil.rmtree(folder, ignore_errors=True)

@@ -31,9 +31,9 @@ def run(args: argparse.Namespace) -> int:
 
 def soak(base: Path, calls: int, *, show: bool = False) -> list[str]:
     """Locate the scene in `base` so many times, from matches and from tracks in turn; return what changed."""
+    from sfm_shapefit.commands.locate import locate
+    from sfm_shapefit.commands.write import write_result
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline import locate
-    from sfm_shapefit.results import write_result
 
     sources = ((base / "sparse" / "0", base / "database.db"), (base / "old", None))
     answers: dict[int, bytes] = {}

@@ -21,7 +21,7 @@ from benchmarks.record import environment, legend, table, write_section
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.placement import Placement
+    from sfm_shapefit.placement.place import Placement
     from sfm_shapefit.viewgraph import ViewGraph
 
 HELP = "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit."
@@ -115,10 +115,10 @@ def measure(spec: GraphSpec, q: float, seed: int) -> Trial:
     """Draw a graph with a share q of self-consistent wrong pairs and solve it by all methods."""
     import numpy as np
 
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
     from sfm_shapefit.results import quality_warnings
-    from sfm_shapefit.solver.admm import solve_lud
     from sfm_shapefit.solver.solve import solve
+    from sfm_shapefit.solver.splitting import solve_lud
 
     problem = draw(spec, q=q, seed=seed, corruption="self-consistent")
     truth, false = problem.locations, problem.false_locations

@@ -238,7 +238,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     import numpy as np
 
     from sfm_shapefit.geometry import fit_similarity
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
 
     one = drawn(problem, seed, data)
     start = time.perf_counter()

@@ -129,8 +129,8 @@ def _prepare_shapefit(graph: "ViewGraph") -> Solver:
 
 
 def _prepare_placed(graph: "ViewGraph") -> Solver:
-    from sfm_shapefit.placement import place
-    from sfm_shapefit.robust.options import PlacementOptions
+    from sfm_shapefit.placement.place import place
+    from sfm_shapefit.refinement.options import PlacementOptions
 
     options = PlacementOptions(tol=_SHAPEFIT_TOL, uniqueness=False)
 

@@ -105,8 +105,8 @@ def _inputs(scene: str, data: Path, folder: Path) -> tuple[Path, Path]:
     """Return database and true model of a scene; the ring is made."""
     if scene != "ring":
         return data / scene / "database.db", data / scene / "gt"
-    from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.synthetic import SceneOptions, make_scene
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
     write_workspace(make_scene(SceneOptions(**RING)), folder / "ring")  # type: ignore[arg-type]
     return folder / "ring" / "database.db", folder / "ring" / "sparse" / "0"

@@ -20,7 +20,7 @@ from benchmarks.metrics import Quantity, number, numbers
 from benchmarks.record import environment, legend, table, write_section
 
 if TYPE_CHECKING:
-    from sfm_shapefit.robust.options import PlacementOptions
+    from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.viewgraph import ViewGraph
 
 HELP = "The published 1DSfM scene Madrid Metropolis: seconds per stage, and residuals of every objective."
@@ -110,8 +110,8 @@ def run(args: argparse.Namespace) -> int:
 
 def measure(source: Path) -> tuple[str, list[Outcome]]:
     """Return what was read and averaged in which time, and what every run gave."""
-    from sfm_shapefit.pipeline import solve_graph_file
-    from sfm_shapefit.robust.options import PlacementOptions
+    from sfm_shapefit.commands.place import solve_graph_file
+    from sfm_shapefit.refinement.options import PlacementOptions
 
     found = solve_graph_file(source, PlacementOptions())  # also loads compiled code
     graph = found.placement.graph
@@ -123,7 +123,7 @@ def measure(source: Path) -> tuple[str, list[Outcome]]:
 def _outcome(name: str, graph: "ViewGraph", options: "PlacementOptions") -> Outcome:
     import numpy as np
 
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
 
     wall, cpu = time.perf_counter(), time.process_time()
     placed = place(graph, options)

@@ -139,10 +139,10 @@ def place_graph(spec: GraphSpec, in_pieces: bool) -> Placed:
     """Place the largest rigid body of a graph; whole with a factor of any size, or in pieces."""
     from sfm_shapefit.laplacian.operators import adjacency
     from sfm_shapefit.laplacian.partition import partition
-    from sfm_shapefit.partitioned import place_partitioned
+    from sfm_shapefit.placement.partitioned import place_partitioned
+    from sfm_shapefit.refinement.options import PlacementOptions
+    from sfm_shapefit.refinement.starts import finish
     from sfm_shapefit.rigidity import rigid_pieces
-    from sfm_shapefit.robust.finish import finish
-    from sfm_shapefit.robust.options import PlacementOptions
     from sfm_shapefit.solver.solve import solve
 
     problem = draw(spec)
@@ -209,11 +209,11 @@ def measure_directions(scene: Path, way: str) -> tuple[float, str]:
     from contextlib import nullcontext
 
     from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.commands.stages.clock import Clock
+    from sfm_shapefit.commands.stages.execution import open_executor
+    from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+    from sfm_shapefit.commands.stages.measure import measure_directions as measured
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline.clock import Clock
-    from sfm_shapefit.pipeline.execution import open_executor
-    from sfm_shapefit.pipeline.measurement import measure_directions as measured
-    from sfm_shapefit.pipeline.sources import choose_inputs, open_source
 
     options = LocateOptions(threads=1)
     model_folder = scene / "sparse" / "0"

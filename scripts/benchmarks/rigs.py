@@ -22,9 +22,9 @@ from benchmarks.record import environment, table, write_section
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.quiet import quiet_stderr
-from sfm_shapefit.colmap.workspace import write_workspace
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.synthetic import RigScene, SceneOptions, WorkspaceOptions, make_rig_drive
+from sfm_shapefit.synthetic.workspace import write_workspace
 
 HELP = "metric scale and errors of a drive of two three-camera rigs, against pycolmap's global mapping"
 RESULTS = Path(__file__).parents[1] / "results.md"

@@ -27,7 +27,7 @@ from benchmarks.record import environment, legend, table, write_section
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
     from sfm_shapefit.colmap.model import PosedModel
-    from sfm_shapefit.placement import Placement
+    from sfm_shapefit.placement.place import Placement
     from sfm_shapefit.synthetic.options import Shape
 
 HELP = "Standard deviations against errors, trust against errors, wrong rotations recognised."
@@ -145,7 +145,7 @@ def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray")
 
 
 def _graph_ratios(graph: Graph) -> "FloatArray":
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
     from sfm_shapefit.viewgraph import ViewGraph
 
     given = ViewGraph(len(graph.locations), graph.edges, graph.directions)
@@ -160,9 +160,9 @@ def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArra
 
 def _scene_ratios(shape: "Shape", seed: int) -> "FloatArray":
     import sfm_shapefit
-    from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.options import LocateOptions
     from sfm_shapefit.synthetic import SceneOptions, make_scene
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
     scene = make_scene(SceneOptions(shape=shape, num_images=25, num_points=1000, seed=seed))
     with tempfile.TemporaryDirectory() as folder:
@@ -197,7 +197,7 @@ def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
 def _ranked(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
     from sfm_shapefit.geometry import fit_similarity_l1
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
     from sfm_shapefit.viewgraph import ViewGraph
 
     placement = place(

@@ -123,9 +123,9 @@ def comparison_of_real(name: str, folder: Path, truth: str) -> Comparison:
 
     from sfm_shapefit.colmap.database import open_database
     from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.commands.stages.execution import directions_of
     from sfm_shapefit.directions import concatenate
     from sfm_shapefit.options import LocateOptions
-    from sfm_shapefit.pipeline.execution import directions_of
 
     model = read_model(folder / "sparse" / "0")
     wanted = LocateOptions().for_directions()
@@ -189,7 +189,7 @@ def _errors(directions: "PairDirections", weights: "FloatArray", centers: "Float
 
     from sfm_shapefit import ViewGraph
     from sfm_shapefit.geometry import fit_similarity_l1
-    from sfm_shapefit.placement import place
+    from sfm_shapefit.placement.place import place
 
     usable = directions.usable()
     graph = ViewGraph(len(centers), directions.pairs[usable], directions.directions[usable], weights)

@@ -7,8 +7,8 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.baselines import locate_least_squares, locate_lud
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.robust.finish import finish
-from sfm_shapefit.robust.options import PlacementOptions
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.starts import finish
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve

@@ -7,7 +7,7 @@ from sfm_shapefit.baselines.least_squares import locate_least_squares
 from sfm_shapefit.baselines.linf import locate_linf
 from sfm_shapefit.baselines.lud import locate_lud
 from sfm_shapefit.baselines.onedsfm import filter_1dsfm
-from sfm_shapefit.baselines.triangles import filter_triangles
+from sfm_shapefit.directions.triangles import filter_triangles
 from sfm_shapefit.viewgraph import ViewGraph
 
 LOCATORS: dict[str, Callable[[ViewGraph], FloatArray]] = {

@@ -7,7 +7,7 @@ Source: Ozyesil and Singer, "Robust camera location estimation by convex program
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.baselines.gauge import unit_gauge
-from sfm_shapefit.solver.admm.lud import solve_lud
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
 _STEPS = 5000  # to the optimum; as a start of a refinement 50 suffice

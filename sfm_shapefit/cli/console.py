@@ -17,7 +17,7 @@ import typer
 from sfm_shapefit.errors import ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
-    from sfm_shapefit.pipeline import Progress
+    from sfm_shapefit.commands.stages.clock import Progress
 
 Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
@@ -200,7 +200,7 @@ def print_table(title: str, rows: Rows) -> None:
 
 def print_json(summary: dict[str, Any]) -> None:
     """Print a summary as JSON on stdout; one that is no UTF-8 gets escapes, which mean the same."""
-    from sfm_shapefit.report import dumps
+    from sfm_shapefit.results.tables import dumps
 
     text = dumps(summary)
     try:

@@ -35,8 +35,8 @@ def evaluate_command(
     source = one_path(model, input_path, "MODEL")
     truth = one_path(reference, None, "REF")
     with reported():
-        from sfm_shapefit.pipeline import evaluate
-        from sfm_shapefit.report import write_records
+        from sfm_shapefit.commands.evaluate import evaluate
+        from sfm_shapefit.results.tables import write_records
 
         errors = evaluate(source, truth, threshold or ())
         if csv is not None:

@@ -73,16 +73,17 @@ def locate_command(
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
     with reported(target):
-        from sfm_shapefit.output import claimed_output
+        from sfm_shapefit.atomic_folder import claimed_output
 
         options = options_from(LocateOptions, given, config)
         names = Path(options.fix) if options.fix else None
         protect = [path for path in (source, database, priors, names, config) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=protect):
             from sfm_shapefit.colmap.quiet import pycolmap_heard
-            from sfm_shapefit.pipeline import locate
-            from sfm_shapefit.pipeline.execution import open_executor
-            from sfm_shapefit.results import summary, write_result
+            from sfm_shapefit.commands.locate import locate
+            from sfm_shapefit.commands.stages.execution import open_executor
+            from sfm_shapefit.commands.write import write_result
+            from sfm_shapefit.results import summary
 
             catch_termination()
             with (

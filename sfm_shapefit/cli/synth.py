@@ -38,8 +38,8 @@ def synth_command(
 
 def _write(options: SceneOptions, target: Path, workspace: WorkspaceOptions) -> list[tuple[str, str]]:
     """Write a workspace whose keypoints are projected points; return what to print of it."""
-    from sfm_shapefit.colmap.workspace import write_workspace
     from sfm_shapefit.synthetic import make_scene
+    from sfm_shapefit.synthetic.workspace import write_workspace
 
     scene = make_scene(options)
     write_workspace(scene, target, workspace)
@@ -54,8 +54,8 @@ def _write_drawn(
     options: SceneOptions, render: RenderOptions, target: Path, workspace: WorkspaceOptions
 ) -> list[tuple[str, str]]:
     """Write a workspace with images; return what to print of it."""
-    from sfm_shapefit.colmap.photographs import judge_matches, write_rendered_workspace
     from sfm_shapefit.synthetic import make_rendered_scene
+    from sfm_shapefit.synthetic.photographs import judge_matches, write_rendered_workspace
 
     scene = make_rendered_scene(options, render)
     write_rendered_workspace(scene, target, workspace)

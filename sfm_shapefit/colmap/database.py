@@ -32,12 +32,12 @@ from urllib.parse import quote
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.matches import MatchBatch, RelativePoses
+from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
+from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.output import locked_folder, remove_abandoned
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""

@@ -22,14 +22,14 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.bodies import Bodies
 from sfm_shapefit.colmap.check import check_model_files, model_suffix
-from sfm_shapefit.colmap.foreign import reconstruction_of
-from sfm_shapefit.colmap.matches import MatchBatch
+from sfm_shapefit.colmap.other_programs import reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.rigs.groups import Bodies
 
 UInt64Array = npt.NDArray[np.uint64]
 

@@ -28,11 +28,11 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.matches import MatchBatch
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
 from sfm_shapefit.colmap.seed import without_points
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.workers import answers
+from sfm_shapefit.executors import answers
 
 TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 """Where tracks come from: matches, or the points of another model with the same points2D."""

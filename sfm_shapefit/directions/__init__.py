@@ -29,14 +29,14 @@ the bias of noise in the normals: Kanatani, "Statistical Optimization for Geomet
 """
 
 from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.relative_poses import from_relative_poses
-from sfm_shapefit.directions.values import (
+from sfm_shapefit.directions.pair_directions import (
     CONTRADICTIONS,
     DirectionOptions,
     DirectionStatus,
     PairDirections,
     concatenate,
 )
+from sfm_shapefit.directions.relative_poses import from_relative_poses
 
 __all__ = [
     "CONTRADICTIONS",

@@ -1,9 +1,8 @@
 """What `locate` returns, and its files."""
 
-from sfm_shapefit.results.files import write_graph_result, write_result
+from sfm_shapefit.results.result import FurtherPiece, GraphResult, Inputs, LocateResult
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, piece_rows
 from sfm_shapefit.results.summary import graph_summary, summary
-from sfm_shapefit.results.values import FurtherPiece, GraphResult, Inputs, LocateResult
 from sfm_shapefit.results.warnings import graph_warnings, match_warnings, quality_warnings, trust_warnings
 
 __all__ = [
@@ -21,6 +20,4 @@ __all__ = [
     "quality_warnings",
     "summary",
     "trust_warnings",
-    "write_graph_result",
-    "write_result",
 ]

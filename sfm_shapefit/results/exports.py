@@ -4,8 +4,8 @@ import numpy as np
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import EpipolarGeometries, g2o_text, onedsfm_files
+from sfm_shapefit.results.result import GraphResult
 from sfm_shapefit.results.rows import name_of
-from sfm_shapefit.results.values import GraphResult
 
 
 def positions_g2o(found: GraphResult) -> str:

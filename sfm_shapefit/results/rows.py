@@ -8,10 +8,10 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions import PairDirections
-from sfm_shapefit.placement import Placement, count_large
-from sfm_shapefit.report import CameraRow, PairRow, PieceRow
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.placement.place import Placement, count_large
+from sfm_shapefit.results.tables import CameraRow, PairRow, PieceRow
 from sfm_shapefit.rigidity import left_out_reasons
-from sfm_shapefit.robust.verdicts import Verdict
 from sfm_shapefit.viewgraph import ViewGraph
 
 _UNCHECKED = "no other pair checks it: the solution bends to fit it"

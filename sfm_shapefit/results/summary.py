@@ -9,12 +9,12 @@ import numpy as np
 from sfm_shapefit import __version__
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import Adjusted
-from sfm_shapefit.placement import Placement
-from sfm_shapefit.report import IN_MEMORY, SCHEMA_VERSION, PieceRow, solve_summary
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.refinement.starts import Finish
+from sfm_shapefit.results.result import GraphResult, LocateResult, all_names
 from sfm_shapefit.results.rows import name_of, piece_rows
-from sfm_shapefit.results.values import GraphResult, LocateResult, all_names
+from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION, PieceRow, solve_summary
 from sfm_shapefit.results.warnings import graph_warnings
-from sfm_shapefit.robust.finish import Finish
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 _QUANTILES = (25, 50, 75, 90)

@@ -8,9 +8,9 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.placement import SMALLEST_PIECE, Placement
+from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
+from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.results.rows import name_of
-from sfm_shapefit.robust.finish import Finish
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution

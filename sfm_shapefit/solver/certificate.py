@@ -50,8 +50,8 @@ from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, routine_
 from sfm_shapefit.laplacian.operators import Workers, adjacency, apply_incidence_transposed
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
-from sfm_shapefit.solver.admm.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.solver.program import along, differences, objective
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 _ROUNDS = 8  # of clipping; three do mostly, but on loose communities the sixth still gained half of the gap

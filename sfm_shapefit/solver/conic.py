@@ -6,7 +6,7 @@ complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
     minimise    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
-With bodies (`sfm_shapefit.bodies`) t = A x, and x takes the place of t, body 0 grounded.
+With bodies (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, body 0 grounded.
 
 The multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow beside a solver made
 for the program, and trusted: every other solver is tested against it.
@@ -20,10 +20,10 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array, hstack
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.bodies import Bodies, separate
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.solver.program import scale_functional
+from sfm_shapefit.solver.rigs.groups import Bodies, separate
 from sfm_shapefit.viewgraph import ViewGraph
 
 _TIGHTEST = 1e-12  # tolerance that double precision can still serve

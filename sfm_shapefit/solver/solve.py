@@ -12,10 +12,8 @@ from sfm_shapefit.arrays import FloatArray, frozen
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.rigidity import is_parallel_rigid
-from sfm_shapefit.solver.admm.linear import Prediction, predict_factor
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.hybrid import Finish, solve_hybrid
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import (
     IterationInfo,
@@ -30,6 +28,8 @@ from sfm_shapefit.solver.program import (
     projected_length,
     scale_functional,
 )
+from sfm_shapefit.solver.splitting.linear import Prediction, predict_factor
+from sfm_shapefit.solver.splitting.split_then_newton import Finish, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing

@@ -230,9 +230,9 @@ def workspace_of(tmp_path: Path) -> WorkspaceMaker:
     """Write scenes as COLMAP workspaces, each in a folder of its own."""
 
     def workspace(scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path:
-        from sfm_shapefit.colmap.photographs import write_rendered_workspace
-        from sfm_shapefit.colmap.workspace import write_workspace
         from sfm_shapefit.synthetic import Scene
+        from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+        from sfm_shapefit.synthetic.workspace import write_workspace
 
         folder = tmp_path / f"workspace{len(list(tmp_path.glob('workspace*'))) + 1}"
         if isinstance(scene, Scene):

@@ -15,7 +15,7 @@ from sfm_shapefit.laplacian.dense import (
     solve_factored,
     work_integers,
 )
-from sfm_shapefit.solver.newton.approach import approach
+from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,
     STALL,

@@ -1,0 +1,43 @@
+"""`sfm-shapefit convert MODEL OUT`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm_shapefit.cli.app import app
+from sfm_shapefit.cli.console import print_table, reported
+from sfm_shapefit.cli.flags import InputPath, ModelArgument, OutputPath, Quiet, one_path
+
+_FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
+
+
+@app.command("convert", short_help="Write a model in another format.")
+def convert_command(
+    model: ModelArgument = None,
+    out: Annotated[Path | None, typer.Argument(metavar="OUT", help="File or folder to be made.")] = None,
+    *,
+    input_path: InputPath = None,
+    output_path: OutputPath = None,
+    target_format: Annotated[
+        str | None,
+        typer.Option(
+            "--format",
+            help="colmap or colmap-txt (a folder), nerf (transforms.json), tum (trajectory) or csv; by "
+            "default that of OUT's suffix: none, .json, .tum or .txt, .csv.",
+        ),
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
+    quiet: Quiet = False,
+) -> None:
+    """Write MODEL, COLMAP's or a file of Bundler, openMVG or OpenSfM, in another format."""
+    source = one_path(model, input_path, "MODEL")
+    target = one_path(out, output_path, "OUT")
+    if target_format is not None and target_format not in _FORMATS:
+        raise typer.BadParameter(f"--format must be one of {', '.join(_FORMATS)}, got {target_format!r}")
+    with reported(target):
+        from sfm_shapefit.commands.convert import convert
+
+        written = convert(source, target, target_format, overwrite=overwrite)  # type: ignore[arg-type]
+        if not quiet:
+            print_table(str(source), [("format", written), ("written to", str(target))])

@@ -1,0 +1,112 @@
+"""`sfm-shapefit inspect MODEL`."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from sfm_shapefit.cli.app import app
+from sfm_shapefit.cli.console import (
+    NAMES_SHOWN,
+    SEE_JSON,
+    Rows,
+    catch_termination,
+    print_json,
+    print_table,
+    reported,
+    shortened,
+    shown_progress,
+)
+from sfm_shapefit.cli.flags import Database, InputPath, Json, one_path, options_from, takes
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.options import LocateOptions
+
+if TYPE_CHECKING:
+    from sfm_shapefit.commands.inspect import Inspection
+    from sfm_shapefit.placement.diagnosis import Diagnosis
+
+_INSPECTED = (
+    "directions",
+    "solver",
+    "objective",
+    "refine",
+    "points",
+    "min_inliers",
+    "min_inlier_ratio",
+    "inlier_threshold_px",
+    "threads",
+)
+"""The options of `locate` that decide what the view graph is and what becomes of it."""
+
+
+@app.command("inspect", short_help="Diagnose a model and say what locate would do; write nothing.")
+@takes(LocateOptions, only=_INSPECTED)
+def inspect_command(
+    model: Annotated[
+        Path | None,
+        typer.Argument(metavar="MODEL", help="COLMAP model folder, or the text file of a bare graph."),
+    ] = None,
+    *,
+    input_path: InputPath = None,
+    database: Database = None,
+    theory: Annotated[
+        bool,
+        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centres."),
+    ] = False,
+    as_json: Json = False,
+    **given: Any,
+) -> None:
+    """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
+    source = one_path(model, input_path, "MODEL")
+    with reported():
+        options = options_from(LocateOptions, given)
+
+        from sfm_shapefit.commands.inspect import inspect as inspect_model
+
+        catch_termination()
+        with shown_progress(not as_json) as progress:
+            found = inspect_model(source, database, options, theory=theory, progress=progress)
+        if as_json:
+            print_json(found.as_dict())
+        else:
+            what = "nodes" if source.is_file() else "images"
+            print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))
+        if found.diagnosis.obstacle:
+            raise UnsolvableError(found.diagnosis.obstacle)
+
+
+def _inspection_table(found: "Inspection") -> Rows:
+    """Return the diagnosis, label by label."""
+    seen = found.diagnosis
+    statuses = "\n".join(f"{count} {status}" for status, count in found.statuses.items())
+    left_out = [f"{name}: {reason}" for name, reason in seen.left_out.items()]
+    weak = [f"{camera.name}: {'; '.join(camera.reasons)}" for camera in seen.weak]
+    return [
+        ("directions", found.directions),
+        ("pairs", statuses),
+        ("points as nodes", found.points),
+        ("rigs", found.rigs),
+        ("components", _components_line(seen)),
+        *([("rigid pieces", shortened(_piece_lines(seen), SEE_JSON))] if seen.pieces else []),
+        *([("not placed", shortened(left_out, SEE_JSON))] if left_out else []),
+        *([("weak cameras", shortened(weak, SEE_JSON))] if weak else []),
+        ("wrong pairs", seen.corruption.statement),
+        *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
+        *([("finish", seen.plan.finish)] if seen.plan else []),
+        *([("will take", found.expected.statement)] if found.expected else []),
+        *([("theory", found.theory.statement)] if found.theory else []),
+    ]
+
+
+def _components_line(seen: "Diagnosis") -> str:
+    sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
+    more = ", ..." if len(seen.components) > NAMES_SHOWN else ""
+    return f"{len(seen.components)} ({sizes}{more} cameras)"
+
+
+def _piece_lines(seen: "Diagnosis") -> list[str]:
+    """Say of each rigid piece how large it is and what it hangs by."""
+    return [
+        f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
+        for piece in seen.pieces
+    ]

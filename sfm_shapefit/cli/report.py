@@ -1,0 +1,55 @@
+"""`sfm-shapefit report OUT` and `sfm-shapefit view OUT`: what an earlier run found, to be looked at."""
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from sfm_shapefit.cli.app import app
+from sfm_shapefit.cli.console import reported
+from sfm_shapefit.cli.flags import Scene, one_path
+
+Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
+
+
+@app.command("report", short_help="Make report.html again from the other files of OUT.")
+def report_command(out: Output = None, *, scene: Scene = False) -> None:
+    """Write OUT/report.html anew from the other files of OUT."""
+    folder = one_path(out, None, "OUT")
+    with reported():
+        from sfm_shapefit.errors import InputError
+        from sfm_shapefit.report.files import write_pictures
+        from sfm_shapefit.report.read_back import read_output
+
+        drawn, facts = read_output(folder)
+        try:
+            write_pictures(drawn, facts, folder, report=True, meshes=scene)
+        except OSError as error:
+            what = f"{folder} cannot be written ({error.strerror})"
+            raise InputError(f"{what}; copy it elsewhere first") from error
+
+
+@app.command("view", short_help="Explore OUT in the browser.")
+def view_command(
+    out: Output = None,
+    *,
+    host: Annotated[
+        str, typer.Option("--host", help="Address to listen on; others than this machine's let others in.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port to listen on.")] = 8080,
+) -> None:
+    """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
+    folder = one_path(out, None, "OUT")
+    with reported():
+        from sfm_shapefit.report.read_back import read_output
+        from sfm_shapefit.report.viewer import serve
+
+        drawn, facts = read_output(folder)
+        server = serve(drawn, facts, host, port)
+        try:
+            print(f"http://{host}:{server.get_port()}  (end with Ctrl-C)", flush=True)  # noqa: T201
+            while True:
+                time.sleep(3600)
+        except KeyboardInterrupt:
+            server.stop()

@@ -1,0 +1,155 @@
+"""Relative rotations of the image pairs of a database, estimated from their inlier matches, or as stored.
+
+COLMAP leaves `cam2_from_cam1` out by default, and databases of other tools hold inlier matches and nothing
+else. So the relative pose of a pair is estimated from its inlier matches and the calibrated rays, by
+COLMAP's own estimator (essential matrix and homography in competition, refined). A pair without parallax
+has a rotation too: for averaging, cameras that only turn are as good as others.
+
+Estimating anew is worth its 10 ms a pair even where poses are stored. The estimator calls a pair
+uncalibrated if a fundamental matrix explains its matches better than an essential one; where the focal
+lengths are known, that is the mark of a false pair. Pairs within 5 degrees of the truth, of all pairs, and
+25 % quantile of the error:
+
+                  stored               estimated, calibrated only
+    castle-P30    230 of 378, 0.20     193 of 210, 0.08
+    castle-P19     86 of 147, 0.27      72 of  78, 0.11
+    lego100       650 of 1312, 0.63    606 of 755, 0.33
+"""
+
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.colmap.quiet import quiet_stderr
+from sfm_shapefit.directions.matches import MatchBatch
+
+RelativeSource = Literal["matches", "stored"]
+
+_CONFIG = pycolmap.TwoViewGeometryConfiguration
+_SOUND_CONFIGS = (_CONFIG.CALIBRATED, _CONFIG.PLANAR, _CONFIG.PANORAMIC, _CONFIG.PLANAR_OR_PANORAMIC)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RelativeRotations:
+    """The relative rotations of k pairs of images, in the order of pairs."""
+
+    pairs: IntArray
+    """(k, 2) images (i, j), i < j, as indices into `PosedModel.image_ids`."""
+    rotations: FloatArray
+    """(k, 3, 3) camera j from camera i."""
+    num_matches: IntArray
+    """(k,) inlier matches."""
+    sound: BoolArray
+    """(k,) False where known focal lengths contradict the matches."""
+
+    def subset(self, rows: IntArray | BoolArray) -> "RelativeRotations":
+        """Return some of the pairs."""
+        return RelativeRotations(
+            pairs=self.pairs[rows],
+            rotations=self.rotations[rows],
+            num_matches=self.num_matches[rows],
+            sound=self.sound[rows],
+        )
+
+
+def relative_rotations(
+    path: Path,
+    model: PosedModel,
+    min_matches: int,
+    source: RelativeSource = "matches",
+    threads: int = 1,
+    advance: Callable[[int, int], None] | None = None,
+) -> RelativeRotations:
+    """Return the relative rotation of every pair with enough matches that has one.
+
+    Args:
+        path: the database; it is not changed.
+        model: all its images, with the identity as their rotation (see `unposed`).
+        min_matches: pairs with fewer inlier matches are left out.
+        source: estimated from the matches, or as stored; then pairs without a stored pose are left out.
+        threads: of the estimates; the answer does not depend on it.
+        advance: called with the pairs that are done and their number.
+
+    Raises:
+        InputError: if the database cannot be read, or a row of it is damaged.
+    """
+    with open_database(path, model) as database:
+        if source == "stored":
+            poses = database.relative_poses()
+            enough = poses.num_inliers >= min_matches
+            return RelativeRotations(
+                pairs=poses.pairs[enough],
+                rotations=poses.rotations[enough],
+                num_matches=poses.num_inliers[enough],
+                sound=np.ones(int(enough.sum()), dtype=np.bool_),
+            )
+        with ThreadPoolExecutor(threads) as pool, quiet_stderr():
+            rows, before = [], 0
+            for batch in database.iter_matches(min_matches):
+                estimate = _Estimate(model, _pixels(database, batch), batch)
+                for k, row in enumerate(pool.map(estimate, range(len(batch.pairs)))):
+                    if advance is not None:
+                        advance(before + k + 1, database.num_pairs)
+                    if row is not None and row[2] >= min_matches:
+                        rows.append(row)
+                before += len(batch.pairs)
+    return RelativeRotations(
+        pairs=np.array([row[0] for row in rows], dtype=np.int64).reshape(-1, 2),
+        rotations=np.array([row[1] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
+        num_matches=np.array([row[2] for row in rows], dtype=np.int64),
+        sound=np.array([row[3] for row in rows], dtype=np.bool_),
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimate:
+    """Estimates the relative rotation of one pair of a batch at a time."""
+
+    model: PosedModel
+    pixels: dict[int, FloatArray]
+    batch: MatchBatch
+
+    def __call__(self, k: int) -> tuple[tuple[int, int], FloatArray, int, bool] | None:
+        """Return pair, rotation, number of matches and soundness; None if the pair has no rotation."""
+        i, j = self.batch.pairs[k].tolist()
+        matches = self.batch.keypoints[self.batch.offsets[k] : self.batch.offsets[k + 1]]
+        cameras = [_camera_of(self.model, image) for image in (i, j)]
+        options = pycolmap.TwoViewGeometryOptions()
+        options.compute_relative_pose = True
+        options.ransac.random_seed = 0
+        geometry = pycolmap.estimate_calibrated_two_view_geometry(
+            cameras[0],
+            self.pixels[i][matches[:, 0]],
+            cameras[1],
+            self.pixels[j][matches[:, 1]],
+            np.repeat(np.arange(len(matches), dtype=np.uint32)[:, None], 2, axis=1),
+            options,
+        )
+        is_guess = not all(camera.has_prior_focal_length for camera in cameras)
+        sound = geometry.config in _SOUND_CONFIGS or (geometry.config == _CONFIG.UNCALIBRATED and is_guess)
+        pose = geometry.cam2_from_cam1
+        if pose is None or not (sound or geometry.config == _CONFIG.UNCALIBRATED):
+            return None
+        rotation = pose.rotation.matrix()
+        if not np.isfinite(rotation).all():
+            return None
+        return (i, j), rotation, len(geometry.inlier_matches), sound
+
+
+def _pixels(database: MatchDatabase, batch: MatchBatch) -> dict[int, FloatArray]:
+    """Return the keypoints of the images of a batch."""
+    return {image: database.keypoints(image) for image in np.unique(batch.pairs).tolist()}
+
+
+def _camera_of(model: PosedModel, image: int) -> pycolmap.Camera:
+    """Return the camera of an image by its index."""
+    reconstruction = model.reconstruction
+    return reconstruction.camera(reconstruction.image(int(model.image_ids[image])).camera_id)

@@ -1,0 +1,114 @@
+"""Rotations of cameras from relative rotations of pairs: pycolmap's rotation averaging, on plain arrays.
+
+    minimise  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
+
+from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs beyond
+`max_error_deg` of the result are left out and what stays connected is averaged once more, as pycolmap's
+global mapper does; cameras outside that component have no rotation.
+
+Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in GLOMAP.
+"""
+
+import numpy as np
+import numpy.typing as npt
+import pycolmap
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.quiet import quiet_output
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.rotations.averaged import Loss
+
+_LOSSES = {
+    "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,
+    "half-norm": pycolmap.RotationWeightType.HALF_NORM,
+}
+_MAX_ERROR_DEG = 10.0  # pycolmap's own default
+_CAMERA_ID = 1
+
+
+def average_rotations(
+    num_images: int,
+    pairs: IntArray,
+    rotations: FloatArray,
+    weights: npt.ArrayLike | None = None,
+    *,
+    loss: Loss = "geman-mcclure",
+    count_matches: bool = True,
+    max_error_deg: float = _MAX_ERROR_DEG,
+    seed: int = 0,
+) -> tuple[FloatArray, BoolArray]:
+    """Return a rotation for each image that the pairs tie to the largest consistent component.
+
+    Args:
+        num_images: n.
+        pairs: (k, 2) images (i, j), i != j, each pair once.
+        rotations: (k, 3, 3) cam_j_from_cam_i.
+        weights: (k,) numbers of matches, rounded; the spanning tree takes pairs of many, and they count in
+            proportion. All alike if None.
+        loss: of the residual angles; "half-norm" (their square root) is finer, but fails more often.
+        count_matches: False leaves the weights to the spanning tree alone: a few false pairs of many matches
+            then do less harm.
+        max_error_deg: pairs that are farther off after the first averaging are left out of the second.
+        seed: of pycolmap's random draws.
+
+    Returns:
+        Rotations (n, 3, 3) cam_from_world, the identity where there is none, and (n,) who has one.
+
+    Raises:
+        InputError: if there are no pairs, or a pair is outside 0..n-1.
+        UnsolvableError: if pycolmap finds no rotations.
+    """
+    if len(pairs) == 0:
+        raise InputError("rotations cannot be averaged without relative rotations of pairs")
+    if pairs.min() < 0 or pairs.max() >= num_images:
+        raise InputError(f"relative rotations join images outside 0..{num_images - 1}")
+    counts = np.ones(len(pairs)) if weights is None else np.asarray(weights, dtype=np.float64)
+    graph = _pose_graph(pairs, rotations, np.maximum(np.rint(counts), 1.0).astype(np.int64))
+    model = _unposed_model(num_images)
+    options = pycolmap.RotationEstimatorOptions()
+    options.random_seed = seed
+    options.max_rotation_error_deg = max_error_deg
+    options.weight_type = _LOSSES[loss]
+    if weights is not None and count_matches:
+        options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
+    with quiet_output():
+        for again in (False, True):
+            options.filter_unregistered = again
+            if not pycolmap.run_rotation_averaging(options, graph, model, []):
+                raise UnsolvableError(
+                    "pycolmap's rotation averaging failed; check the relative rotations, or give rotations"
+                )
+    return _rotations_of(model)
+
+
+def _rotations_of(model: pycolmap.Reconstruction) -> tuple[FloatArray, BoolArray]:
+    """Return the rotations (n, 3, 3), the identity where there is none, and (n,) who has one."""
+    n = len(model.images)
+    found, registered = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, dtype=np.bool_)
+    for image_id in model.reg_image_ids():
+        found[image_id - 1] = model.image(image_id).cam_from_world().rotation.matrix()
+        registered[image_id - 1] = True
+    return found, registered
+
+
+def _pose_graph(pairs: IntArray, rotations: FloatArray, counts: IntArray) -> pycolmap.PoseGraph:
+    """Return the pairs as pycolmap's graph; image k has the id k + 1."""
+    graph = pycolmap.PoseGraph()
+    for (i, j), rotation, count in zip(pairs.tolist(), rotations, counts.tolist(), strict=True):
+        edge = pycolmap.PoseGraphEdge(
+            cam2_from_cam1=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3)), num_matches=count
+        )
+        graph.add_edge(i + 1, j + 1, edge)
+    return graph
+
+
+def _unposed_model(num_images: int) -> pycolmap.Reconstruction:
+    """Return a model of images without poses, each in a frame of its own."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=_CAMERA_ID, model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0, 0])
+    )
+    for image_id in range(1, num_images + 1):
+        image = pycolmap.Image(name=str(image_id), camera_id=_CAMERA_ID, image_id=image_id)
+        model.add_image_with_trivial_frame(image)
+    return model

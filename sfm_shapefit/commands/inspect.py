@@ -1,0 +1,129 @@
+"""`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.economy import known_workload
+from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.measure import evidence_of, joint_graph, measure_directions, view_graph
+from sfm_shapefit.commands.stages.memory import Forecast, forecast, measure_speed
+from sfm_shapefit.commands.stages.rigs import rigs_statement
+from sfm_shapefit.directions import DirectionStatus
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import read_graph
+from sfm_shapefit.formats.models import is_model_file
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.placement.diagnosis import Diagnosis, Theory, diagnose, theory_of
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inspection:
+    """All that `inspect` reports."""
+
+    directions: str
+    """Where directions come from, and why."""
+    num_images: int
+    """Images or nodes of the input, with a rotation or without."""
+    statuses: dict[str, int]
+    """How many pairs have a usable direction, and why others have none."""
+    points: str
+    """Whether 3D points join the view graph, and why."""
+    diagnosis: Diagnosis
+    theory: Theory | None
+    """None if not asked for."""
+    expected: Forecast | None = None
+    """What `locate` will take on this machine; None for a bare graph."""
+    rigs: str = "none: every image is a frame of its own"
+    """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for JSON."""
+        facts = asdict(self)
+        if self.expected is not None:
+            facts["expected"] |= {"peak_mb": self.expected.peak_mb, "total_s": self.expected.total_s}
+        if self.theory is not None and self.theory.conditions is not None:
+            conditions = self.theory.conditions
+            facts["theory"]["conditions"] |= {
+                "granted": conditions.granted,
+                "granted_in_space": conditions.granted_in_space,
+                "feasible": conditions.feasible,
+            }
+        return facts
+
+
+def inspect(
+    source: "pycolmap.Reconstruction | Path | str",
+    database: Path | str | None = None,
+    options: LocateOptions | None = None,
+    *,
+    theory: bool = False,
+    progress: Progress | None = None,
+) -> Inspection:
+    """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
+
+    Args:
+        source: a reconstruction or a model folder as for `locate`, or the text file of a bare graph.
+        database: as for `locate`; a bare graph has none.
+        options: how it would be placed; defaults if None.
+        theory: also compute the constants of the recovery theorems at the model's centres.
+        progress: called as stages advance.
+
+    Returns:
+        Where directions come from and what becomes of the pairs; `diagnosis` with components, rigid pieces,
+        hinges, weak cameras, the share of wrong pairs and the plan of the solve. `as_dict()` has all of it.
+
+    Raises:
+        InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
+            is diagnosed; `diagnosis.obstacle` says why.
+    """
+    options = options or LocateOptions()
+    if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
+        if database is not None:
+            raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
+        return _inspect_graph(Path(source), options, theory=theory)
+    clock = Clock(progress) if progress else Clock()
+    with clock("read"):
+        model = read_model(source)
+        inputs = choose_inputs(source, database, options.directions)
+    with open_source(model, inputs) as matches:
+        with clock("directions"):
+            directions = measure_directions(matches, options, clock)
+        with clock("diagnosis"):
+            joint = joint_graph(matches, directions, options)
+            pairs = view_graph(model, directions)
+            return Inspection(
+                directions=inputs.statement,
+                num_images=len(model.reconstruction.images),
+                statuses={status.value: count for status, count in directions.counts().items()},
+                points=options.points_statement(model.num_images, joint.num_points),
+                diagnosis=diagnose(
+                    joint.graph,
+                    options.for_placement(),
+                    joint.num_cameras,
+                    evidence_of(directions).contradicting,
+                ),
+                theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
+                expected=forecast(
+                    known_workload(matches, directions, joint, options), matches.economy, measure_speed()
+                ),
+                rigs=rigs_statement(model, joint),
+            )
+
+
+def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspection:
+    """Diagnose the bare graph of a text file."""
+    graph = read_graph(path)
+    return Inspection(
+        directions=f"as given in {path}",
+        num_images=graph.num_cameras,
+        statuses={DirectionStatus.USABLE.value: graph.num_edges},
+        points="no: a bare graph has no matches",
+        diagnosis=diagnose(graph, options.for_placement()),
+        theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
+    )

@@ -1,0 +1,262 @@
+"""`map_database`: rotations averaged from the matches, then `locate`, component by component.
+
+    images and matches -> relative rotations -> components -> averaged rotations -> locate -> models
+
+With bundle adjustment, a draft is placed and adjusted in one loose round first; the rotations of the draft
+are far finer than averaged ones, so directions, verdicts and trust are measured anew from them before the
+final adjustment. Images that the averaging drops form components of their own.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
+from sfm_shapefit.colmap.database_images import UnposedImages, posed_at_origin, read_images, rotations_of
+from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.stages.averaging import averaged
+from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import mean_rotation_l1
+from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.results import LocateResult
+from sfm_shapefit.results.map_result import MappedModel, MapResult
+from sfm_shapefit.rotations.averaged import AveragedRotations
+
+_DRAFT_WIDENING = 4.0  # of the reprojection limit: a draft is a few pixels off, and would lose long tracks
+_ALARMING_SHARE = 0.7  # of a model's pairs that agree with its rotations: castle-P30 0.97, lego100 0.89
+_DOUBTFUL_SHARE = 0.25  # of one image's pairs
+_UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
+
+
+def map_database(
+    database: Path | str, options: MapOptions | None = None, progress: Progress | None = None
+) -> MapResult:
+    """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
+
+    Args:
+        database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
+        options: settings; defaults if None.
+        progress: called as stages advance.
+
+    Returns:
+        `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
+        how they were chosen; `left_out`, the reason for each image in no model; `warnings`.
+
+    Raises:
+        InputError: if the database cannot be used; the message says what to do.
+        UnsolvableError: if no component of three images or more can be placed.
+    """
+    options = options or MapOptions()
+    path, clock = Path(database), Clock(progress) if progress else Clock()
+    run = _Run(options, clock)
+    with clock("read"):
+        images = read_images(path)
+        unposed = read_model(images.reconstruction)
+    with clock("relative rotations"):
+        relative = relative_rotations(
+            path,
+            unposed,
+            LEAST_MATCHES,
+            options.relative,
+            options.num_threads(),
+            clock.advance,
+        )
+    models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
+    for members, averaging in run.components(unposed.num_images, relative, reasons):
+        try:
+            found = run.located(path, images, unposed, members, averaging)
+        except UnsolvableError as error:
+            reasons |= dict.fromkeys(members.tolist(), f"its component cannot be placed: {error}")
+            continue
+        names = tuple(unposed.names[k] for k in members.tolist())
+        models.append(MappedModel(located=found, averaging=averaging, names=names))
+        for k in members.tolist():
+            del reasons[k]
+    if not models:
+        raise UnsolvableError(_nothing_placed(path, relative, reasons))
+    models.sort(key=lambda model: -int(model.located.kept.sum()))
+    left_out = {unposed.names[k]: reason for k, reason in sorted(reasons.items())}
+    return MapResult(
+        database=path,
+        options=options,
+        models=tuple(models),
+        num_images=unposed.num_images,
+        num_pairs=len(relative.pairs),
+        left_out=left_out,
+        timings_s=clock.seconds,
+        warnings=tuple(_warnings(images, models, left_out)),
+    )
+
+
+@dataclass(slots=True)
+class _Run:
+    """The settings of one run, and the time its stages take, of all components together."""
+
+    options: MapOptions
+    clock: Clock
+
+    def components(
+        self, num_images: int, relative: RelativeRotations, reasons: dict[int, str]
+    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
+        """Yield the images of each component that got rotations, ascending, and those rotations.
+
+        Why an image belongs to none is written to `reasons`.
+        """
+        waiting = _connected(num_images, relative.pairs)
+        while waiting:
+            members = waiting.pop(0)
+            if len(members) < self.options.min_model_size:
+                if len(members) > 1:
+                    few = f"joined to {len(members) - 1} other image only; three make a model"
+                    reasons |= dict.fromkeys(members.tolist(), few)
+                continue
+            with self.clock("rotation averaging"):
+                inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
+                local = _renumbered(inside, members)
+                try:
+                    answer = averaged(len(members), local, self.options.min_matches)
+                except UnsolvableError as error:
+                    reasons |= dict.fromkeys(members.tolist(), str(error))
+                    continue
+            left = members[~answer.registered]
+            reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
+            if len(left) < len(members):
+                rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
+                among = _connected(num_images, rest)
+                waiting = [*waiting, *(group for group in among if len(group) > 1)]
+            if answer.registered.sum() >= self.options.min_model_size:
+                yield members[answer.registered], _of_registered(answer)
+
+    def located(
+        self,
+        path: Path,
+        images: UnposedImages,
+        unposed: PosedModel,
+        members: IntArray,
+        averaging: AveragedRotations,
+    ) -> LocateResult:
+        """Place one component; with bundle adjustment, from the rotations of an adjusted draft."""
+        image_ids = unposed.image_ids[members].tolist()
+        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
+        known = self.options.known_distance
+        if known is not None and not {*known[:2]} <= {unposed.names[k] for k in members.tolist()}:
+            settings |= {"known_distance": None, "scale": "unit"}  # it belongs to another component
+        rotations = averaging.rotations
+        if self.options.bundle_adjust:
+            with self.clock("draft"):
+                rotations = self._drafted(path, images, image_ids, rotations, settings)
+            settings["refine_rotations"] = False
+        with self.clock("locate"):
+            model = posed_at_origin(images.reconstruction, image_ids, rotations)
+            return locate(model, path, LocateOptions(**settings), self.clock.progress)
+
+    def _drafted(
+        self,
+        path: Path,
+        images: UnposedImages,
+        image_ids: list[int],
+        rotations: FloatArray,
+        settings: dict[str, object],
+    ) -> FloatArray:
+        """Return rotations (k, 3, 3) from a loose adjustment of a draft, as given for images it lacks."""
+        limit = _DRAFT_WIDENING * self.options.max_reprojection_error_px
+        draft_settings = settings | {
+            "refine_rotations": False,
+            "bundle_adjust": False,
+            "min_trust": 0.0,
+            "max_reprojection_error_px": limit,
+        }
+        model = posed_at_origin(images.reconstruction, image_ids, rotations)
+        draft = locate(model, path, LocateOptions(**draft_settings))  # type: ignore[arg-type]
+        try:
+            adjusted = bundle_adjust(
+                draft.reconstruction,
+                draft.reconstruction,
+                self.options.for_structure(),
+                AdjustmentOptions(rounds=1),
+            )
+        except UnsolvableError:
+            return rotations
+        turned, posed = rotations_of(adjusted.reconstruction, image_ids)
+        if not posed.any():
+            return rotations
+        common = mean_rotation_l1(rotations[posed].transpose(0, 2, 1) @ turned[posed])
+        return np.where(posed[:, None, None], turned, rotations @ common)
+
+
+def _connected(num_images: int, pairs: IntArray) -> list[IntArray]:
+    """Return the connected components, ascending, the largest first; single images are components too."""
+    ones = np.ones(len(pairs), dtype=np.int8)
+    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(num_images, num_images))
+    labels = connected_components(graph.tocsr(), directed=False)[1]
+    groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
+    return sorted(groups, key=lambda group: (-len(group), int(group[0])))
+
+
+def _renumbered(relative: RelativeRotations, members: IntArray) -> RelativeRotations:
+    """Return pairs among `members` (ascending) as positions in it."""
+    return RelativeRotations(
+        pairs=np.searchsorted(members, relative.pairs),
+        rotations=relative.rotations,
+        num_matches=relative.num_matches,
+        sound=relative.sound,
+    )
+
+
+def _of_registered(answer: AveragedRotations) -> AveragedRotations:
+    """Return the answer for the images that have a rotation."""
+    kept = answer.registered
+    return replace(
+        answer,
+        rotations=answer.rotations[kept],
+        registered=kept[kept],
+        agreements=answer.agreements[kept],
+    )
+
+
+def _nothing_placed(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:
+    """Say why no component could be placed."""
+    if len(relative.pairs) == 0:
+        return (
+            f"no pair of images in {path} has {LEAST_MATCHES} inlier matches and a relative rotation; match "
+            "the images and verify them geometrically first"
+        )
+    causes = list(reasons.values())
+    most = max(set(causes), key=lambda cause: (causes.count(cause), cause))
+    return f"no component of {path} can be placed; for most images: {most}"
+
+
+def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[str, str]) -> Iterator[str]:
+    """Yield what the user should know, a sentence each."""
+    if images.has_rigs:
+        yield "the database's rigs are not used: every camera is placed on its own"
+    if images.num_guessed_cameras:
+        yield (
+            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; "
+            "calibrate them first (pycolmap.calibrate_view_graph) if the result is poor"
+        )
+    for number, model in enumerate(models):
+        share, agreements = model.averaging.share, model.averaging.agreements
+        if share < _ALARMING_SHARE:
+            yield (
+                f"model {number}: only {share:.0%} of the pairs agree with the averaged rotations; do not "
+                "trust it without a look"
+            )
+        doubtful = np.flatnonzero(agreements < _DOUBTFUL_SHARE)
+        if len(doubtful):
+            worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
+            yield (
+                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, "
+                f"above all those of {worst}"
+            )
+    if left_out:
+        name, reason = next(iter(left_out.items()))
+        yield f"{len(left_out)} images are in no model, {name} for one: {reason}"

@@ -1,0 +1,147 @@
+"""`solve GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
+
+from concurrent.futures import Executor
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.colmap.other_programs import relative_poses_of
+from sfm_shapefit.colmap.rotation_averaging import average_rotations
+from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats import (
+    EpipolarGeometries,
+    is_g2o,
+    is_onedsfm,
+    is_relative_poses,
+    read_g2o,
+    read_g2o_rotations,
+    read_graph,
+    read_onedsfm,
+    read_relative_poses,
+    read_rotations,
+)
+from sfm_shapefit.placement.place import place, place_further
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results import GraphResult
+from sfm_shapefit.viewgraph import ViewGraph
+
+if TYPE_CHECKING:
+    import pycolmap
+
+MAX_ROTATION_ERROR_DEG = 10.0
+
+
+class _Rotations(NamedTuple):
+    """Rotations of cameras and where they come from."""
+
+    cam_from_world: FloatArray
+    known: BoolArray
+    statement: str
+
+
+def solve_graph_file(
+    path: "Path | str | pycolmap.PoseGraph",
+    options: PlacementOptions | None = None,
+    *,
+    rotations: Path | str | None = None,
+    max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
+    reverse: bool = False,
+    progress: Progress | None = None,
+    executor: Executor | None = None,
+) -> GraphResult:
+    """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
+
+    Args:
+        path: a text file, see `formats.read_graph`; or relative poses: a 1DSfM folder or EGs.txt, see
+            `formats.read_onedsfm`, GLOMAP's text, see `formats.read_relative_poses`, the edges of a g2o file,
+            see `formats.read_g2o`, or a pose graph.
+        options: settings; defaults if None.
+        rotations: of the cameras of relative poses: 1DSfM's rots.txt, see `formats.read_rotations`, or the
+            vertices of a g2o file; averaged by pycolmap if None.
+        max_rotation_error_deg: relative poses whose rotation contradicts those of the cameras by more are
+            left out, as `locate` leaves them out.
+        reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
+        progress: called as stages advance.
+        executor: solves a graph in pieces whose factor would be too large for one machine; none if None.
+
+    Raises:
+        InputError: if a file is malformed; the message names the line.
+        UnsolvableError: if the directions determine nothing.
+    """
+    options = options or PlacementOptions()
+    clock = Clock(progress) if progress else Clock()
+    found, statement = None, "directions as given"
+    with clock("read"):
+        geometries = _relative_poses(path)
+    if geometries is not None:
+        if reverse:
+            raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
+        with clock("rotations"):
+            found = _rotations(geometries, rotations)
+        graph, statement = _consistent(geometries, found, max_rotation_error_deg)
+    else:
+        assert isinstance(path, Path | str)
+        if rotations is not None:
+            raise InputError(f"{path} is a bare graph of directions, which need no rotations; leave them out")
+        with clock("read"):
+            graph = read_graph(path)
+        if reverse:
+            graph = ViewGraph(graph.num_cameras, graph.edges, -graph.directions, graph.weights, graph.names)
+    with clock("solve"):
+        placement = place(graph, options, on_iteration=clock.iteration, executor=executor)
+    with clock("further pieces"):
+        further = tuple(place_further(placement, options))
+    return GraphResult(
+        path=Path(path if isinstance(path, Path | str) else "pose graph in memory"),
+        statement=statement,
+        options=options,
+        placement=placement,
+        further=further,
+        timings_s=clock.seconds,
+        geometries=geometries,
+        rotations=None if found is None else found.cam_from_world,
+    )
+
+
+def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeometries | None:
+    """Return the relative poses of a source; None if it is a bare graph of directions."""
+    if not isinstance(source, Path | str):
+        return relative_poses_of(source)
+    if is_onedsfm(source):
+        return read_onedsfm(source)
+    if is_g2o(source):
+        return read_g2o(source)
+    return read_relative_poses(source) if is_relative_poses(source) else None
+
+
+def _consistent(
+    geometries: EpipolarGeometries, found: _Rotations, max_rotation_error_deg: float
+) -> tuple[ViewGraph, str]:
+    """Return the directions of the pairs that agree with the rotations, and what was left out."""
+    agreeing = np.flatnonzero(geometries.mismatch_deg(found.cam_from_world) <= max_rotation_error_deg)
+    total, kept = len(geometries.pairs), len(agreeing)
+    if kept == 0:
+        raise InputError(
+            f"none of the {total} relative rotations agrees with those of the cameras; "
+            "check that they belong together"
+        )
+    graph = geometries.subset(agreeing.tolist()).view_graph(found.cam_from_world, found.known)
+    return graph, (
+        f"{found.statement}; {total - kept} of {total} pairs contradict them by more than "
+        f"{max_rotation_error_deg:g} deg and are left out"
+    )
+
+
+def _rotations(geometries: EpipolarGeometries, path: Path | str | None) -> _Rotations:
+    """Return the rotations of a file, or averaged ones."""
+    total = len(geometries.names)
+    if path is not None:
+        read = read_g2o_rotations if is_g2o(path) else read_rotations
+        given, known = read(path, geometries.names)
+        return _Rotations(given, known, f"{int(np.sum(known))} of {total} rotations of {path}")
+    averaged, known = average_rotations(total, geometries.pairs, geometries.rotations)
+    statement = f"{int(np.sum(known))} of {total} rotations averaged by pycolmap"
+    return _Rotations(averaged, known, statement)

@@ -1,0 +1,156 @@
+"""Directions measured by other processes or machines, through any `concurrent.futures` executor.
+
+The pairs of a database are cut into parts of a few hundred thousand matches. A task names the database file
+and carries the posed cameras, without which rays have no world axes: names, rotations, intrinsics. Its
+worker opens the file read-only for itself, reads its part, and sends the directions back. Every pair is
+estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
+of one process, to the bit, whichever worker did what, and however often.
+
+A worker that dies is the executor's business: a pool of processes breaks, which is reported; dask gives the
+task to another one.
+"""
+
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Literal
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras
+from sfm_shapefit.directions import DirectionOptions, PairDirections, concatenate, estimate_directions
+from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.executors import WorkerError, answers
+
+ExecutorKind = Literal["serial", "processes", "dask"]
+
+MATCHES_PER_TASK = 1_000_000
+"""About 1.5 seconds of work, and 230 MB."""
+_RETRIES = 3  # of a task whose worker died, by dask
+_NO_DASK = "the executor dask needs dask.distributed: pip install '.[dask]' in the folder of sfm_shapefit"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DirectionTask:
+    """Some pairs of a database, and all that is needed to measure their directions elsewhere."""
+
+    database: Path
+    """Its absolute path, the same for all workers."""
+    part: tuple[int, int]
+    """The range of its pairs."""
+    cameras: PosedCameras
+    """Of the whole model: the indices of pairs refer to them."""
+    options: DirectionOptions
+
+
+def directions_of(
+    batch: MatchBatch, focal_lengths_px: FloatArray, options: DirectionOptions, threads: int
+) -> PairDirections:
+    """Return the directions of a batch of pairs."""
+    return estimate_directions(
+        batch.pairs,
+        batch.offsets,
+        batch.rays_i,
+        batch.rays_j,
+        1.0 / focal_lengths_px[batch.pairs].min(axis=1),
+        options,
+        threads=threads,
+    )
+
+
+def shared_out(
+    database: MatchDatabase,
+    model: PosedModel,
+    options: DirectionOptions,
+    executor: Executor,
+    advance: Callable[[int, int], None],
+    matches_per_task: int = MATCHES_PER_TASK,
+) -> list[PairDirections]:
+    """Return the directions of all pairs of a database, in parts, as an executor's workers measure them.
+
+    Args:
+        database: what they read for themselves.
+        model: the posed cameras.
+        options: what to believe.
+        executor: submits tasks; it is not shut down.
+        advance: told of the pairs done and in all.
+        matches_per_task: about so many in one task.
+
+    Raises:
+        WorkerError: if a worker died and the executor does not replace it.
+        InputError: as a worker found the database.
+    """
+    cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
+    parts = database.parts(matches_per_task)
+    tasks = [DirectionTask(database=path, part=part, cameras=cameras, options=options) for part in parts]
+    found: list[PairDirections] = []
+    for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
+        found += measured
+        advance(stop, database.num_pairs)
+    return found
+
+
+def measure_task(task: DirectionTask) -> list[PairDirections]:
+    """Return the directions of a task's pairs, one value or none; what a worker runs."""
+    model = from_posed_cameras(task.cameras)
+    with open_database(task.database, model) as database:
+        found = [
+            directions_of(batch, model.focal_lengths_px, task.options, threads=1)
+            for batch in database.iter_matches(1, part=task.part)
+        ]
+    return [concatenate(found)] if found else []
+
+
+@contextmanager
+def open_executor(
+    kind: ExecutorKind, workers: int, scheduler: str | None = None
+) -> Iterator[Executor | None]:
+    """Open an executor by its name, and close it in the end.
+
+    Args:
+        kind: "serial" is none, "processes" a pool on this machine, "dask" a cluster.
+        workers: processes on this machine.
+        scheduler: address of a dask scheduler that runs already; a cluster of this machine if None. Whoever
+            can reach a scheduler can run code on its workers: keep it inside a trusted network.
+
+    Raises:
+        InputError: if dask is not installed, or a scheduler is named for another executor.
+        WorkerError: if the scheduler cannot be reached.
+    """
+    if scheduler is not None and kind != "dask":
+        raise InputError("a scheduler belongs to the executor dask; add --executor dask, or leave it out")
+    if kind == "serial":
+        yield None
+    elif kind == "processes":
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:  # fork and threads clash
+            yield pool
+    else:
+        with _dask_client(workers, scheduler) as client:
+            yield client.get_executor(retries=_RETRIES)
+
+
+@contextmanager
+def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
+    """Connect to a scheduler, or start a cluster of worker processes here."""
+    try:
+        from distributed import Client, LocalCluster
+    except ModuleNotFoundError:
+        raise InputError(_NO_DASK) from None
+    if scheduler is None:
+        with (
+            LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise WorkerError(f"the dask scheduler {scheduler} cannot be reached; check its address") from error
+    with client:
+        yield client

@@ -1,0 +1,119 @@
+"""Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.colmap.database import MatchDatabase, find_database, open_database
+from sfm_shapefit.colmap.model import PosedModel, track_matches
+from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
+from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.options import Source
+from sfm_shapefit.results import Inputs
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchSource:
+    """A model with the matches of its images, which can be read again and again."""
+
+    model: PosedModel
+    kind: Source
+    """What directions are made from; never "auto"."""
+    database: MatchDatabase | None
+    """The open database; None where the model's own tracks serve."""
+    economy: Economy = ECONOMIES[0]
+    """What is given up for memory."""
+
+    def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
+        """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
+        if self.database is None:
+            return track_matches(self.model, 1)
+        return self.database.iter_matches(1, self.economy.batch, among)
+
+    def counted(
+        self, batches: Iterator[MatchBatch], advance: Callable[[int, int], None]
+    ) -> Iterator[MatchBatch]:
+        """Report progress while batches are consumed: pairs of a database, or images of a model."""
+        total = self.model.num_images if self.database is None else self.database.num_pairs
+        done = 0
+        for batch in batches:
+            yield batch
+            if len(batch.pairs):
+                done = int(batch.pairs[-1, 0]) + 1 if self.database is None else done + len(batch.pairs)
+            advance(min(done, total), total)
+        advance(total, total)
+
+    def workload(self) -> Workload:
+        """Return what is known of the work before any direction is measured."""
+        database, model = self.database, self.model
+        images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+        seen = sum(image.num_points2D() for image in images)
+        num_pairs = 0 if database is None else database.num_pairs
+        return Workload(
+            num_images=model.num_images,
+            num_keypoints=seen if database is None else max(seen, database.num_keypoints()),
+            num_pairs=num_pairs,
+            num_matches=0 if database is None else database.num_matches,
+            num_edges=num_pairs,
+            num_nodes=model.num_images,
+            num_sampled=0,
+            has_points=False,
+            factor_entries=0,
+            factor_flops=0.0,
+        )
+
+
+@contextmanager
+def open_source(model: PosedModel, inputs: Inputs, max_memory: int = 0) -> Iterator[MatchSource]:
+    """Open the matches that were chosen, and close them in the end.
+
+    Args:
+        model: whose images they belong to.
+        inputs: what was chosen.
+        max_memory: limit of the peak memory in MB, which decides the economy; 0 for none.
+
+    Raises:
+        InputError: if the matches cannot be read, or there is no way to stay below the limit.
+    """
+    if inputs.database is None:
+        yield MatchSource(model=model, kind=inputs.source, database=None)
+        return
+    with open_database(inputs.database, model) as database:
+        source = MatchSource(model=model, kind=inputs.source, database=database)
+        if max_memory:
+            economy = choose_economy(source.workload(), max_memory)
+            database.limit_rays(economy.rays_bytes)
+            source = replace(source, economy=economy)
+        yield source
+
+
+def choose_inputs(
+    reconstruction: "pycolmap.Reconstruction | Path | str", database: Path | str | None, source: Source
+) -> Inputs:
+    """Decide where directions come from, and say how."""
+    folder = Path(reconstruction) if isinstance(reconstruction, Path | str) else None
+    if source == "tracks":
+        if database is not None:
+            raise InputError("directions from tracks use no database; leave out one of the two")
+        return Inputs(
+            folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
+        )
+    is_folder = folder is not None and not folder.is_file()  # pixels of other programs' models may differ
+    found = find_database(folder) if folder is not None and is_folder else None
+    path = Path(database) if database is not None else found
+    if path is None:
+        if source != "auto":
+            raise InputError(f"directions from {source} need a database; give one with --database")
+        statement = "the model's own tracks; no database.db was given or found beside the model"
+        return Inputs(folder=folder, database=None, source="tracks", statement=statement)
+    what = "stored relative poses" if source == "relative-poses" else "inlier matches"
+    statement = f"{what} of {path}" + (" (found beside the model)" if database is None else "")
+    chosen: Source = "relative-poses" if source == "relative-poses" else "matches"
+    return Inputs(folder=folder, database=path, source=chosen, statement=statement)

@@ -1,0 +1,159 @@
+"""From matches to the problem that is solved: directions, the view graph with its points, the evidence."""
+
+from concurrent.futures import Executor
+from dataclasses import replace
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.commands.stages.clock import Clock
+from sfm_shapefit.commands.stages.execution import directions_of, shared_out
+from sfm_shapefit.commands.stages.inputs import MatchSource
+from sfm_shapefit.directions import (
+    CONTRADICTIONS,
+    DirectionStatus,
+    PairDirections,
+    concatenate,
+    from_relative_poses,
+)
+from sfm_shapefit.directions.tracks import JointGraph, build_tracks, covering_set, join_points
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.judgement.trust import Evidence
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.viewgraph import ViewGraph
+
+_CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
+_MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
+_ADVICE = {
+    DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
+    DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
+    DirectionStatus.NO_PARALLAX: "cameras that only turn cannot be placed; use images from different places",
+}
+"""What to do where no pair has a direction, by the most frequent reason."""
+
+
+def measure_directions(
+    source: MatchSource, options: LocateOptions, clock: Clock, executor: Executor | None = None
+) -> PairDirections:
+    """Return the direction of every pair that the source has; an executor shares them out, if it can."""
+    model = source.model
+    if source.database is not None and source.kind == "relative-poses":
+        poses = source.database.relative_poses()
+        if len(poses.pairs) == 0:
+            raise UnsolvableError("the database has no stored relative pose; use directions from matches")
+        return from_relative_poses(
+            poses.pairs,
+            (poses.rotations, poses.translations),
+            model.rotations,
+            poses.num_inliers,
+            options.for_directions(),
+        )
+    if executor is not None and source.database is not None:
+        parts = shared_out(source.database, model, options.for_directions(), executor, clock.advance)
+    else:
+        wanted, threads = options.for_directions(), options.num_threads()
+        batches = source.counted(source.batches(), clock.advance)
+        parts = [directions_of(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
+    if not parts:
+        raise UnsolvableError(
+            "no two posed images share matches; match the images, or give the database that has their matches"
+        )
+    return concatenate(parts)
+
+
+def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
+    """Return the graph of the usable directions; it has at least one edge."""
+    usable = directions.usable()
+    if len(usable) == 0:
+        counts = directions.counts()
+        reasons = ", ".join(f"{count} {status.value}" for status, count in counts.items())
+        raise UnsolvableError(
+            f"none of the {len(directions.pairs)} pairs has a usable direction ({reasons}); "
+            f"{_ADVICE.get(next(iter(counts)), _CHECK_ROTATIONS)}"
+        )
+    return ViewGraph(
+        model.num_images,
+        directions.pairs[usable],
+        directions.directions[usable],
+        directions.weights()[usable],
+        names=model.names,
+    )
+
+
+def joint_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> JointGraph:
+    """Return the view graph, with 3D points as further nodes if the options want them."""
+    model = source.model
+    graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
+    if not (options.uses_points(model.num_images) and source.economy.points):
+        return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
+    pixel_angles = 1.0 / model.focal_lengths_px
+    tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
+    chosen = tracks.subset(covering_set(tracks, model.num_images))
+    return join_points(graph, covariance, chosen, pixel_angles)
+
+
+def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
+    """Return whether the errors of the directions are sampled together."""
+    if source.kind == "relative-poses" or not source.economy.samples:
+        return False
+    return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
+
+
+def without_points(joint: JointGraph) -> JointGraph:
+    """Return the pairs of cameras alone; they stand before the rays to points."""
+    graph, k = joint.graph, joint.num_cameras
+    rows = np.flatnonzero((graph.edges < k).all(axis=1))
+    names = None if graph.names is None else graph.names[:k]
+    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
+    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k)
+
+
+def shared_errors(
+    source: MatchSource, directions: PairDirections, options: LocateOptions
+) -> FloatArray | None:
+    """Return samples of the usable directions' errors, which share keypoints; None if not known."""
+    if not samples_errors(source, directions):
+        return None
+    usable = directions.usable()
+    row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
+    errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
+    for batch in source.batches():
+        rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
+        errors[rows] = sample_direction_errors(
+            batch.pairs,
+            batch.offsets,
+            batch.keypoints,
+            (batch.rays_i, batch.rays_j),
+            1.0 / source.model.focal_lengths_px[batch.pairs].min(axis=1),
+            directions.directions[rows],
+            directions.covariance[rows],
+            1.4826 * directions.median_residual_px[rows],
+            options.inlier_threshold_px,
+        )
+    return errors[usable]
+
+
+def evidence_of(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
+    """Return what the matches say of the cameras beyond the usable directions."""
+    usable = directions.usable()
+    against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
+    return Evidence(
+        support=directions.num_matches[usable],
+        contradicting=directions.pairs[against].reshape(-1, 2),
+        contradicting_support=directions.num_matches[against],
+        errors=errors,
+    )
+
+
+def with_points(evidence: Evidence, joint: JointGraph) -> Evidence:
+    """Return the evidence with a row for each direction to a point: one match, errors of their own."""
+    own = joint.covariance[len(evidence.support) :]
+    support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
+    if evidence.errors is None:
+        return replace(evidence, support=support)
+    draws = np.random.default_rng(0).standard_normal((len(own), *evidence.errors.shape[1:]))
+    sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+    errors = np.concatenate([evidence.errors, sigmas[:, None, :] * draws])
+    return replace(evidence, support=support, errors=errors)

@@ -1,0 +1,81 @@
+"""Refine the given rotations before cameras are placed: opt-in, see `rotations`."""
+
+from contextlib import ExitStack
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.model import PosedModel, with_turned_cameras
+from sfm_shapefit.commands.stages.clock import Clock
+from sfm_shapefit.commands.stages.inputs import MatchSource, open_source
+from sfm_shapefit.commands.stages.measure import joint_graph, measure_directions
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.placement.place import place
+from sfm_shapefit.results import Inputs
+from sfm_shapefit.rotations.acceptance import refine_rotations
+from sfm_shapefit.rotations.joint_refinement import RayMatches
+
+_REFINEMENT_ROUNDS = 2
+_REFINEMENT_RESIDUAL_DEG = 5.0  # of a direction; beyond it no error of rotations is to blame
+_REFINEMENT_MATCHES = 4_000_000  # in all; 200 MB
+_MATCHES_PER_PAIR = (50, 2000)  # at least and at most; more were no better on any real scene
+
+
+def refined_rotations(
+    model: PosedModel, inputs: Inputs, options: LocateOptions, clock: Clock
+) -> tuple[PosedModel, FloatArray]:
+    """Return the model with refined rotations, and by how many degrees each camera turned, shape (n,).
+
+    Directions need rotations and the refinement needs centres: cameras are placed, rotations refined, and
+    both once more, for with better rotations more pairs have a direction. What a camera may turn is
+    always judged against its given rotation.
+    """
+    turns = np.tile(np.eye(3), (model.num_images, 1, 1))
+    turned, turned_deg = model, np.zeros(model.num_images)
+    for repeat in range(_REFINEMENT_ROUNDS):
+        with ExitStack() as resources:
+            given, current = (resources.enter_context(open_source(m, inputs)) for m in (model, turned))
+            directions = measure_directions(current, options, clock)
+            joint = joint_graph(current, directions, options)
+            placement = place(
+                joint.graph, options.for_placement(), joint.covariance, num_cameras=joint.num_cameras
+            )
+            residuals = placement.assessment.residuals_deg[placement.pairs]
+            near = placement.edges[placement.pairs[residuals <= _REFINEMENT_RESIDUAL_DEG]]
+            rays = _rays_of_pairs(given, directions.usable()[near], placement.cameras)
+        refined = refine_rotations(rays, placement.locations, turns[placement.cameras] if repeat else None)
+        turns[placement.cameras], turned_deg[placement.cameras] = refined.turns, refined.angles_deg
+        turned = with_turned_cameras(model, turns)
+    return turned, turned_deg
+
+
+def _rays_of_pairs(source: MatchSource, rows: IntArray, cameras: IntArray) -> RayMatches:
+    """Return matches of some pairs, evenly picked where a pair has too many.
+
+    Args:
+        source: the images and their matches.
+        rows: (k,) ascending positions of the pairs among all pairs with matches.
+        cameras: (n,) ascending images that become cameras 0 to n - 1; they hold all ends of the pairs.
+    """
+    limit = int(np.clip(_REFINEMENT_MATCHES // max(len(rows), 1), *_MATCHES_PER_PAIR))
+    parts, first = [], 0
+    for batch in source.batches():
+        chosen = rows[(rows >= first) & (rows < first + len(batch.pairs))] - first
+        first += len(batch.pairs)
+        counts = np.diff(batch.offsets)[chosen]
+        picked = [
+            start + np.arange(min(count, limit)) * count // min(count, limit)
+            for start, count in zip(batch.offsets[chosen].tolist(), counts.tolist(), strict=True)
+        ]
+        kept = np.concatenate([np.zeros(0, dtype=np.int64), *picked])
+        pairs = batch.pairs[chosen]
+        angles = 1.0 / source.model.focal_lengths_px[pairs].min(axis=1)
+        parts.append((pairs, np.minimum(counts, limit), batch.rays_i[kept], batch.rays_j[kept], angles))
+    pairs, counts, rays_i, rays_j, angles = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return RayMatches(
+        pairs=np.searchsorted(cameras, pairs),
+        offsets=np.append(0, np.cumsum(counts)),
+        rays_i=rays_i,
+        rays_j=rays_j,
+        pixel_angles=angles,
+    )

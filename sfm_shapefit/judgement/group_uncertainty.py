@@ -1,0 +1,93 @@
+"""How uncertain the locations of rigid bodies are, and how much each direction decides for itself.
+
+As in `uncertainty`, with the centres f of the bodies as unknowns and their scale s held: it is the unit in
+which positions are given. The information about f is the Laplacian of the graph of bodies, its null space the
+translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T f held fixed: the mean of the
+cameras, or one body that stays where it is. All nodes of a body share its covariance.
+"""
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
+from sfm_shapefit.laplacian.operators import apply_incidence_transposed
+from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.rigs.groups import Bodies
+
+_RIDGE = 1e-12  # of each block's trace
+_SHORTEST = 1e-12  # of the longest baseline
+_MAX_BYTES = 2_000_000_000
+
+
+def propagate_bodies(
+    locations: FloatArray,
+    edges: IntArray,
+    information: FloatArray,
+    bodies: Bodies,
+    share: FloatArray,
+    errors: FloatArray | None = None,
+) -> Uncertainty | None:
+    """Return the uncertainty of bodies from the information of the directions between them.
+
+    Args:
+        locations: (n, d) at the solution.
+        edges: (m, 2) pairs that tie the bodies, each between two of them.
+        information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
+        bodies: of the nodes.
+        share: (B,) F, not negative, with sum 1: the bodies whose weighted mean is held fixed.
+        errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
+            information if None.
+
+    Returns:
+        None if the factor would take more than 2 GB.
+
+    Raises:
+        UnsolvableError: if the bodies hang loose.
+    """
+    d = locations.shape[1]
+    baselines = differences(locations, edges)
+    lengths = np.linalg.norm(baselines, axis=1)
+    lengths = np.maximum(lengths, _SHORTEST * lengths.max())
+    units = baselines / lengths[:, None]
+    projectors = np.eye(d) - units[:, :, None] * units[:, None, :]
+    across = projectors @ information @ projectors
+    blocks = across / lengths[:, None, None] ** 2
+    ends = np.ascontiguousarray(bodies.body_of[edges])
+    plan = analyse(bodies.num_bodies, ends)
+    if plan.num_bytes(d) > _MAX_BYTES:
+        return None
+    traces = np.trace(blocks, axis1=1, axis2=2)
+    factor = factorise(plan, blocks + _RIDGE * traces[:, None, None] * np.eye(d))
+    inverse = selected_inverse(factor, ends)
+    i, j = ends.T
+    relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
+    leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
+    covariances = _with_fixed_mean(factor, inverse.nodes, share)
+    if errors is not None:
+        forces = (across @ errors.transpose(0, 2, 1)) / lengths[:, None, None]
+        covariances = scatter(_moved(factor, ends, forces, share))
+    return Uncertainty(
+        covariances=covariances[bodies.body_of],
+        leverages=np.clip(leverages, 0.0, 1.0),
+        gauge=share[bodies.body_of] > 0.0,
+    )
+
+
+def _with_fixed_mean(factor: CholeskyFactor, nodes: FloatArray, share: FloatArray) -> FloatArray:
+    """Return the diagonal blocks of S K^-1 S^T, (B, d, d); K is regular by its grounding."""
+    d = nodes.shape[1]
+    fixed = share[:, None, None] * np.eye(d)
+    product = factor.solve(fixed)
+    middle = np.einsum("nak,nal->kl", fixed, product)
+    covariances: FloatArray = nodes - product - product.transpose(0, 2, 1) + middle
+    return covariances
+
+
+def _moved(factor: CholeskyFactor, ends: IntArray, forces: FloatArray, share: FloatArray) -> FloatArray:
+    """Return S K^-1 D^T f for each of the samples in the forces f (m, d, s), shape (B, d, s)."""
+    count, d = len(share), forces.shape[1]
+    flat = apply_incidence_transposed(ends, np.ascontiguousarray(forces.reshape(len(ends), -1)), count)
+    moved = factor.solve(np.ascontiguousarray(flat.reshape(count, d, -1)))
+    return np.asarray(moved - np.einsum("n,nas->as", share, moved))

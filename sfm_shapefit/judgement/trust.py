@@ -1,0 +1,278 @@
+"""How far each camera is to be trusted, and why not further.
+
+    trust = min(1, agreement / usual) * hold
+
+agreement    the share of the camera's matches with the main body of cameras that agree with the
+             solution, with a prior of a few matches, of which half the square of the median share are for
+             the camera. A pair agrees if its direction
+             lies within 3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts
+             if the direction lies farther off, or if it has none because most of its matches contradict
+             the given rotations. A pair counts with its number of matches, up to a limit; if it agrees,
+             less its leverage: a direction that decides itself where the camera goes is no evidence.
+usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere,
+             having its part of them says nothing against a camera.
+hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median
+             distance of the cameras from their median: 1 where the pairs hold the camera, 1/2 where they
+             leave 10 % open.
+
+So 1 means that a camera's matches agree as is usual in the scene and nothing is loose. Where there is no
+evidence either way, trust is 2/3 in a clean scene, and 2/3 of the median share where pairs are wrong: what
+nothing checks is right as often as the rest. In a clean scene a camera whose matches speak against it as much
+as for it has 1/2 to 2/3, and below 1/2 more speaks against it than for it, or it is loose.
+
+Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
+symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
+they stand to the rest. Counted are only the pairs with the main body of cameras. Bodies are found by
+correlation clustering: two bodies join while the agreeing matches between them outweigh the contradicting
+ones, the strongest first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of
+image and mesh graphs by lifted multicuts", section 4). So each group is judged by all its pairs with the rest
+together. Bodies are about who agrees with whom, not about evidence: leverages do not count there.
+
+Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
+together they count at most half as much as all agreements.
+"""
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.judgement.conditioning import FEW_PAIRS, Conditioning, Looseness
+from sfm_shapefit.viewgraph import ViewGraph
+
+_AGREEING_ANGLE_RAD = np.radians(3.0)
+_AGREEING_SIGMAS = 5.0
+_MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
+_LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
+_PRIOR = 30.0  # matches, half of them for the camera in a clean scene
+_LEAST_MEDIAN = 0.5
+_MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
+_UNKNOWN_SUPPORT = 50.0  # of a pair that does not say
+_USUAL_SHARE = 0.75  # of the median agreement of all cameras: a camera with that much loses nothing
+_HOLD_SHARE = 0.1  # tau, of the cameras' spread
+_LOW = 0.75  # trust below which reasons are given
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What the matches say beyond the directions of a graph."""
+
+    support: IntArray
+    """(m,) matches of each pair of the graph."""
+    contradicting: IntArray
+    """(q, 2) other pairs, whose matches contradict the given rotations."""
+    contradicting_support: IntArray
+    """(q,) their number of matches."""
+    errors: FloatArray | None = None
+    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
+    share keypoints (`shared_noise`); the pairs' errors are independent if None."""
+
+    def restricted_to(self, edges: IntArray, cameras: IntArray, num_cameras: int) -> "Evidence":
+        """Return the evidence for a graph of some of the edges and cameras, renumbered.
+
+        Args:
+            edges: indices of the pairs that are kept, in their new order.
+            cameras: indices of the cameras that are kept, in their new order.
+            num_cameras: of the graph this evidence belongs to.
+        """
+        new = np.full(num_cameras, -1, dtype=np.int64)
+        new[cameras] = np.arange(len(cameras))
+        pairs = new[self.contradicting.reshape(-1, 2)]
+        kept = (pairs >= 0).all(axis=1)
+        return Evidence(
+            support=self.support[edges],
+            contradicting=pairs[kept],
+            contradicting_support=self.contradicting_support[kept],
+            errors=None if self.errors is None else self.errors[edges],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraTrust:
+    """The trust of k cameras, and the reasons for a low one."""
+
+    trust: FloatArray
+    """(k,) in [0, 1]."""
+    agreement: FloatArray
+    """(k,) the first factor."""
+    body: BoolArray
+    """(k,) the main body of cameras, whose pairs count."""
+    reasons: tuple[str, ...]
+    """k sentences, empty where the trust is not low."""
+
+
+def judge_cameras(
+    graph: ViewGraph,
+    locations: FloatArray,
+    angles: FloatArray,
+    sigmas_of_pairs: FloatArray,
+    sigmas: FloatArray,
+    conditioning: Conditioning,
+    leverages: FloatArray,
+    evidence: Evidence | None = None,
+    rigid: IntArray | None = None,
+) -> CameraTrust:
+    """Return the trust of each camera and the reasons for a low one.
+
+    Args:
+        graph: the solved graph.
+        locations: (n, d) its solution.
+        angles: (m,) residual angles in radians.
+        sigmas_of_pairs: (m,) standard deviation of each direction in radians, per axis.
+        sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
+        conditioning: how well the pairs hold its k cameras; nodes beyond are points, whose rays speak for or
+            against a camera like pairs.
+        leverages: (m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside
+            the largest rigid piece of those, and everywhere if unknown.
+        evidence: support and contradicting pairs; unknown if None.
+        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of
+            all its cameras together; every node is its own if None.
+    """
+    num_cameras = len(conditioning.num_pairs)
+    votes = _votes(graph, angles, sigmas_of_pairs, evidence)
+    labels = np.arange(graph.num_cameras) if rigid is None else rigid
+    heard, votes = _checked(votes, leverages), votes.of_bodies(labels)
+    body: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
+    if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
+        signed = np.where(votes.agrees, votes.weights, -votes.weights)
+        body = main_body(len(body), votes.pairs, signed)
+    agreement = _shares(heard.of_bodies(labels), body, int(labels[:num_cameras].max()) + 1)[
+        labels[:num_cameras]
+    ]
+    body = body[labels]
+    usual = _USUAL_SHARE * float(np.median(agreement))
+    hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
+    # Where most cameras have no agreement at all, any agreement is more than usual.
+    relative = agreement / usual if usual > 0.0 else (agreement > 0.0).astype(np.float64)
+    trust = np.minimum(relative, 1.0) * hold
+    few = conditioning.num_pairs <= FEW_PAIRS
+    reasons = [""] * num_cameras
+    for k in np.flatnonzero(trust < _LOW).tolist():
+        reasons[k] = _reason(float(agreement[k]), usual, conditioning.causes[k], bool(few[k]))
+    return CameraTrust(trust=trust, agreement=agreement, body=body[:num_cameras], reasons=tuple(reasons))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Votes:
+    """Pairs that speak for or against their cameras."""
+
+    pairs: IntArray
+    agrees: BoolArray
+    weights: FloatArray
+
+    def of_bodies(self, labels: IntArray) -> "_Votes":
+        """Return the votes between the bodies of these labels (n,) in place of their nodes."""
+        pairs = labels[self.pairs]
+        outer = pairs[:, 0] != pairs[:, 1]
+        return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])
+
+
+def _votes(
+    graph: ViewGraph, angles: FloatArray, sigmas_of_pairs: FloatArray, evidence: Evidence | None
+) -> _Votes:
+    """Collect the pairs that speak, with the weight of their matches."""
+    pairs = graph.edges
+    agrees = angles <= np.maximum(_AGREEING_ANGLE_RAD, _AGREEING_SIGMAS * sigmas_of_pairs)
+    weights = np.full(graph.num_edges, _UNKNOWN_SUPPORT)
+    if evidence is not None:
+        weights = np.concatenate([evidence.support, evidence.contradicting_support]).astype(np.float64)
+        weights = np.minimum(weights, _MAX_SUPPORT)
+        pairs = np.concatenate([pairs, evidence.contradicting.reshape(-1, 2)])
+        agrees = np.concatenate([agrees, np.zeros(len(evidence.contradicting), dtype=np.bool_)])
+    against = float(weights[~agrees].sum())
+    allowed = _LARGEST_CONTRADICTION * float(weights[agrees].sum())
+    weights[~agrees] *= min(1.0, allowed / against) if against > 0.0 else 1.0
+    return _Votes(pairs, agrees, weights)
+
+
+def _checked(votes: _Votes, leverages: FloatArray) -> _Votes:
+    """Return the votes with agreeing pairs counted by how far others check them; as they are if unknown."""
+    if not np.isfinite(leverages).any():
+        return votes
+    checked = np.ones(len(votes.pairs))
+    checked[: len(leverages)] = 1.0 - np.nan_to_num(leverages, nan=1.0)
+    return _Votes(votes.pairs, votes.agrees, np.where(votes.agrees, checked, 1.0) * votes.weights)
+
+
+def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
+    """Return the share of each camera's matches with the body that agree, prior included."""
+    n = len(body)
+    i, j = votes.pairs.T
+    counts = np.zeros((2, n))
+    for own, other in ((i, j), (j, i)):
+        for row, chosen in enumerate((votes.agrees, ~votes.agrees)):
+            used = chosen & body[other]
+            counts[row] += np.bincount(own[used], weights=votes.weights[used], minlength=n)
+    good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
+    spoken = heard > 0.0
+    median = float(np.median(good[spoken] / heard[spoken])) if spoken.any() else 1.0
+    median = max(median, _LEAST_MEDIAN)  # a collapsed answer, with which hardly anything agrees
+    return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
+
+
+def main_body(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:
+    """Return the largest body of nodes that greedy additive edge contraction finds, (n,).
+
+    Args:
+        num_nodes: n.
+        pairs: (m, 2) node indices; repeated pairs add up.
+        weights: (m,) positive where the two nodes belong together, negative where they do not.
+    """
+    ties: list[dict[int, float]] = [{} for _ in range(num_nodes)]
+    for (i, j), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
+        ties[i][j] = ties[j][i] = ties[i].get(j, 0.0) + weight
+    queue = [(-w, i, j) for i, tie in enumerate(ties) for j, w in tie.items() if i < j and w > 0.0]
+    heapq.heapify(queue)
+    members = [[node] for node in range(num_nodes)]
+    while queue:
+        weight, i, j = heapq.heappop(queue)
+        if ties[i].get(j) != -weight:
+            continue  # one of the two has changed since, or is part of another
+        kept, gone = (i, j) if len(ties[i]) >= len(ties[j]) else (j, i)
+        members[kept] += members[gone]
+        members[gone] = []
+        _contract(ties, kept, gone, queue)
+    largest = max(members, key=lambda body: (len(body), -min(body, default=0)))
+    chosen: BoolArray = np.zeros(num_nodes, dtype=np.bool_)
+    chosen[largest] = True
+    return chosen
+
+
+def _contract(
+    ties: list[dict[int, float]], kept: int, gone: int, queue: list[tuple[float, int, int]]
+) -> None:
+    """Hand the ties of one node to another and queue those that became positive."""
+    del ties[kept][gone]
+    for other, weight in ties[gone].items():
+        if other == kept:
+            continue
+        del ties[other][gone]
+        total = ties[kept].get(other, 0.0) + weight
+        ties[kept][other] = ties[other][kept] = total
+        if total > 0.0:
+            heapq.heappush(queue, (-total, min(kept, other), max(kept, other)))
+    ties[gone] = {}
+
+
+def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
+    """Return tau^2 / (tau^2 + sigma^2) of each camera, 1 where sigma is not known."""
+    tau = _HOLD_SHARE * median_spread(centers)
+    if not tau > 0.0:
+        return np.where(np.isinf(largest_sigmas), 0.0, 1.0)
+    return np.asarray(1.0 / (1.0 + (np.nan_to_num(largest_sigmas, nan=0.0, posinf=np.inf) / tau) ** 2))
+
+
+def _reason(agreement: float, usual: float, cause: Looseness | None, few: bool) -> str:
+    """Say why a camera's trust is low."""
+    if cause is Looseness.DISTANCE:
+        return str(cause.value)  # where it stands is arbitrary, and so is what agrees with it there
+    found = []
+    if agreement < usual:
+        found.append("more of its matches contradict it than usual here: its rotation may be wrong")
+    if cause is not None:
+        found.append(cause.value)
+    elif few:
+        found.append(Looseness.FEW_PAIRS.value)
+    return "; ".join(found) or "its pairs leave it somewhat loose"

@@ -1,0 +1,378 @@
+"""What the solved locations say of each pair and camera: residual, verdict, uncertainty, trust.
+
+The residual of a pair is the angle between its measured direction and the solved baseline. It is judged
+against its own covariance and an excess s that all pairs share and that no pair can know of itself, above all
+errors of the given rotations:
+
+    chi2_e = r_e^T (Sigma_e + s^2 I)^-1 r_e,    r_e in the tangent plane of v_e.
+
+s makes the median of chi2 over the agreeing pairs what it should be. Whether a pair agrees is judged with the
+level of all residuals in place of s, which is more: neither covariances nor locations are exact. A residual
+is smaller than its error, because the solution bends towards the measurement: over least squares by the
+redundancy 1 - unknowns / equations, while a sum of norms fits as many directions exactly as it has unknowns,
+and leaves the others alone. The locations tell which of the two they come from.
+
+How uncertain the locations are, and how much a pair decides for itself, is `uncertainty`; what all pairs of a
+camera say together is `trust`.
+"""
+
+import enum
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtri
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
+from sfm_shapefit.judgement.conditioning import LooseGroup, condition
+from sfm_shapefit.judgement.group_uncertainty import propagate_bodies
+from sfm_shapefit.judgement.trust import Evidence, judge_cameras
+from sfm_shapefit.judgement.uncertainty import propagate
+from sfm_shapefit.rigidity import parallel_rigid_pieces
+from sfm_shapefit.solver.program import along, differences
+from sfm_shapefit.solver.rigs import largest_tied
+from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.viewgraph import ViewGraph
+
+_OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
+_LARGEST_FITTED_SHARE = 0.3  # keeps the quantile below 0.65, so that a third of the pairs may be wrong
+_LARGEST_SHARE = 0.9  # of the equations taken up by unknowns: beyond, residuals hardly speak
+_EXACTLY_FITTED = 1e-3  # of the median residual; a normal residual is below it once in a million times
+_MIN_FITTED_SHARE = 0.02  # of the pairs: then the locations come from a sum of norms
+_MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
+_LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
+_BISECTIONS = 50
+_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
+_PART = 10_000  # directions whose error samples are worked on at a time
+_LOOSENING_RAD = 1e-4
+"""Noise for which it is asked at least which nodes are loose: with none, none would be."""
+_REACHES = (np.inf, 1e3, 30.0)
+"""Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
+stands beyond the last does not say how large the scene is."""
+_UNCHECKED_LEVERAGE = 0.99
+"""Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size."""
+
+
+class Verdict(enum.Enum):
+    """What the solution says of a measured direction."""
+
+    INLIER = "inlier"
+    OUTLIER = "outlier"
+    UNDETERMINED = "undetermined"
+    """One of its cameras is not placed, or no other pair checks it, so nothing can be said."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Assessment:
+    """Evidence for each pair and camera of a solved view graph."""
+
+    residuals_deg: FloatArray
+    """(m,) angle between the measured direction and the solved baseline, in [0, 180]."""
+    inliers: BoolArray
+    """(m,) whether the pair agrees with the solution."""
+    leverages: FloatArray
+    """(m,) share of its own fitted direction that an agreeing pair decides itself, in [0, 1]; 0 for outliers,
+    NaN for agreeing pairs outside the largest rigid piece of those."""
+    level_deg: float
+    """Standard deviation, per axis, of the residuals of all pairs together (from their median)."""
+    excess_deg: float
+    """The part of it, per axis, that the pairs' own covariances do not explain."""
+    trust: FloatArray
+    """(k,) of each camera, in [0, 1], see `trust.judge_cameras`."""
+    reasons: tuple[str, ...]
+    """k sentences that say why a trust is low; empty where it is not."""
+    loose_groups: tuple[LooseGroup, ...]
+    """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
+    covariances: FloatArray
+    """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
+    cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
+    NaN, all of them, where the graph is too large for its factor."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(n, d) standard deviation of each location along the axes."""
+        return _standard_deviations(self.covariances)
+
+    def verdict(self, pair: int) -> Verdict:
+        """Return what the solution says of a pair."""
+        if not self.inliers[pair]:
+            return Verdict.OUTLIER
+        checked = self.leverages[pair] < _UNCHECKED_LEVERAGE
+        return Verdict.INLIER if checked else Verdict.UNDETERMINED
+
+
+def assess(
+    graph: ViewGraph,
+    locations: FloatArray,
+    covariance: FloatArray | None = None,
+    evidence: Evidence | None = None,
+    num_cameras: int | None = None,
+    bodies: Bodies | None = None,
+    held: int | None = None,
+    unheld: IntArray | None = None,
+    factor_memory: int = 2000,
+) -> Assessment:
+    """Judge pairs and cameras by a solution.
+
+    Args:
+        graph: the solved view graph.
+        locations: (n, d) its locations.
+        covariance: (m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`,
+            rad^2; NaN where it is unknown, None where all are.
+        evidence: support of the pairs, and pairs that have no direction because their matches contradict the
+            given rotations; unknown if None.
+        num_cameras: k, the first so many nodes are cameras and the others points; all if None.
+        bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
+        held: the body that stays where it is; the mean of the cameras does if None.
+        unheld: nodes that stand where they do for want of anything better, such as those that the finish put
+            back: their standard deviations are infinite, and they hold no others; none if None.
+        factor_memory: MB that the factor for standard deviations may take; of bodies it is small.
+    """
+    freedom = graph.dimension - 1
+    k = graph.num_cameras if num_cameras is None else num_cameras
+    own = np.zeros((graph.num_edges, freedom, freedom)) if covariance is None else np.nan_to_num(covariance)
+    baselines = differences(locations, graph.edges)
+    residuals = _tangential_residuals(graph.directions, baselines)
+    behind = along(baselines, graph.directions) <= 0.0
+    num_bodies = graph.num_cameras if bodies is None else bodies.num_bodies
+    num_unknowns = graph.dimension * (num_bodies - 1) - (1 if bodies is None else 0)
+    excess, inliers = _excess(residuals, own, behind, num_unknowns)
+    information = np.linalg.inv(own + excess**2 * np.eye(freedom))
+
+    bases = tangent_bases(graph.directions)
+    angles = np.linalg.norm(residuals, axis=1)
+    sigma_of_pair = np.sqrt(np.trace(own, axis1=1, axis2=2) / freedom + excess**2)
+    # Exact directions are propagated as if they had some noise, and scaled back.
+    scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
+    information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
+    errors = None if evidence is None else evidence.errors
+    sampled = None if errors is None else _Sampled(errors, excess, scale)
+    separately = partial(_propagated, factor_memory * 1_000_000)
+    propagated = separately if bodies is None else partial(_propagated_over, bodies, held)
+    holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
+    covariances, leverages = propagated(graph, locations, holding, information, k, sampled)
+    leverages[inliers & ~holding] = np.nan
+    covariances = scale**2 * covariances
+    sigmas = _standard_deviations(covariances)
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k, unheld)
+    rigid = None if bodies is None else bodies.body_of
+    judged = judge_cameras(
+        graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
+    )
+    return Assessment(
+        residuals_deg=np.degrees(angles),
+        inliers=inliers,
+        leverages=leverages,
+        level_deg=float(np.degrees(_level(angles, num_unknowns, freedom))),
+        excess_deg=float(np.degrees(excess)),
+        trust=judged.trust,
+        reasons=judged.reasons,
+        loose_groups=conditioning.groups,
+        covariances=covariances,
+    )
+
+
+def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> FloatArray:
+    """Return the residual angles as vectors (m, d - 1) in tangent bases; pi long where cameras coincide."""
+    units = normalized(baselines)
+    angles = np.radians(angle_between_deg(directions, units))
+    tangential = np.einsum("edk,ed->ek", tangent_bases(directions), units)
+    vectors = normalized(tangential) * angles[:, None]  # the angle, also beyond 90 deg
+    lost = ~np.isfinite(vectors).all(axis=1)  # no tangential part: an angle of 0 or pi, or no baseline
+    angles = np.where(np.isnan(angles), np.pi, angles)
+    vectors[lost] = 0.0
+    vectors[lost, 0] = angles[lost]
+    return vectors
+
+
+def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[float, bool]:
+    """Return unknowns / equations, and whether the residuals are those of a sum of norms."""
+    share = num_unknowns / max(freedom * len(angles), 1)
+    middle = float(np.median(angles[angles > 0.0])) if np.any(angles > 0.0) else 0.0
+    fitted = float(np.mean(angles <= _EXACTLY_FITTED * middle))
+    return share, fitted > min(_MIN_FITTED_SHARE, 0.5 * share)
+
+
+def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
+    """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
+    share, is_exact = _fitted_share(angles, num_unknowns, freedom)
+    share = min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE)
+    median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
+    quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
+    shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
+    return max(quantile / (shrunk * float(median_length)), _MIN_LEVEL_RAD)
+
+
+def _excess(
+    residuals: FloatArray, own: FloatArray, behind: BoolArray, num_unknowns: int
+) -> tuple[float, BoolArray]:
+    """Return the excess s in radians and which pairs agree; each decides the other, a few times."""
+    freedom = residuals.shape[1]
+    angles = np.linalg.norm(residuals, axis=1)
+    values, vectors = np.linalg.eigh(own)
+    squares = np.einsum("ekl,ek->el", vectors, residuals) ** 2
+    limit = chdtri(freedom, _OUTLIER_PROBABILITY)
+    used: BoolArray = np.ones(len(angles), dtype=np.bool_)
+    inliers = used
+    for _ in range(_LEVEL_ROUNDS):
+        level = _level(angles[used], num_unknowns, freedom)
+        inliers = (np.sum(squares / (values + level**2), axis=1) <= limit) & ~behind
+        if not inliers.any():
+            return level, inliers
+        if np.array_equal(inliers, used):
+            break
+        used = inliers
+    share, is_exact = _fitted_share(angles[inliers], num_unknowns, freedom)
+    share = min(share, _LARGEST_FITTED_SHARE) if is_exact else min(share, _LARGEST_SHARE)
+    rank = (1.0 + share) / 2.0 if is_exact else 0.5
+    wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
+    return _matching_excess(squares[inliers], values[inliers], rank, wanted), inliers
+
+
+def _matching_excess(squares: FloatArray, variances: FloatArray, rank: float, wanted: float) -> float:
+    """Return s, at least the rounding level, at which a quantile of the chi-squares is as wanted."""
+
+    def too_large(excess: float) -> bool:
+        chi2 = np.sum(squares / (np.maximum(variances, 0.0) + excess**2), axis=1)
+        return float(np.quantile(chi2, rank)) > wanted
+
+    low, high = _MIN_LEVEL_RAD, np.pi
+    if not too_large(low):
+        return low
+    for _ in range(_BISECTIONS):
+        middle = float(np.sqrt(low * high))
+        low, high = (middle, high) if too_large(middle) else (low, middle)
+    return high
+
+
+class _Sampled(NamedTuple):
+    """Samples of the errors of the directions."""
+
+    errors: FloatArray
+    """(m, s, d - 1) that sharing keypoints explains, in tangent bases, radians."""
+    excess: float
+    """Standard deviation of what it does not explain."""
+    scale: float
+    """By which the errors are divided."""
+
+    def parts(self, directions: FloatArray, rows: IntArray) -> Iterator[FloatArray]:
+        """Yield the errors (., s, d) of the given rows in world axes, a part at a time."""
+        random = np.random.default_rng(0)
+        for start in range(0, len(self.errors), _PART):
+            own = self.errors[start : start + _PART]
+            whole = own + self.excess * random.standard_normal(own.shape)
+            first, last = np.searchsorted(rows, (start, start + _PART))
+            chosen = rows[first:last]
+            bases = tangent_bases(directions[chosen]).transpose(0, 2, 1)
+            yield whole[chosen - start] @ bases / self.scale
+
+
+def _standard_deviations(covariances: FloatArray) -> FloatArray:
+    """Return the roots of the diagonals, (n, d)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
+
+
+def _unheld(locations: FloatArray) -> FloatArray:
+    """Return the covariances (n, d, d) of locations that nothing holds."""
+    n, d = locations.shape
+    return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
+
+
+def _propagated(
+    max_bytes: int,
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    sampled: _Sampled | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances (n, d, d) and the leverages (m,).
+
+    Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid. Where
+    baselines of very different lengths make that singular, only its nodes within some radii have any.
+    """
+    unknown = np.full_like(_unheld(locations), np.nan), np.where(inliers, np.nan, 0.0)
+    distances = _distances(locations, num_cameras)
+    for reach in _REACHES:
+        covariances = _unheld(locations)
+        leverages = np.where(inliers, np.nan, 0.0)
+        used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
+        rows = used[parallel_rigid_pieces(graph.num_cameras, graph.edges[used], graph.dimension) == 0]
+        held, edges = np.unique(graph.edges[rows], return_inverse=True)
+        cameras = int(np.sum(held < num_cameras))
+        if cameras < _SMALLEST_RIGID:
+            return covariances, leverages
+        try:
+            samples = None if sampled is None else sampled.parts(graph.directions, rows)
+            found = propagate(
+                locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
+            )
+        except UnsolvableError:  # singular in spite of the ridge
+            continue
+        if found is None:
+            return unknown
+        inside = locations[held[distances[held] <= _REACHES[-1]]]
+        is_loose = (found.sigmas > _extent(inside)).any(axis=1)
+        covariances[held[~is_loose]] = found.covariances[~is_loose]
+        leverages[rows] = found.leverages
+        return covariances, leverages
+    return unknown
+
+
+def _distances(locations: FloatArray, num_cameras: int) -> FloatArray:
+    """Return the distance of each node (n,) from the cameras' median, in their median distances."""
+    cameras = locations[:num_cameras]
+    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
+    return np.asarray(distances / max(median_spread(cameras), np.finfo(np.float64).tiny))
+
+
+def _extent(locations: FloatArray) -> float:
+    """Return the longest side of the box around locations (n, d); 0 of none."""
+    return float(np.ptp(locations, axis=0).max()) if len(locations) else 0.0
+
+
+def _propagated_over(
+    bodies: Bodies,
+    held: int | None,
+    graph: ViewGraph,
+    locations: FloatArray,
+    inliers: BoolArray,
+    information: FloatArray,
+    num_cameras: int,
+    sampled: _Sampled | None,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the covariances (n, d, d) and the leverages (m,) of rigid bodies, their scale held.
+
+    Only the bodies that the inlier pairs tie at these locations have any: those around the one that is held,
+    or most cameras.
+    """
+    covariances = _unheld(locations)
+    leverages = np.where(inliers, np.nan, 0.0)
+    cameras = np.bincount(bodies.body_of[:num_cameras], minlength=bodies.num_bodies)
+    tied = largest_tied(graph.edges[inliers], bodies, cameras, locations, around=held)
+    inside = np.isin(bodies.body_of, tied)
+    rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
+    if len(tied) < 2 or len(rows) == 0:
+        return covariances, leverages
+    nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
+    share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
+    samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
+    part = bodies.restricted_to(nodes)
+    try:
+        found = propagate_bodies(
+            locations[nodes], edges, information[rows], part, share / share.sum(), samples
+        )
+    except UnsolvableError:
+        found = None
+    if found is None:
+        return np.full_like(covariances, np.nan), leverages
+    extent = np.ptp(locations[nodes], axis=0).max()
+    is_loose = (found.sigmas > extent).any(axis=1)
+    covariances[nodes[~is_loose]] = found.covariances[~is_loose]
+    leverages[rows] = found.leverages
+    return covariances, leverages

@@ -1,1 +1,0 @@
-"""`map`: from a database alone to placed cameras; rotations are averaged first."""

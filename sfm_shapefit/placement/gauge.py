@@ -1,0 +1,273 @@
+"""Scale, origin and axes of the answer: what directions cannot tell, chosen by the user and stated.
+
+The program leaves scale and shift free (sum_i t_i = 0, L(T) = kappa); rotations are given, so the axes are
+the input's. A gauge is a scale and a shift of the centres and, with position priors alone, a turn of the
+whole model onto their axes.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import (
+    Similarity,
+    fit_similarity,
+    fit_similarity_l1,
+    median_spread,
+    rotation_angles_deg,
+)
+
+Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
+
+_CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
+_ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
+_COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
+_FEWEST_PRIORS = 2
+_PRIORS_FOR_AXES = 3
+_FLAT = 5.0  # times their residual: a spread across a line that is smaller says nothing of the turn about it
+_KERNEL_WIDTH = 3.0  # standard deviations at which a prior's weight is half
+_REWEIGHTINGS = 20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Gauge:
+    """The map from the solver's locations to the output's units, and the sentence that states it."""
+
+    similarity: Similarity
+    """Scale and shift in the input's axes; its rotation is the identity."""
+    scale: Scale | Literal["fixed"]
+    """The choice that was carried out."""
+    statement: str
+    """What scale, origin and axes the output has, for the report."""
+    axes: FloatArray | None = None
+    """(3, 3) rotation from the input's axes to the output's, about the origin, applied to the whole model
+    after `similarity`; None where the axes are the input's."""
+    warning: str = ""
+    """Why the scale may be rough, if it may."""
+
+    def apply(self, locations: FloatArray) -> FloatArray:
+        """Map the solver's locations (n, 3) to the output's units and axes."""
+        moved = self.similarity.apply(locations)
+        return moved if self.axes is None else np.asarray(moved @ self.axes.T)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PositionPriors:
+    """Measured positions of some cameras, such as GPS, in axes and units of their own."""
+
+    cameras: IntArray
+    """(k,) whose they are, ascending indices without repetition."""
+    positions: FloatArray
+    """(k, 3)"""
+    covariances: FloatArray
+    """(k, 3, 3), in the positions' units squared; NaN where unknown."""
+    statement: str
+    """Where they come from, and what their axes are."""
+
+    def of(self, cameras: IntArray) -> "PositionPriors":
+        """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
+        _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
+        return PositionPriors(
+            cameras=places,
+            positions=self.positions[rows],
+            covariances=self.covariances[rows],
+            statement=self.statement,
+        )
+
+
+def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
+    """Return the gauge of the input's centres: a robust similarity (L1) that keeps the axes.
+
+    Without usable input centres it becomes "unit", and says so.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+    """
+    spread = np.ptp(input_centers, axis=0).max()
+    if spread <= _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
+        return unit_gauge(locations, "the input's centres coincide, so the scale is free; ")
+    size = median_spread(input_centers) or spread
+    similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
+    if similarity.scale <= 0.0:
+        return unit_gauge(locations, "the input's centres contradict the answer; ")
+    off = float(np.median(np.linalg.norm(similarity.apply(locations) - input_centers, axis=1))) / size
+    warning = ""
+    if off > _ROUGH:
+        warning = (
+            f"the input's centres are {off:.0%} of their spread off the answer, so the scale taken from them "
+            "is rough; use the scale unit if they mean nothing"
+        )
+    statement = "input: scale and origin of the input's centres, its axes"
+    return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
+
+
+def metric_gauge(
+    locations: FloatArray, unit: float, input_centers: FloatArray, fixed: BoolArray, *, has_rigs: bool
+) -> Gauge:
+    """Return the gauge of locations whose scale is known, with the origin of what is fixed, or of the input.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        unit: length of the output's unit in theirs.
+        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        fixed: (n,) the cameras that stay where the input has them.
+        has_rigs: whether the scale is that of rigs; else it is that of the fixed cameras.
+    """
+    scale = 1.0 / unit
+    shifts = input_centers - scale * locations
+    if fixed.any():
+        shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
+    elif np.ptp(input_centers, axis=0).max() > _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
+        shift, origin = np.median(shifts, axis=0), "origin of the input's centres"
+    else:
+        shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
+    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=shift)
+    if has_rigs:
+        return Gauge(
+            similarity=similarity,
+            scale="rig",
+            statement=f"rig: the unit of the sensors' offsets in their rigs; {origin}",
+        )
+    return Gauge(similarity=similarity, scale="fixed", statement=f"fixed: scale and {origin}")
+
+
+def moved_gauge(gauge: Gauge, location: FloatArray, center: FloatArray, name: str) -> Gauge:
+    """Return the gauge shifted so that one location (3,) comes to lie at `center`, where `name` stays."""
+    scale = gauge.similarity.scale
+    return replace(
+        gauge,
+        similarity=replace(gauge.similarity, translation=center - scale * location),
+        statement=f"{gauge.statement}; shifted so that {name} stays where it is",
+    )
+
+
+def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:
+    """Return the gauge with the centroid (of locations (n, 3)) at 0 and the median distance from it 1."""
+    centroid = locations.mean(axis=0)
+    scale = 1.0 / float(np.median(np.linalg.norm(locations - centroid, axis=1)))
+    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=-scale * centroid)
+    statement = f"unit: {because}the median distance of the cameras from their centroid, the origin, is 1"
+    return Gauge(similarity=similarity, scale="unit", statement=statement)
+
+
+def distance_gauge(locations: FloatArray, first: int, second: int, distance: float, names: str) -> Gauge:
+    """Return the gauge in which two cameras are so far apart; origin: the centroid.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        first, second: two of the cameras.
+        distance: their distance in the output's units, positive.
+        names: the two cameras, for the statement.
+
+    Raises:
+        InputError: if the two cameras coincide in the answer.
+    """
+    apart = float(np.linalg.norm(locations[first] - locations[second]))
+    if apart <= _COINCIDENT * median_spread(locations):
+        raise InputError(f"the cameras {names} coincide, so their distance sets no scale; choose two others")
+    scale = distance / apart
+    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=-scale * locations.mean(axis=0))
+    statement = f"distance: {names} are {distance:g} apart; origin: the cameras' centroid, axes: the input's"
+    return Gauge(similarity=similarity, scale="distance", statement=statement)
+
+
+def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
+    """Return the gauge of position priors: a robust similarity, with a turn if they determine one.
+
+    From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
+    where these are too small or not known) and the weight 1 / (1 + (chi / 3)^4): a minority of wrong
+    priors has no part in it.
+
+    Args:
+        locations: (n, 3) the solver's answer.
+        priors: of these cameras.
+
+    Raises:
+        InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
+    """
+    if len(priors.cameras) < _FEWEST_PRIORS:
+        raise InputError(
+            f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
+            "give priors of more cameras, or choose another scale"
+        )
+    source, target = locations[priors.cameras], priors.positions
+    size = median_spread(target)
+    if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
+        raise InputError("the position priors coincide, so they set no scale; choose another scale")
+    turns = len(source) >= _PRIORS_FOR_AXES
+    found, weights, level = _fit_to_priors(source, priors, size, rotate=turns)
+    across = np.sqrt(np.linalg.svd(_centred(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
+    if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
+        turns = False
+        found, weights, level = _fit_to_priors(source, priors, size, rotate=False)
+    if found.scale <= 0.0:
+        raise InputError(
+            "the position priors contradict the cameras that were found; check that names and axes are right"
+        )
+    return Gauge(
+        similarity=Similarity(
+            scale=found.scale, rotation=np.eye(3), translation=found.rotation.T @ found.translation
+        ),
+        scale="prior",
+        axes=found.rotation if turns else None,
+        statement=_prior_statement(priors, found, weights, level, turns=turns),
+        warning=_prior_warning(level, size, turns=turns),
+    )
+
+
+def _fit_to_priors(
+    source: FloatArray, priors: PositionPriors, size: float, *, rotate: bool
+) -> tuple[Similarity, FloatArray, float]:
+    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals."""
+    target = priors.positions
+    found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
+    sigmas = np.sqrt(np.trace(priors.covariances, axis1=1, axis2=2) / 3.0)
+    sigmas = np.where(np.isfinite(sigmas), sigmas, 0.0)
+    weights = np.ones(len(source))
+    level = 0.0
+    for _ in range(_REWEIGHTINGS):
+        residuals = np.linalg.norm(found.apply(source) - target, axis=1)
+        level = float(np.median(residuals)) / 1.538  # of a 3-vector of unit variance per axis
+        spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size)
+        weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
+        found = fit_similarity(source, target, weights / spread**2, rotate=rotate)
+    return found, weights, level
+
+
+def _centred(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """Return sqrt(weight) times the points from their weighted mean, (n, 3)."""
+    mean = weights @ points / weights.sum()
+    return np.asarray(np.sqrt(weights)[:, None] * (points - mean))
+
+
+def _prior_statement(
+    priors: PositionPriors, found: Similarity, weights: FloatArray, level: float, *, turns: bool
+) -> str:
+    agreeing = int(np.sum(weights >= 0.5))
+    axes = (
+        f"turned by {float(rotation_angles_deg(found.rotation)):.1f} deg onto theirs"
+        if turns
+        else "axes: the input's"
+    )
+    return (
+        f"prior: {priors.statement}; {agreeing} of {len(weights)} agree, to {level:.3g} per axis; "
+        f"origin: theirs, {axes}"
+    )
+
+
+def _prior_warning(level: float, size: float, *, turns: bool) -> str:
+    if level > _ROUGH * size:
+        return (
+            f"the position priors are {level / size:.0%} of their spread off the answer, so scale and axes "
+            "taken from them are rough; check them"
+        )
+    if not turns:
+        return (
+            "the position priors lie on a line or are fewer than three, so the axes are kept as the input "
+            "has them; they need not be those of the priors"
+        )
+    return ""

@@ -1,0 +1,1 @@
+"""From a convex start to the locations that are kept: starts compared, refined in angles, strays reset."""

@@ -1,0 +1,112 @@
+"""Angular refinement with measured positions of some nodes: directions and anchors in one robust cost.
+
+To the terms of `angular`, at the levels that its refinement ended with, comes one for each anchor,
+
+    k^2 / 2 atan(chi2_a / k^2),    chi2_a = (t_a - p_a)^T Omega_a (t_a - p_a),
+
+with the same kernel, so that an anchor far off says nothing. Anchors are taken as pairs with one more node,
+which stands at the origin: the normal matrix is a block Laplacian still, and what it leaves open, a shift of
+everything, is settled by that node. Units are those of the anchors; directions do not mind.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.refinement.angular import KERNEL_WIDTH, AngularTerms, Metric
+from sfm_shapefit.solver.program import adjoint
+from sfm_shapefit.viewgraph import ViewGraph
+
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
+_MAX_STEPS = 40
+_CONVERGED = 1e-9  # relative decrease of the cost that counts as none
+
+
+class Anchors(NamedTuple):
+    """Measured positions."""
+
+    nodes: IntArray
+    """(k,) whose they are."""
+    positions: FloatArray
+    """(k, d)"""
+    information: FloatArray
+    """(k, d, d) inverse covariances."""
+
+
+def refine_anchored(
+    graph: ViewGraph, start: FloatArray, metric: Metric, levels: FloatArray, anchors: Anchors
+) -> FloatArray:
+    """Return locations (n, d), in the anchors' units, of least cost of directions and anchors together.
+
+    Args:
+        graph: a connected view graph.
+        start: (n, d) locations near the anchors.
+        metric: covariance and class of each pair.
+        levels: (number of classes,) in radians.
+        anchors: measured positions of some nodes.
+    """
+    problem = _Problem(AngularTerms(graph, metric, levels), anchors)
+    t, damping = start, _FIRST_DAMPING
+    cost = problem.cost(t)
+    for _ in range(_MAX_STEPS):
+        moved, damping, lower = _step(problem, t, damping, cost)
+        if cost - lower <= _CONVERGED * cost:
+            break
+        t, cost = moved, lower
+    return t
+
+
+class _Problem:
+    """The joint cost and its normal equations; the last node is the origin."""
+
+    def __init__(self, terms: AngularTerms, anchors: Anchors) -> None:
+        n = terms.graph.num_cameras
+        links = np.stack([anchors.nodes, np.full(len(anchors.nodes), n)], axis=1)
+        self.terms, self.anchors, self.num_nodes = terms, anchors, n + 1
+        self.edges = np.concatenate([terms.graph.edges, links])
+        neighbours = adjacency(n + 1, self.edges)
+        plan = plan_factorisation(neighbours, self.edges, best_order(neighbours))
+        self.factor: CholeskyFactor = allocate_factor(plan, terms.graph.dimension)
+
+    def cost(self, t: FloatArray) -> float:
+        """Return the cost at t, (n, d)."""
+        return self.terms.cost(t) + float(
+            np.sum(0.5 * KERNEL_WIDTH**2 * np.arctan(self._chi2(t) / KERNEL_WIDTH**2))
+        )
+
+    def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
+        blocks, damped, gradient = self.terms.linearised(t)
+        weights = 1.0 / (1.0 + (self._chi2(t) / KERNEL_WIDTH**2) ** 2)
+        own = weights[:, None, None] * self.anchors.information
+        pull = np.einsum("kab,kb->ka", own, t[self.anchors.nodes] - self.anchors.positions)
+        right = -adjoint(np.concatenate([gradient, pull]), self.edges, self.num_nodes)
+        return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right
+
+    def _chi2(self, t: FloatArray) -> FloatArray:
+        off = t[self.anchors.nodes] - self.anchors.positions
+        return np.asarray(np.einsum("ka,kab,kb->k", off, self.anchors.information, off))
+
+
+def _step(problem: _Problem, t: FloatArray, damping: float, before: float) -> tuple[FloatArray, float, float]:
+    """Take one step that lowers the cost; return locations, damping and the cost, the same if none does."""
+    blocks, damped, right = problem.normal_equations(t)
+    while damping <= _MOST_DAMPING:
+        try:
+            problem.factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(t.shape[1]))
+        except UnsolvableError:
+            damping *= 10.0
+            continue
+        step = problem.factor.solve(right)
+        proposed = t + step[:-1] - step[-1]
+        after = problem.cost(proposed)
+        if after < before:
+            return proposed, max(damping / 10.0, _LEAST_DAMPING), after
+        damping *= 10.0
+    return t, _FIRST_DAMPING, before

@@ -1,0 +1,423 @@
+"""Robust refinement of locations in the angles of their directions: the common finish of both convex starts.
+
+With d_e = t_i - t_j and u_e = d_e / |d_e|, the residual u_e - v_e does not depend on lengths, so that nothing
+can be gained by shrinking, as it can in the convex programs. It is judged in the direction's own metric,
+
+    chi2_e = (u_e - v_e)^T M_e (u_e - v_e),    M_e = B_e (Sigma_e + s^2 I)^-1 B_e^T + m_e v_e v_e^T,
+
+Sigma_e the covariance of the direction, s the level of all residuals of its class together, m_e the mean
+eigenvalue of the first term. It counts by the arctangent kernel, with k = 3,
+
+    minimise  sum_e w_e / 2 * k^2 atan(chi2_e / k^2),
+
+flat where residuals are noise and as deaf to outliers as that of Geman and McClure, which takes 18 % more
+error than least squares on the right directions alone, where this takes 4 %. While the level falls, that one
+is used all the same: it lets go of a wrong direction early, where this may settle for a larger level.
+
+The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
+A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
+Laplacian, and so does the damping, which resists relative changes of length: lambda w_e tr(M_e) / |d_e|^2.
+It never ends, and keeps a camera whose pairs are all rejected from flying off.
+
+Sources: the residual: Zhuang, Cheong and Lee, "Baseline desensitizing in translation averaging", CVPR 2018,
+with angles in place of its chords; the kernel and its graduation: Yang, Antonante, Tzoumas and Carlone,
+"Graduated non-convexity for robust spatial perception", RA-L 2020.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from scipy.special import chdtri
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import median_spread, tangent_bases
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
+from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.viewgraph import ViewGraph
+
+KERNEL_WIDTH = 3.0
+"""k: a residual of so many standard deviations counts half of what it can."""
+
+_FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
+_LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH  # exact data: a smaller level would reject pairs for their rounding
+_LEAST_SHARE = 0.2  # of a class inside the kernel, below which its level stays: most of it is not fitted yet
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
+_SHORTEST = 1e-3  # of the median length: the floor under |d|, where a direction says nothing
+_SETTLED = 0.03  # relative change of the levels that counts as none
+_CONVERGED = 1e-9  # relative decrease of the cost that counts as none
+_STILL = 1e-6  # move, as a share of the extent, of all but a tenth of the nodes, that counts as none
+_ALIKE = 1e-6  # relative difference of costs that says that two refinements end at the same place
+_HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival it does not catch up
+_MAX_STEPS = 60
+_MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
+_MAX_BYTES = 2_000_000_000
+
+
+class NormalFactor(Protocol):
+    """What solves the normal equations of a step: a factor of the Laplacian, or of that over bodies."""
+
+    def refactor(self, weights: FloatArray, /) -> None:
+        """Factor the matrix of edge blocks (m, d, d), or raise UnsolvableError."""
+
+    def solve(self, rhs: FloatArray, /) -> FloatArray:
+        """Return the step of the locations, (n, d), for a right-hand side of that shape."""
+
+
+class Metric(NamedTuple):
+    """What a residual is judged by."""
+
+    covariance: FloatArray | None
+    """(m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; None if unknown."""
+    classes: IntArray
+    """(m,) the class of each pair, 0, 1, ...; each has a level of its own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AngularResult:
+    """Locations refined in angles."""
+
+    locations: FloatArray
+    """(n, d) centred, of unit norm."""
+    levels_rad: FloatArray
+    """(number of classes,) the s at which it ended."""
+    cost: float
+    """At these levels; see `robust_cost`."""
+    iterations: int
+    """Factorisations."""
+
+
+def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFactor | IterativeNormal | None:
+    """Return what the refinement solves its steps with; None if its factor would take too much memory.
+
+    Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
+    few steps. On long chains they need many, but there a factor is little work.
+    """
+    neighbours = adjacency(graph.num_cameras, graph.edges)
+    tree = best_order(neighbours)
+    if tree.flops * graph.dimension**3 > _MAX_FLOPS:
+        return IterativeNormal(graph)
+    plan = plan_factorisation(neighbours, graph.edges, tree)
+    return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
+
+
+def refine_angles(
+    graph: ViewGraph,
+    start: FloatArray,
+    metric: Metric,
+    plan: SymbolicFactor | NormalFactor,
+    rival: FloatArray | None = None,
+) -> AngularResult:
+    """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
+
+    Args:
+        graph: a connected view graph.
+        start: (n, d) locations; their scale does not matter.
+        metric: covariance and class of each pair.
+        plan: what `plan_refinement` says; or memory for a factor, such as that over bodies, in which case
+            locations are and stay those of the bodies.
+        rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
+            as low as these, and where it clearly cannot.
+
+    Returns:
+        Locations whose cost at the final levels is not above that of the start: these, if nothing better
+        was found.
+    """
+    factor: NormalFactor = (
+        allocate_factor(plan, graph.dimension) if isinstance(plan, SymbolicFactor) else plan
+    )
+    spread = _spread(graph, metric)
+    first = _unit(start)
+    other = None if rival is None else _unit(rival)
+    t, damping, steps = first, _FIRST_DAMPING, 0
+    levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
+    while steps < _MAX_STEPS:
+        lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
+        settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
+        levels = levels if settled else lower
+        information = _information(graph, spread, levels[metric.classes])
+        moved, damping, before, after = _step(graph, information, factor, t, damping, steep=not settled)
+        still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
+        t, steps = moved, steps + 1
+        if settled and still:
+            break
+        if settled and other is not None and _is_decided(before, after, _cost(graph, information, other)):
+            break
+    information = _information(graph, spread, levels[metric.classes])
+    cost, first_cost = _cost(graph, information, t), _cost(graph, information, first)
+    if first_cost < cost:
+        t, cost = first, first_cost
+    return AngularResult(locations=t, levels_rad=levels, cost=cost, iterations=steps)
+
+
+def _is_decided(before: float, after: float, rival: float) -> bool:
+    """Whether a cost has reached the rival's, or stays above it even if it falls many times as much again."""
+    return abs(after - rival) <= _ALIKE * rival or after - rival > _HOPELESS * (before - after)
+
+
+def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
+    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 times its weight.
+
+    Args:
+        graph: the view graph.
+        locations: (n, d).
+        metric: covariance and class of each pair.
+        levels: (number of classes,) in radians.
+    """
+    information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    return _cost(graph, information, _unit(locations))
+
+
+class AngularTerms:
+    """The terms of the directions at given levels, for a refinement that adds others to them."""
+
+    def __init__(self, graph: ViewGraph, metric: Metric, levels: FloatArray) -> None:
+        self.graph = graph
+        self._information = _information(graph, _spread(graph, metric), levels[metric.classes])
+
+    def cost(self, locations: FloatArray) -> float:
+        """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
+        return _cost(self.graph, self._information, locations)
+
+    def linearised(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
+        return _linearised(self.graph, self._information, locations)
+
+
+def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
+    """Return which pairs fit the locations, (m,): those of chi2 below k^2.
+
+    Args:
+        graph: the view graph.
+        locations: (n, d).
+        metric: covariance and class of each pair.
+        levels: (number of classes,) in radians.
+    """
+    information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    residuals = _residuals(graph, _unit(locations))
+    chi2 = np.einsum("ea,eab,eb->e", residuals, information, residuals)
+    return np.asarray(chi2 < KERNEL_WIDTH**2)
+
+
+def residual_levels(
+    graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray
+) -> FloatArray:
+    """Return the level of each class, from the median of the residuals that its kernel does not reject.
+
+    Args:
+        graph: the view graph.
+        locations: (n, d).
+        metric: whose classes are used; own covariances are part of the level.
+        levels: (number of classes,) the present ones, radians.
+    """
+    freedom = graph.dimension - 1
+    equations = freedom * graph.num_edges
+    unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
+    median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # of a residual of unit variance per axis
+    chords = _chords(graph, _unit(locations))
+    found = np.empty_like(levels)
+    for c, level in enumerate(levels):
+        own = chords[metric.classes == c]
+        inside = own[own < KERNEL_WIDTH * level]
+        few = len(inside) < _LEAST_SHARE * len(own) or len(own) == 0
+        found[c] = level if few else np.median(inside) / median_length
+    return np.maximum(found, _LEAST_LEVEL_RAD)
+
+
+def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] | None:
+    """Return the axes (m, d, d - 1) and variances (m, d - 1) of each direction; None if all are unknown.
+
+    A covariance that is not finite is unknown, and counts as 0: the level alone speaks for the pair.
+    """
+    if metric.covariance is None:
+        return None
+    known = np.asarray(np.isfinite(metric.covariance).all(axis=(1, 2)))
+    variances, axes = np.linalg.eigh(np.where(known.reshape(-1, 1, 1), metric.covariance, 0.0))
+    return np.asarray(tangent_bases(graph.directions) @ axes), np.maximum(variances, 0.0)
+
+
+def _information(
+    graph: ViewGraph, spread: tuple[FloatArray, FloatArray] | None, level: FloatArray
+) -> FloatArray:
+    """Return M_e, (m, d, d), for the level s of each pair, (m,)."""
+    m, d = graph.directions.shape
+    if spread is None:
+        return np.asarray(np.eye(d) / level[:, None, None] ** 2)
+    information = np.empty((m, d, d))
+    _inform(*spread, graph.directions, level, information)
+    return information
+
+
+def _step(
+    graph: ViewGraph,
+    information: FloatArray,
+    factor: NormalFactor,
+    t: FloatArray,
+    damping: float,
+    *,
+    steep: bool = False,
+) -> tuple[FloatArray, float, float, float]:
+    """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
+    before = _cost(graph, information, t, steep)
+    blocks, damped, gradient = _linearised(graph, information, t, steep)
+    right = -adjoint(gradient, graph.edges, graph.num_cameras)
+    while damping <= _MOST_DAMPING:
+        try:
+            factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(graph.dimension))
+        except UnsolvableError:  # too little of the matrix is left under these weights
+            damping *= 10.0
+            continue
+        proposed = _unit(t + factor.solve(right))
+        after = _cost(graph, information, proposed, steep)
+        if after < before:
+            return proposed, max(damping / 10.0, _LEAST_DAMPING), before, after
+        damping *= 10.0
+    return t, _FIRST_DAMPING, before, before
+
+
+def _unit(t: FloatArray) -> FloatArray:
+    """Return the locations centred and of unit norm."""
+    centred = t - t.mean(axis=0)
+    return np.asarray(centred / np.sqrt(np.sum(centred * centred)))
+
+
+def _motion(t: FloatArray, moved: FloatArray) -> float:
+    """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
+
+    A few loose nodes may wander for long while nothing else changes; in a long chain the cost may hardly
+    fall while all of it still moves.
+    """
+    return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
+
+
+def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return u_e - v_e, (m, d)."""
+    baselines = differences(t, graph.edges)
+    lengths = np.linalg.norm(baselines, axis=1, keepdims=True)
+    units = baselines / np.maximum(lengths, _SHORTEST * np.median(lengths))
+    return np.asarray(units - graph.directions)
+
+
+def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return |u_e - v_e|, (m,), which is the residual angle where that is small."""
+    return np.asarray(np.linalg.norm(_residuals(graph, t), axis=1))
+
+
+def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False) -> float:
+    baselines = differences(t, graph.edges)
+    floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
+    return float(_sum_of_kernels(baselines, graph.directions, graph.weights, information, floor, steep))
+
+
+def _linearised(
+    graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
+    m, d = graph.directions.shape
+    baselines = differences(t, graph.edges)
+    floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
+    blocks, damped, gradient = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
+    out = (blocks, damped, gradient)
+    _linearise(baselines, graph.directions, graph.weights, information, floor, steep, out)
+    return blocks, damped, gradient
+
+
+@kernel(exact=True)
+def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
+    """Write sum_a q_a q_a^T / (variance_a + level^2) + m v v^T."""
+    m, d = v.shape
+    for e in range(m):
+        out[e] = 0.0
+        mean = 0.0
+        for k in range(d - 1):
+            inverse = 1.0 / (variances[e, k] + level[e] ** 2)
+            mean += inverse / (d - 1)
+            for a in range(d):
+                for b in range(d):
+                    out[e, a, b] += inverse * axes[e, a, k] * axes[e, b, k]
+        for a in range(d):
+            for b in range(d):
+                out[e, a, b] += mean * v[e, a] * v[e, b]
+
+
+@kernel(exact=True)
+def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool) -> float:
+    """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2), rho(x) = atan x, or x / (1 + x) if `steep`."""
+    m, d = v.shape
+    total = 0.0
+    residual = np.empty(d)
+    for e in range(m):
+        length = 0.0
+        for a in range(d):
+            length += baselines[e, a] ** 2
+        length = max(np.sqrt(length), floor)
+        for a in range(d):
+            residual[a] = baselines[e, a] / length - v[e, a]
+        chi2 = 0.0
+        for a in range(d):
+            for b in range(d):
+                chi2 += residual[a] * information[e, a, b] * residual[b]
+        x = chi2 / KERNEL_WIDTH**2
+        total += 0.5 * w[e] * KERNEL_WIDTH**2 * (x / (1.0 + x) if steep else np.arctan(x))
+    return total
+
+
+@kernel(exact=True)
+def _linearise(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool, out: Any) -> None:
+    """Write J^T M J, the damping's weight, and J^T M r of each pair, times the kernel's weight.
+
+    J = (I - u u^T) / |d|, and I / floor where |d| is below the floor, for u = d / floor there.
+    """
+    blocks, damped, gradient = out
+    m, d = v.shape
+    u, pull = np.empty(d), np.empty(d)
+    across, half = np.empty((d, d)), np.empty((d, d))
+    for e in range(m):
+        length = 0.0
+        for a in range(d):
+            length += baselines[e, a] ** 2
+        radial = 1.0 if length > floor * floor else 0.0
+        length = max(np.sqrt(length), floor)
+        for a in range(d):
+            u[a] = baselines[e, a] / length
+        for a in range(d):
+            for b in range(d):
+                across[a, b] = ((1.0 if a == b else 0.0) - radial * u[a] * u[b]) / length
+        chi2, trace = 0.0, 0.0
+        for a in range(d):
+            pull[a] = 0.0
+            for b in range(d):
+                pull[a] += information[e, a, b] * (u[b] - v[e, b])
+            chi2 += (u[a] - v[e, a]) * pull[a]
+            trace += information[e, a, a]
+        x = chi2 / KERNEL_WIDTH**2
+        weight = w[e] / ((1.0 + x) ** 2 if steep else 1.0 + x * x)
+        damped[e] = w[e] * trace / (d * length * length)
+        for a in range(d):
+            gradient[e, a] = 0.0
+            for b in range(d):
+                gradient[e, a] += weight * across[a, b] * pull[b]
+        _congruence(weight, across, information[e], half, blocks[e])
+
+
+@kernel(exact=True)
+def _congruence(weight: float, a: Any, middle: Any, half: Any, out: Any) -> None:
+    """Write weight * a^T middle a of symmetric a into `out`."""
+    d = len(a)
+    for i in range(d):
+        for j in range(d):
+            half[i, j] = 0.0
+            for k in range(d):
+                half[i, j] += middle[i, k] * a[k, j]
+    for i in range(d):
+        for j in range(d):
+            out[i, j] = 0.0
+            for k in range(d):
+                out[i, j] += weight * a[i, k] * half[k, j]

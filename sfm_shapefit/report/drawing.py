@@ -1,0 +1,351 @@
+"""What is drawn of a result: cameras, pairs and points as plain arrays. Page, meshes and viewer share it.
+
+Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a scene can be
+made of a result in memory or of its files. Positions are in the output's units and axes; what has no
+position holds NaN. Bare graphs of two dimensions lie in the plane z = 0, of more than three dimensions the
+first three are drawn.
+"""
+
+import enum
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.results.tables import CameraRow, PairRow
+
+if TYPE_CHECKING:
+    import pycolmap
+
+    from sfm_shapefit.colmap.model import PosedModel
+
+MAX_POINTS = 20_000
+"""Points that are drawn; more are thinned evenly."""
+_FAR_POINT = 4.0  # times the distance from the median within which 90 % of points and cameras lie
+_FRUSTUM_SHARE = 0.4  # depth of a frustum, of the median distance between neighbours
+_FRUSTUM_OF_EXTENT = (0.008, 0.05)  # and its limits, of the extent
+_HALF_SIZES = (0.15, 1.2)  # limits of half a picture's side over its focal length: fisheyes have no pyramid
+_UPRIGHT = 0.1  # weight of "the pictures' y axes point down" beside "their x axes are level"
+
+
+class PairClass(enum.IntEnum):
+    """What became of a pair, as the page counts and colours it."""
+
+    AGREES = 0
+    CONTRADICTS = 1
+    UNDETERMINED = 2
+    NO_DIRECTION = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Poses:
+    """How images look, by row; NaN where it is not known."""
+
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3)"""
+    half_sizes: FloatArray
+    """(n, 2) half the width and height of the picture at distance 1, limited to what can be drawn."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cameras:
+    """The n rows of cameras.csv."""
+
+    names: tuple[str, ...]
+    placed: BoolArray
+    reasons: tuple[str, ...]
+    pieces: IntArray
+    """(n,) -1 where there is none."""
+    degrees: IntArray
+    trust: FloatArray
+    centers: FloatArray
+    """(n, 3)"""
+    sigmas: FloatArray
+    """(n,) largest standard deviation over the axes, in the output's units; NaN where it is not known."""
+    poses: Poses
+    """Rotations in the output's axes, pictures; `poses.centers` are the input's, in its own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pairs:
+    """The m rows of pairs.csv."""
+
+    cameras: IntArray
+    """(m, 2) rows of `Cameras`."""
+    classes: IntArray
+    """(m,) values of `PairClass`."""
+    support: IntArray
+    weights: FloatArray
+    leverages: FloatArray
+    dual_norms: FloatArray
+    residuals_deg: FloatArray
+    """(m,) at the output's centres."""
+    certified_deg: FloatArray
+    """(m,) at the convex optimum, before any refinement; NaN where it is not known."""
+    input_deg: FloatArray
+    """(m,) at the input's centres; NaN where those mean nothing."""
+    reasons: tuple[str, ...]
+
+    def worst_first(self) -> IntArray:
+        """Return the rows, those that contradict the solution most first, those without a direction last."""
+        rank = np.array([2, 0, 1, 3])[self.classes]
+        order: IntArray = np.lexsort((-self.support, -np.nan_to_num(self.residuals_deg), rank))
+        return order
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Points:
+    """The 3D points that are drawn."""
+
+    positions: FloatArray
+    """(k, 3)"""
+    colors: IntArray
+    """(k, 3) in 0..255."""
+    num_all: int
+    """How many the model has."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Scene:
+    """Everything that is drawn."""
+
+    cameras: Cameras
+    pairs: Pairs
+    points: Points
+    axes: FloatArray
+    """(3, 3) rows: to the right, forward and up as seen by the cameras, in the output's axes."""
+    frustum_depth: float
+    """In the output's units."""
+    dimension: int = 3
+    """Of the graph; others than 3 are bare graphs."""
+    input_is_aligned: bool = False
+    """Whether the input's centres are in the output's units, so that both can be drawn together."""
+    history: tuple[tuple[int, float, float | None], ...] = field(default=())
+    """Iteration, objective and bound of the convex solve, as far as they were recorded."""
+
+    @property
+    def extent(self) -> float:
+        """Diagonal of the box around the placed cameras, in the output's units."""
+        placed = self.cameras.centers[self.cameras.placed]
+        return float(np.linalg.norm(np.ptp(placed, axis=0))) if len(placed) else 0.0
+
+
+def build_scene(
+    cameras: Sequence[CameraRow],
+    pairs: Sequence[PairRow],
+    *,
+    model: "PosedModel | None" = None,
+    original: "PosedModel | None" = None,
+    turn: FloatArray | None = None,
+    points: "pycolmap.Reconstruction | None" = None,
+    certified: FloatArray | None = None,
+    input_is_aligned: bool = False,
+    dimension: int = 3,
+    history: Sequence[tuple[int, float, float | None]] = (),
+) -> Scene:
+    """Return the scene of a result's rows.
+
+    Args:
+        cameras, pairs: rows of the tables.
+        model: where rotations and pictures come from; unknown if None.
+        original: the input, for its centres; unknown if None.
+        turn: (3, 3) from the axes of `model` to the output's; None if they are the same.
+        points: the reconstruction whose 3D points are drawn; none if None.
+        certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
+        input_is_aligned: the input's centres are in the output's units.
+        dimension: of the graph.
+        history: iteration, objective and bound of the solve.
+    """
+    names = tuple(row.name for row in cameras)
+    known, before = (
+        _unknown_poses(len(names)) if source is None else poses_of(source, names)
+        for source in (model, original)
+    )
+    rotations = known.rotations if turn is None else known.rotations @ turn.T
+    poses = replace(known, rotations=rotations, centers=before.centers)
+    own = _cameras(cameras, names, poses)
+    positions = own.centers[own.placed]
+    drawn = _points(points, positions)
+    return Scene(
+        cameras=own,
+        pairs=_pairs(pairs, own, certified),
+        points=drawn,
+        axes=view_axes(poses.rotations[own.placed]),
+        frustum_depth=_frustum_depth(positions),
+        dimension=dimension,
+        input_is_aligned=input_is_aligned,
+        history=tuple(history),
+    )
+
+
+def poses_of(model: "PosedModel", names: Sequence[str]) -> Poses:
+    """Return rotations, centres and pictures of a model's images, by name; NaN for those it has not."""
+    found = _unknown_poses(len(names))
+    row_of = {name: row for row, name in enumerate(names)}
+    sizes: dict[int, tuple[float, float]] = {}
+    for k, (image_id, name) in enumerate(zip(model.image_ids.tolist(), model.names, strict=True)):
+        row = row_of.get(name)
+        if row is None:
+            continue
+        camera_id = model.reconstruction.image(image_id).camera_id
+        if camera_id not in sizes:
+            camera = model.reconstruction.camera(camera_id)
+            focal_length = 2.0 * float(model.focal_lengths_px[k])
+            sizes[camera_id] = camera.width / focal_length, camera.height / focal_length
+        found.rotations[row], found.centers[row] = model.rotations[k], model.centers[k]
+        found.half_sizes[row] = np.clip(sizes[camera_id], *_HALF_SIZES)
+    return found
+
+
+def frustum_corners(scene: Scene, rows: IntArray, centers: FloatArray) -> FloatArray:
+    """Return the picture corners of cameras in the world's axes, shape (k, 4, 3), around each picture.
+
+    Args:
+        scene: rotations, pictures and depth.
+        rows: (k,) cameras with a rotation.
+        centers: (k, 3) where they stand.
+    """
+    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    halves = scene.cameras.poses.half_sizes[rows]
+    in_camera = np.concatenate([signs * halves[:, None, :], np.ones((len(rows), 4, 1))], axis=2)
+    rotations = scene.cameras.poses.rotations[rows]
+    corners: FloatArray = centers[:, None, :] + scene.frustum_depth * in_camera @ rotations
+    return corners
+
+
+def view_axes(rotations: FloatArray) -> FloatArray:
+    """Return right, forward and up, as rows, as most cameras see them; the world's axes if there are none.
+
+    People hold cameras level: up is the direction most orthogonal to the pictures' x axes and, as far as that
+    leaves it open, opposite to their y axes.
+
+    Args:
+        rotations: (n, 3, 3) cam_from_world.
+    """
+    rotations = rotations[np.isfinite(rotations).all(axis=(1, 2))]
+    if len(rotations) == 0:
+        return np.eye(3)
+    x, y, z = (rotations[:, axis] for axis in range(3))
+    _, vectors = np.linalg.eigh((x.T @ x - _UPRIGHT * y.T @ y) / len(rotations))
+    up = vectors[:, 0]
+    leaning = (y.mean(axis=0) @ up, z.mean(axis=0) @ up)
+    up = -up if max(leaning, key=abs) > 0.0 else up
+    forward = z.mean(axis=0) - (z.mean(axis=0) @ up) * up
+    if np.linalg.norm(forward) < _UPRIGHT:  # they look all around
+        forward = np.eye(3)[np.argmin(np.abs(up))]
+        forward = forward - (forward @ up) * up
+    forward = forward / np.linalg.norm(forward)
+    return np.stack([np.cross(forward, up), forward, up])
+
+
+def _unknown_poses(n: int) -> Poses:
+    return Poses(
+        rotations=np.full((n, 3, 3), np.nan),
+        centers=np.full((n, 3), np.nan),
+        half_sizes=np.full((n, 2), np.nan),
+    )
+
+
+def _cameras(rows: Sequence[CameraRow], names: tuple[str, ...], poses: Poses) -> Cameras:
+    centers = np.full((len(rows), 3), np.nan)
+    for k, row in enumerate(rows):
+        if row.center:
+            centers[k] = _in_three_dimensions(np.array(row.center))
+    return Cameras(
+        names=names,
+        placed=np.array([row.placed for row in rows], dtype=np.bool_),
+        reasons=tuple(row.reason for row in rows),
+        pieces=np.array([-1 if row.piece is None else row.piece for row in rows], dtype=np.int64),
+        degrees=np.array([row.degree for row in rows], dtype=np.int64),
+        trust=np.array([row.trust for row in rows], dtype=np.float64),
+        centers=centers,
+        sigmas=np.array([max(row.sigma, default=np.nan) for row in rows], dtype=np.float64),
+        poses=poses,
+    )
+
+
+def _in_three_dimensions(points: FloatArray) -> FloatArray:
+    """Return points (..., d) with coordinates added or left out to make three."""
+    missing = max(3 - points.shape[-1], 0)
+    widths = [(0, 0)] * (points.ndim - 1) + [(0, missing)]
+    return np.pad(points, widths)[..., :3]
+
+
+def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
+    row_of = {name: k for k, name in enumerate(cameras.names)}
+    ends = np.array([(row_of[row.name1], row_of[row.name2]) for row in rows], dtype=np.int64).reshape(-1, 2)
+    dimension = max((len(row.direction) for row in rows), default=3)
+    nothing = (np.nan,) * dimension
+    directions = np.array([row.direction or nothing for row in rows]).reshape(-1, dimension)
+    return Pairs(
+        cameras=ends,
+        classes=np.array([_class_of(row) for row in rows], dtype=np.int64),
+        support=np.array([row.support for row in rows], dtype=np.int64),
+        weights=np.array([row.weight for row in rows], dtype=np.float64),
+        leverages=np.array([row.leverage for row in rows], dtype=np.float64),
+        dual_norms=np.array([row.dual_norm for row in rows], dtype=np.float64),
+        residuals_deg=np.array([row.residual_deg for row in rows], dtype=np.float64),
+        certified_deg=_angles_at(certified, ends, directions),
+        input_deg=_angles_at(cameras.poses.centers if dimension == 3 else None, ends, directions),
+        reasons=tuple(row.reason for row in rows),
+    )
+
+
+def _class_of(row: PairRow) -> PairClass:
+    if not row.direction:
+        return PairClass.NO_DIRECTION
+    if row.verdict == Verdict.UNDETERMINED.value:
+        return PairClass.UNDETERMINED
+    return PairClass.AGREES if row.verdict == Verdict.INLIER.value else PairClass.CONTRADICTS
+
+
+def _angles_at(locations: FloatArray | None, ends: IntArray, directions: FloatArray) -> FloatArray:
+    """Return the angles between directions and the baselines at some locations; NaN where those mean nothing.
+
+    Locations that all coincide, as those of a model that states rotations only, mean nothing.
+    """
+    known_rows = np.zeros((0, 3)) if locations is None else locations[np.isfinite(locations).all(axis=1)]
+    if locations is None or len(known_rows) == 0 or not np.ptp(known_rows, axis=0).max() > 0.0:
+        return np.full(len(ends), np.nan)
+    baselines = locations[ends[:, 0]] - locations[ends[:, 1]]
+    known = np.isfinite(baselines).all(axis=1) & np.isfinite(directions).all(axis=1)
+    known &= np.linalg.norm(baselines, axis=1) > 0.0
+    angles = np.full(len(ends), np.nan)
+    angles[known] = angle_between_deg(directions[known], normalized(baselines[known]))
+    return angles
+
+
+def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArray) -> Points:
+    """Return at most MAX_POINTS points, evenly picked, without those far out that would shrink the rest."""
+    if reconstruction is None or reconstruction.num_points3D() == 0:
+        return Points(positions=np.zeros((0, 3)), colors=np.zeros((0, 3), dtype=np.int64), num_all=0)
+    points = reconstruction.points3D
+    ids = sorted(points.keys())
+    count = min(len(ids), MAX_POINTS)
+    chosen = [points[ids[k * len(ids) // count]] for k in range(count)]
+    positions = np.array([point.xyz for point in chosen]).reshape(-1, 3)
+    colors = np.array([point.color for point in chosen], dtype=np.int64).reshape(-1, 3)
+    both = np.concatenate([positions, cameras])
+    middle = np.median(both, axis=0)
+    limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
+    near = np.linalg.norm(positions - middle, axis=1) <= limit
+    return Points(positions=positions[near], colors=colors[near], num_all=len(ids))
+
+
+def _frustum_depth(positions: FloatArray) -> float:
+    """Return how deep frusta are drawn: well below the distance between neighbours."""
+    if len(positions) < 2:
+        return 1.0
+    low, high = np.quantile(positions, [0.05, 0.95], axis=0)
+    extent = float(np.linalg.norm(high - low)) or float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
+    distances = np.asarray(cKDTree(positions).query(positions, k=2)[0])
+    smallest, largest = _FRUSTUM_OF_EXTENT
+    wanted = _FRUSTUM_SHARE * float(np.median(distances[:, 1]))
+    return float(np.clip(wanted, smallest * extent, largest * extent))

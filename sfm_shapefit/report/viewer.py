@@ -1,0 +1,232 @@
+"""`view`: a live viewer in the browser, with thresholds to move and cameras to pick. The door to viser.
+
+Everything is shown around the median of the cameras, because the viewer computes in float32. Names reach it
+as plain labels of its controls, shortened; never as markup.
+"""
+
+import io
+from contextlib import redirect_stdout
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
+from sfm_shapefit.report.drawing import PairClass, Scene, frustum_corners
+from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
+from sfm_shapefit.report.sentences import shortened
+
+if TYPE_CHECKING:
+    import viser
+
+_EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
+"""Of a pyramid: apex, then corners."""
+_GREY = (140, 140, 140)
+_CHOSEN = (240, 180, 40)
+_NOBODY = "all cameras"
+_MAX_PAIRS = 50_000
+_FEWEST_FITTED = 3
+_PICKED_DEG = 2.0  # between a click and the centre of the camera that is meant
+_LEAST_DEG = 0.01  # the slider is logarithmic, up to 180 degrees
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Thresholds:
+    """What the controls say."""
+
+    residual_deg: float
+    """Pairs with a larger residual are drawn as contradicting."""
+    min_support: int
+    """Pairs with fewer matches are not drawn."""
+    min_trust: float
+    """Cameras with less trust are not drawn, nor are their pairs."""
+    camera: int | None
+    """Only its pairs are drawn; all if None."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DrawnPairs:
+    """The pairs that some thresholds leave."""
+
+    rows: IntArray
+    contradicts: BoolArray
+    """By the threshold, not by the verdict."""
+
+
+def drawn_pairs(scene: Scene, thresholds: Thresholds) -> DrawnPairs:
+    """Return which pairs are drawn and how, the worst first."""
+    cameras, pairs = scene.cameras, scene.pairs
+    shown = cameras.placed & ~(cameras.trust < thresholds.min_trust)
+    kept = shown[pairs.cameras].all(axis=1) & np.isfinite(pairs.residuals_deg)
+    kept &= pairs.support >= thresholds.min_support
+    if thresholds.camera is not None:
+        kept &= (pairs.cameras == thresholds.camera).any(axis=1)
+    worst = pairs.worst_first()
+    rows = worst[kept[worst]][:_MAX_PAIRS]
+    return DrawnPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
+
+
+def camera_at(scene: Scene, origin: FloatArray, direction: FloatArray) -> int | None:
+    """Return the placed camera whose centre is nearest to a ray in angle, within 2 degrees; None if none is.
+
+    Args:
+        scene: what is drawn.
+        origin: (3,) of the ray, in the output's units and axes.
+        direction: (3,) of any length.
+    """
+    rows = np.flatnonzero(scene.cameras.placed)
+    towards = scene.cameras.centers[rows] - origin
+    if len(rows) == 0:
+        return None
+    angles = angle_between_deg(normalized(towards), normalized(np.broadcast_to(direction, towards.shape)))
+    nearest = int(np.argmin(angles))
+    return int(rows[nearest]) if angles[nearest] <= _PICKED_DEG else None
+
+
+def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
+    """Start the viewer; it runs until its `stop` is called.
+
+    Args:
+        scene: what is drawn.
+        facts: the contents of locate.json.
+        host: the address to listen on; 127.0.0.1 can be reached from this machine only.
+        port: the port; the next free one if it is taken.
+
+    Raises:
+        InputError: if viser is not installed.
+    """
+    try:
+        import viser
+    except ImportError as error:
+        raise InputError(
+            "the viewer needs viser: pip install '.[viewer]' in the folder of sfm_shapefit"
+        ) from error
+    with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
+        server = viser.ViserServer(host=host, port=port, verbose=False)
+    server.scene.set_up_direction(tuple(scene.axes[2].tolist()))
+    _View(server, scene, facts)
+    return server
+
+
+class _View:
+    """The controls and what they draw."""
+
+    def __init__(self, server: "viser.ViserServer", scene: Scene, facts: dict[str, Any]) -> None:
+        self._server, self._scene = server, scene
+        centers = scene.cameras.centers
+        self._middle = np.median(centers[scene.cameras.placed], axis=0) if scene.cameras.placed.any() else 0.0
+        self._by_trust = np.lexsort((scene.cameras.trust, np.isnan(scene.cameras.trust)))
+        self._add_points()
+        self._add_input()
+        self._add_controls(facts)
+        self._draw()
+
+    def _add_points(self) -> None:
+        points = self._scene.points
+        if len(points.positions):
+            self._server.scene.add_point_cloud(
+                "/points",
+                (points.positions - self._middle).astype(np.float32),
+                points.colors.astype(np.uint8),
+                point_size=0.02 * max(self._scene.frustum_depth, 1e-9),
+                precision="float32",
+            )
+
+    def _add_input(self) -> None:
+        """Draw the input's cameras in grey where they can be brought into the output's units."""
+        self._input = None
+        centers = input_centers(self._scene)
+        if centers is not None:
+            rows = np.flatnonzero(np.isfinite(centers).all(axis=1))
+            self._input = self._frusta("/input", rows, centers[rows], np.tile(_GREY, (len(rows), 1)))
+
+    def _add_controls(self, facts: dict[str, Any]) -> None:
+        gui, scene = self._server.gui, self._scene
+        placed = int(scene.cameras.placed.sum())
+        gui.add_markdown(f"**{placed:,} of {len(scene.cameras.names):,} cameras placed**")
+        level = max(5.0 * float(facts["residual_level_deg"] or 0.0), _LEAST_DEG)
+        start = float(np.clip(np.log10(level), np.log10(_LEAST_DEG), 2.25))
+        self._residual = gui.add_slider("residual, log10 deg", -2.0, 2.26, 0.01, start)
+        top = int(scene.pairs.support.max(initial=0))
+        self._support = gui.add_slider("least matches", 0, max(top, 1), 1, 0)
+        self._trust = gui.add_slider("least trust", 0.0, 1.0, 0.01, 0.0)
+        names = [
+            f"{k + 1}: {shortened(scene.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
+        ]
+        self._picked = gui.add_dropdown("pairs of", [_NOBODY, *names], initial_value=_NOBODY)
+        self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
+        self._counts = gui.add_text("pairs drawn", "", disabled=True)
+        if self._input is not None:
+            handle, shown = self._input, gui.add_checkbox("input's poses (grey)", True)
+            shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
+        for control in (self._residual, self._support, self._trust, self._picked):
+            control.on_update(lambda _event: self._draw())
+        self._server.scene.on_click()(self._pick)
+
+    def _pick(self, event: "viser.SceneClickEvent") -> None:
+        """Choose the camera under a click."""
+        origin = np.asarray(event.ray_origin) + self._middle
+        row = camera_at(self._scene, origin, np.asarray(event.ray_direction))
+        if row is not None:
+            self._picked.value = next(name for name, own in self._choices.items() if own == row)
+
+    def _draw(self) -> None:
+        """Draw cameras and pairs anew; a name that is drawn again replaces what it named."""
+        scene = self._scene
+        chosen = self._choices.get(self._picked.value)
+        thresholds = Thresholds(
+            residual_deg=10.0**self._residual.value,
+            min_support=int(self._support.value),
+            min_trust=float(self._trust.value),
+            camera=chosen,
+        )
+        rows = np.flatnonzero(scene.cameras.placed & ~(scene.cameras.trust < thresholds.min_trust))
+        colors = trust_colors(scene.cameras.trust[rows])
+        colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
+        self._frusta("/cameras", rows, scene.cameras.centers[rows], colors)
+        drawn = drawn_pairs(scene, thresholds)
+        kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
+        ends = scene.cameras.centers[scene.pairs.cameras[drawn.rows]]
+        self._lines("/pairs", ends, PAIR_COLORS[kinds])
+        against = int(drawn.contradicts.sum())
+        self._counts.value = f"{len(drawn.rows):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
+
+    def _frusta(
+        self, name: str, rows: IntArray, centers: FloatArray, colors: Any
+    ) -> "viser.LineSegmentsHandle | None":
+        """Draw cameras as pyramids, those without a rotation as a cross."""
+        corners = frustum_corners(self._scene, rows, centers)
+        known = np.isfinite(corners).all(axis=(1, 2))
+        pyramids = np.concatenate([centers[:, None, :], corners], axis=1)[known][:, _EDGES]
+        arms = self._scene.frustum_depth / 3 * np.stack([-np.eye(3), np.eye(3)], axis=1)
+        crosses = centers[~known][:, None, None, :] + arms
+        segments = np.concatenate([pyramids.reshape(-1, 2, 3), crosses.reshape(-1, 2, 3)])
+        shades = np.concatenate([np.repeat(colors[known], 8, axis=0), np.repeat(colors[~known], 3, axis=0)])
+        return self._lines(name, segments, shades)
+
+    def _lines(self, name: str, ends: FloatArray, colors: Any) -> "viser.LineSegmentsHandle | None":
+        """Draw lines (k, 2, 3) in colours (k, 3); nothing is left of the name if there are none."""
+        if len(ends) == 0:
+            self._server.scene.remove_by_name(name)
+            return None
+        both = np.repeat(np.asarray(colors, dtype=np.uint8)[:, None, :], 2, axis=1)
+        points = (ends - self._middle).astype(np.float32)
+        return self._server.scene.add_line_segments(
+            name, points, both, thickness=1.5, thickness_units="screen"
+        )
+
+
+def input_centers(scene: Scene) -> FloatArray | None:
+    """Return the input's centres (n, 3) in the output's units and axes, brought there by a fit if need be.
+
+    None where the input has no centres, or they all coincide.
+    """
+    before, after = scene.cameras.poses.centers, scene.cameras.centers
+    common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
+        return None
+    if scene.input_is_aligned:
+        return before
+    return fit_similarity_l1(before[common], after[common]).apply(before)

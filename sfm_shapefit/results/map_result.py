@@ -1,0 +1,85 @@
+"""What `map` returns, and its files: COLMAP's layout of several models, each with the files of `locate`.
+
+OUT/0, OUT/1, ...   models, largest first: each a folder as `locate` writes it
+OUT/map.json        the averaging behind each, and the images in no model with the reason
+"""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from sfm_shapefit.options import MapOptions
+from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.summary import summary
+from sfm_shapefit.results.tables import SCHEMA_VERSION
+from sfm_shapefit.rotations.averaged import AveragedRotations
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MappedModel:
+    """One component of the images."""
+
+    located: LocateResult
+    averaging: AveragedRotations
+    """The rotations it started from, of the images in `names`."""
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MapResult:
+    """The models of a database, and how they came about."""
+
+    database: Path
+    options: MapOptions
+    models: tuple[MappedModel, ...]
+    """Those with most placed cameras first."""
+    num_images: int
+    num_pairs: int
+    """Pairs with a relative rotation."""
+    left_out: dict[str, str]
+    """Name and reason of each image in no model."""
+    timings_s: dict[str, float]
+    warnings: tuple[str, ...]
+    """What the user should know beyond the warnings of each model."""
+
+    @property
+    def num_placed(self) -> int:
+        """Number of cameras in all models."""
+        return sum(int(model.located.kept.sum()) for model in self.models)
+
+
+def map_summary(found: MapResult) -> dict[str, Any]:
+    """Return what stands in map.json."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "inputs": {"database": str(found.database)},
+        "options": asdict(found.options),
+        "num_images": found.num_images,
+        "num_placed": found.num_placed,
+        "num_pairs": found.num_pairs,
+        "models": [
+            {
+                "folder": str(number),
+                "num_images": len(model.names),
+                "num_placed": int(model.located.kept.sum()),
+                "averaging": _averaging_summary(model.averaging),
+                "located": summary(model.located),
+            }
+            for number, model in enumerate(found.models)
+        ],
+        "left_out": found.left_out,
+        "timings_s": found.timings_s,
+        "warnings": list(found.warnings),
+    }
+
+
+def _averaging_summary(averaging: AveragedRotations) -> dict[str, Any]:
+    return {
+        "statement": averaging.statement,
+        "num_registered": int(averaging.registered.sum()),
+        "min_matches": averaging.min_matches,
+        "loss": averaging.loss,
+        "known_focal_lengths_only": averaging.sound_only,
+        "agreeing_share": averaging.share,
+        "num_tried": averaging.num_tried,
+    }

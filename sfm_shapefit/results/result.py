@@ -1,0 +1,205 @@
+"""What `locate` and `solve` return: the answer with the evidence for it."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.adjustment import Adjusted
+from sfm_shapefit.colmap.model import PosedModel
+from sfm_shapefit.directions import DirectionStatus, PairDirections
+from sfm_shapefit.formats import EpipolarGeometries
+from sfm_shapefit.options import LocateOptions, Source
+from sfm_shapefit.placement.gauge import Gauge
+from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
+from sfm_shapefit.results.tables import CameraRow, PairRow
+from sfm_shapefit.rigidity import RigidPiece
+from sfm_shapefit.solver.options import SolverResult
+
+if TYPE_CHECKING:
+    import pycolmap
+
+
+CARRIED_FIXED = "fixed; no pair of it takes part"
+CARRIED_BY_FRAME = "placed with its frame; no pair of its own takes part"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Inputs:
+    """What `locate` worked from."""
+
+    folder: Path | None
+    """The model folder; None for a reconstruction in memory."""
+    database: Path | None
+    """The database whose matches were used, if any."""
+    source: Source
+    """Where the directions came from; never "auto"."""
+    statement: str
+    """How that choice was made, for the user."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LocateResult:
+    """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    """A new reconstruction: placed cameras and triangulated points; other images are unregistered."""
+    inputs: Inputs
+    options: LocateOptions
+    model: PosedModel
+    """The input as read, with refined rotations if those were asked for; camera k below is its image k."""
+    directions: PairDirections
+    """All pairs that were looked at, with their support."""
+    placement: Placement
+    """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
+    largest rigid piece solved, and the evidence for it, in the solver's units."""
+    kept: BoolArray
+    """Which of the placement's cameras are in the output; the others are not trusted enough."""
+    gauge: Gauge
+    """From the solver's units to the output's."""
+    adjusted: Adjusted | None
+    """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncoloured."""
+    timings_s: dict[str, float]
+    """Wall-clock seconds per stage."""
+    warnings: tuple[str, ...]
+    """What the user should know, a sentence each."""
+    turned_deg: FloatArray | None = None
+    """(n,) by how much each rotation of the input was refined, exactly 0 where it was kept; None if
+    rotations were not to be refined."""
+    further: "tuple[FurtherPiece, ...]" = ()
+    """The further rigid pieces of three cameras or more, each with a scale of its own."""
+    fixed: BoolArray | None = None
+    """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+
+    @property
+    def solve(self) -> SolverResult:
+        """The certified solve of the largest rigid piece."""
+        return self.placement.solve
+
+    @property
+    def pieces(self) -> list[RigidPiece]:
+        """The parallel-rigid pieces of the view graph, largest first."""
+        return self.placement.pieces
+
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per image of the input: the posed ones by id, then those without a rotation."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        solved_pieces = [piece.placement for piece in self.further]
+        rows = camera_rows(
+            self.placement, centers, self.gauge.similarity.scale, solved_pieces, self.gauge.axes
+        )
+        for camera, reason in without_direction(self.directions, self.placement.graph).items():
+            rows[camera] = replace(rows[camera], reason=reason)
+        for camera, center in self._carried().items():
+            is_fixed = self.fixed is not None and self.fixed[camera]
+            reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
+            rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
+        unposed = sorted(set(all_names(self)) - set(self.model.names))
+        return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    def _carried(self) -> dict[int, tuple[float, ...]]:
+        """Return the centres of images in the output that no pair placed: fixed ones, and rest of a frame."""
+        ids = self.model.image_ids
+        judged = set(self.placement.cameras[self.kept].tolist())
+        return {
+            camera: tuple(self.reconstruction.image(image_id).projection_center().tolist())
+            for camera, image_id in enumerate(ids.tolist())
+            if camera not in judged and self.reconstruction.image(image_id).has_pose
+        }
+
+    @property
+    def pairs(self) -> list[PairRow]:
+        """One row per pair that was looked at, usable or not, in the order of pairs."""
+        support = self.directions.num_inliers[self.directions.usable()]
+        usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
+        names = self.model.names
+        axes = self.gauge.axes
+        return [
+            _turned(next(usable), axes)
+            if status is DirectionStatus.USABLE
+            else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
+            for (i, j), status, support in zip(
+                self.directions.pairs.tolist(),
+                self.directions.status,
+                self.directions.num_inliers.tolist(),
+                strict=True,
+            )
+        ]
+
+
+def _turned(row: PairRow, axes: FloatArray | None) -> PairRow:
+    """Return a pair's row with its direction in the output's axes."""
+    return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FurtherPiece:
+    """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
+
+    placement: Placement
+    """Its solution; `placement.piece` is its number."""
+    kept: BoolArray
+    """Which of the placement's cameras are in its model; the others are not trusted enough."""
+    gauge: Gauge
+    """From the solver's units to those of its model, a unit of its own."""
+    reconstruction: "pycolmap.Reconstruction"
+    """Its seeded model."""
+    image_ids: IntArray
+    """(k,) the images of the placement's cameras."""
+
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per camera of the piece."""
+        centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
+        return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GraphResult:
+    """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
+
+    path: Path
+    """The graph's file or folder."""
+    statement: str
+    """What it is, and where rotations came from, for the user."""
+    options: PlacementOptions
+    placement: Placement
+    further: tuple[Placement, ...]
+    """The further rigid pieces of three nodes or more, each with a scale of its own."""
+    timings_s: dict[str, float]
+    """Wall-clock seconds per stage."""
+    geometries: EpipolarGeometries | None = None
+    """The relative poses that the directions came from, if it has any."""
+    rotations: FloatArray | None = None
+    """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
+
+    @property
+    def cameras(self) -> list[CameraRow]:
+        """One row per node."""
+        return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
+
+    @property
+    def pairs(self) -> list[PairRow]:
+        """One row per edge."""
+        support = np.zeros(self.placement.num_pairs, dtype=np.int64)
+        return pair_rows(self.placement, support, self.further)
+
+
+def _centers_of(
+    reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
+) -> FloatArray:
+    """Return the centres (k, 3) of images, NaN for those that are not kept."""
+    centers = np.full((len(kept), 3), np.nan)
+    centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
+    return centers
+
+
+def all_names(found: LocateResult) -> list[str]:
+    """Return the names of all images of the input, posed or not."""
+    return [image.name for image in found.model.reconstruction.images.values()]

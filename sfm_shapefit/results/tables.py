@@ -1,0 +1,192 @@
+"""What `locate` found as tables: one row per camera, one per pair, and the summary in locate.json.
+
+The formats are part of the interface (`cameras.csv`, `pairs.csv`, `locate.json`, schema version 1):
+columns and keys may be added, never renamed.
+"""
+
+import csv
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from operator import attrgetter
+from pathlib import Path
+from typing import Any
+
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.solver.options import SolverResult
+
+SCHEMA_VERSION = 1
+IN_MEMORY = "in memory"
+"""What stands in locate.json in the place of a model's path where there is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CameraRow:
+    """One image of the input, or node of a bare graph, placed or not; NaN and None are empty fields."""
+
+    name: str
+    placed: bool = False
+    reason: str = ""
+    """Why it is not placed or, if it is, why its trust is low."""
+    piece: int | None = None
+    """The parallel-rigid piece it belongs to, 0 the largest, which is the output; N stands in pieces/N with
+    a scale of its own. None outside every piece of 3 cameras."""
+    center: tuple[float, ...] = ()
+    """Centre in the output's units, d numbers; empty when not placed. Columns x, y, z."""
+    degree: int = 0
+    """Number of its pairs with a usable direction."""
+    trust: float = math.nan
+    """How far it is to be trusted, in [0, 1]: the share of its matches with the main body of cameras that
+    agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
+    `judgement.trust`."""
+    sigma: tuple[float, ...] = ()
+    """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
+    Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairRow:
+    """One pair that was looked at; NaN is an empty field."""
+
+    name1: str
+    name2: str
+    direction: tuple[float, ...] = ()
+    """Unit direction from image 2 to image 1 in world axes (of C_1 - C_2). Columns vx, vy, vz."""
+    support: int = 0
+    """Number of inlier matches; 0 for a bare graph, which does not say."""
+    weight: float = math.nan
+    """Weight in the program."""
+    residual_deg: float = math.nan
+    """Angle between the direction and the solved baseline."""
+    dual_norm: float = math.nan
+    """||y_e|| / w_e of the certificate; below 1 for directions that the solution fits exactly."""
+    leverage: float = math.nan
+    """Share of its own fitted direction that it decides itself, in [0, 1]; 0 for outliers."""
+    verdict: str = Verdict.UNDETERMINED.value
+    """inlier, outlier, or undetermined."""
+    reason: str = ""
+    """Why it is undetermined."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceRow:
+    """A parallel-rigid piece of three cameras or more."""
+
+    num_cameras: int
+    scale: str
+    """The gauge of a solved piece; pieces that the solver refuses have none."""
+    hinges: list[str]
+    """Names of the cameras that it shares with other pieces."""
+    folder: str
+    """Where it stands in the output: "." for the largest piece, "pieces/1" and so on; empty if it is not
+    solved."""
+    num_placed: int
+    """Cameras of it that are in the output; the others are not trusted."""
+
+
+def write_rows(
+    rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
+) -> None:
+    """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
+    axes = axis_names(dimension)
+    per_axis = {
+        "center": axes,
+        "sigma": [f"sigma_{axis}" for axis in axes],
+        "direction": [f"v{axis}" for axis in axes],
+    }
+    names = [field.name for field in fields(row_type)]
+    values_of, nothing = attrgetter(*names), ("",) * dimension
+    is_vector = [name in per_axis for name in names]
+
+    def cells(row: CameraRow | PairRow) -> list[object]:
+        found: list[object] = []
+        for value, vector in zip(values_of(row), is_vector, strict=True):
+            if vector:
+                found.extend(map(_cell, value) if value else nothing)
+            else:
+                found.append(_cell(value))
+        return found
+
+    columns = [column for name in names for column in per_axis.get(name, [name])]
+    _write_csv(columns, map(cells, rows), path)
+
+
+def axis_names(dimension: int) -> list[str]:
+    """Return x, y, z up to three dimensions, and x1, x2, ... beyond."""
+    return list("xyz"[:dimension]) if dimension <= len("xyz") else [f"x{k + 1}" for k in range(dimension)]
+
+
+def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
+    """Write records as CSV; numbers round-trip, NaN and None are empty fields.
+
+    Args:
+        records: one mapping per row, at least one; the columns are those of the first.
+        path: the file.
+
+    Raises:
+        InputError: if the file cannot be written.
+    """
+    columns = list(records[0])
+    _write_csv(columns, ([_cell(record[name]) for name in columns] for record in records), path)
+
+
+def _write_csv(columns: Sequence[str], rows: Iterable[list[object]], path: Path) -> None:
+    """Write a header and rows of cells; bytes that are no UTF-8, as names may have, appear as \\udcXX."""
+    try:
+        with path.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream:
+            writer = csv.writer(stream, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(rows)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written ({error.strerror}); choose another file") from error
+
+
+def write_json(summary: dict[str, Any], path: Path) -> None:
+    """Write a summary as JSON, with null for numbers that are not finite."""
+    path.write_text(dumps(summary) + "\n", encoding="utf-8")
+
+
+def dumps(summary: dict[str, Any], *, only_ascii: bool = False) -> str:
+    """Return a summary as JSON text that UTF-8 can encode, or ASCII, with escapes for all else.
+
+    NaN and infinities, which JSON has not, become null. Bytes of a path that are no UTF-8 become the escape
+    \\udcXX, from which `os.fsencode` of the parsed text gives them back.
+    """
+    text = json.dumps(_finite(summary), indent=2, ensure_ascii=only_ascii, allow_nan=False)
+    return text.encode("utf-8", errors="backslashreplace").decode("utf-8")  # Python's escape is JSON's
+
+
+def solve_summary(result: SolverResult) -> dict[str, Any]:
+    """Return the `solve` object of locate.json."""
+    return {
+        "status": result.status.name.lower(),
+        "objective": result.objective,
+        "dual_bound": result.dual_bound,
+        "gap": result.gap,
+        "equality_residual": result.equality_residual,
+        "unique": result.unique,
+        "iterations": result.iterations,
+        "seconds": result.seconds,
+        "method": result.method,
+        "method_reason": result.method_reason,
+    }
+
+
+def _cell(value: object) -> object:
+    if isinstance(value, float):
+        return repr(float(value)) if math.isfinite(value) else ""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "" if value is None else value
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,1 +1,0 @@
-"""What the answer is worth: verdicts on pairs, uncertainty and trust of cameras."""

@@ -1,0 +1,160 @@
+"""From locations of bodies and any dual to a rigorous bound; see the package for the derivation.
+
+Uniqueness is judged as in `solver.certificate`: whatever is optimal satisfies linear conditions, and if the
+reduced matrix of these is regular with one pair pinned, nothing else does.
+"""
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.solver.certificate import Certificate
+from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
+from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor, System, factor_pinned
+from sfm_shapefit.viewgraph import ViewGraph
+
+_OFF_BODIES = 1e-9  # distance of locations from those of rigid bodies, of their extent, that is rounding
+_EXACT = 1e-12  # an equality residual that needs no repair
+_REPAIRS = 4  # each shrinks the equality residual to the rounding of the previous one
+_RESIDUAL_FLOOR = 0.1  # least residual, of the mean one, that the metric of the repair takes seriously
+_STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
+_REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
+
+
+def certify_bodies(
+    graph: ViewGraph, bodies: Bodies, locations: FloatArray, dual: FloatArray, *, uniqueness: bool = False
+) -> Certificate:
+    """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
+
+    Args:
+        graph: a view graph whose pairs connect the bodies; those inside a body take no part.
+        bodies: of its nodes.
+        locations: (n, d) in any scale, with L(T) > 0 and the bodies' offsets in one common scale.
+        dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
+        uniqueness: also examine whether the optimum is unique.
+
+    Returns:
+        The certificate; its `equality_residual` is the largest violation at a body, or in the equation
+        for the scale with offsets of root mean square 1, relative to the largest weighted degree of a body.
+
+    Raises:
+        InputError: if an array has the wrong shape or is not finite, the locations have L(T) <= 0, or they
+            are not those of rigid bodies.
+        UnsolvableError: if the dual must be repaired and the bodies hang loose.
+    """
+    outer = bodies.joins(graph.edges)
+    _refuse(graph, bodies, locations, dual)
+    edges, v, w = graph.edges[outer], graph.directions[outer], graph.weights[outer]
+    between = ViewGraph(graph.num_cameras, edges, v, w)
+    value = objective(between, locations - locations.mean(axis=0))
+    if not value < np.inf:
+        raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
+    unit = bodies.normalised()
+    c = unit.reduce(scale_functional(between))
+    ends = unit.body_of[edges]
+    degree = float(np.bincount(ends.ravel(), weights=np.repeat(w, 2)).max())
+
+    y = across(np.ascontiguousarray(dual[outer]), v)
+    y, total = _balanced(between, unit, locations, y, c, _EXACT * degree)
+    scale = 1.0 / max(1.0, float(np.max(np.linalg.norm(y, axis=1) / w)))
+    y, total = scale * y, scale * total
+    bound = float(total @ c / (c @ c))
+    if bound <= 0.0:  # y = 0 is feasible and proves at least this
+        y, total, bound = np.zeros_like(y), np.zeros_like(total), 0.0
+    every = np.zeros_like(graph.directions)
+    every[outer] = y
+    return Certificate(
+        objective=value,
+        dual_bound=bound,
+        dual=frozen(every),
+        equality_residual=_largest(total - bound * c, graph.dimension) / degree,
+        unique=_is_unique(between, unit, locations, y) if uniqueness else None,
+    )
+
+
+def _refuse(graph: ViewGraph, bodies: Bodies, locations: FloatArray, dual: FloatArray) -> None:
+    """Raise InputError for what cannot be certified."""
+    shapes = (graph.num_cameras, graph.dimension), graph.directions.shape
+    if locations.shape != shapes[0] or dual.shape != shapes[1] or bodies.offsets.shape != shapes[0]:
+        raise InputError(
+            f"locations, dual and offsets have shapes {locations.shape}, {dual.shape} and "
+            f"{bodies.offsets.shape}; this graph needs {shapes[0]}, {shapes[1]} and {shapes[0]}"
+        )
+    if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
+        raise InputError("locations and dual must be finite to be certified")
+    if not bodies.joins(graph.edges).any():
+        raise InputError("no pair joins two bodies, so there is nothing to certify")
+    apart = bodies.fit(locations)[1]
+    if apart > _OFF_BODIES * float(np.abs(locations).max()):
+        raise InputError(f"the locations are not those of rigid bodies: a node is {apart:.1e} off its body")
+
+
+def _largest(violation: FloatArray, dimension: int) -> float:
+    """Return the largest norm of a reduced vector at a body, or its size for the scale."""
+    at_bodies = np.linalg.norm(violation[:-1].reshape(-1, dimension), axis=1)
+    return float(max(at_bodies.max(), abs(violation[-1])))
+
+
+def _balanced(
+    graph: ViewGraph, bodies: Bodies, locations: FloatArray, y: FloatArray, c: FloatArray, allowed: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the dual moved to A^T D^T y = lambda A^T c, and A^T D^T y."""
+    n, d = graph.num_cameras, graph.dimension
+    total = bodies.reduce(adjoint(y, graph.edges, n))
+    multiplier = float(total @ c / (c @ c))
+    if _largest(total - multiplier * c, d) <= allowed:
+        return y, total
+    stiffness = _stiffness(graph, locations)
+    system = _projected_system(graph, bodies, locations, stiffness, c)
+    for _ in range(_REPAIRS):
+        multiplier, h = system.balance(total)
+        moved = across(differences(bodies.expand(h), graph.edges), graph.directions)
+        y = across(y - stiffness[:, None] * moved, graph.directions)
+        total = bodies.reduce(adjoint(y, graph.edges, n))
+        if _largest(total - multiplier * c, d) <= allowed:
+            break
+    return y, total
+
+
+def _stiffness(graph: ViewGraph, locations: FloatArray) -> FloatArray:
+    """Return w_e / max(||r_e||, floor), in units of the mean residual: long residuals hardly move."""
+    residuals = np.linalg.norm(across(differences(locations, graph.edges), graph.directions), axis=1)
+    mean = float(np.average(residuals, weights=graph.weights))
+    if not mean > 0.0:
+        return graph.weights
+    return np.asarray(graph.weights / np.maximum(residuals / mean, _RESIDUAL_FLOOR))
+
+
+def _projected_system(
+    graph: ViewGraph, bodies: Bodies, locations: FloatArray, stiffness: FloatArray, c: FloatArray
+) -> System:
+    """Factor A^T D^T S P D A with its longest pair pinned."""
+    v = graph.directions
+    blocks = stiffness[:, None, None] * (np.eye(graph.dimension) - v[:, :, None] * v[:, None, :])
+    longest = int(np.argmax(along(differences(locations, graph.edges), v)))
+    tau = float(np.mean(stiffness))
+    blocks[longest] += tau * np.outer(v[longest], v[longest])
+    i, j = graph.edges[longest].tolist()
+    system = factor_pinned(ReducedFactor(graph.edges, bodies), blocks, c, ((i, j), v[longest]), tau)
+    if system is None:
+        raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the bodies")
+    return system
+
+
+def _is_unique(graph: ViewGraph, bodies: Bodies, locations: FloatArray, y: FloatArray) -> bool:
+    """Return whether the feasible dual excludes other optima, up to translation and scale."""
+    v, w = graph.directions, graph.weights
+    norms = np.linalg.norm(y, axis=1)
+    held: BoolArray = norms < (1.0 - _STRICT) * w
+    u = np.where(held[:, None], 0.0, y / np.maximum(norms, 1e-300)[:, None])
+    conditions = np.eye(graph.dimension) - v[:, :, None] * v[:, None, :] - u[:, :, None] * u[:, None, :]
+    blocks = w[:, None, None] * conditions
+    longest = int(np.argmax(along(differences(locations, graph.edges), v)))
+    blocks[longest] += w[longest] * np.outer(v[longest], v[longest])
+    factor = ReducedFactor(graph.edges, bodies)
+    try:
+        factor.refactor(blocks)
+    except UnsolvableError:
+        return False
+    return factor.smallest_pivot > _REGULAR

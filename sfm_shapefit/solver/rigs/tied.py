@@ -1,0 +1,125 @@
+"""Which bodies the pairs tie to one another once the scale s is known, and which hang free.
+
+With s held, x moves along f alone, and a motion that no pair notices is a null vector of K, the Laplacian of
+the bodies with blocks P_e = I - u_e u_e^T, u_e the directions of the baselines. Two bodies are tied if every
+null vector moves both alike: an equivalence relation, whose classes are the sets of bodies that keep their
+places relative to one another. If all bodies are in one class, s and f are determined up to translation and
+one common factor: a null vector that changes s is the solution itself, plus one that does not.
+
+Random null vectors tell the classes with probability 1: z <- (K + eps N)^-1 eps N z with N the plain
+Laplacian tends to the projection of z on the null space. That is a sparse solve or a few, at any size.
+
+Whether pairs tie bodies in general is asked at random positions with the given offsets, for a body's offsets
+are part of the problem and not general; whether they do at a solution, at its baselines.
+"""
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+
+_EPSILON = 1e-10
+_STEPS = 4
+_PROBES = 3
+_ALIKE = 1e-3  # of the unit normal draws: null vectors that move two bodies so alike move both the same
+_SEED = 0
+
+
+def largest_tied(
+    edges: IntArray,
+    bodies: Bodies,
+    sizes: IntArray,
+    locations: FloatArray | None = None,
+    around: int | None = None,
+) -> IntArray:
+    """Return the largest set of bodies, ascending, that the pairs tie to one another if s is known.
+
+    Args:
+        edges: (m, 2) pairs of nodes; those inside a body are ignored.
+        bodies: of the nodes.
+        sizes: (B,) what counts of each body, such as its number of cameras; sets are compared by their sum.
+        locations: (n, d) where they are asked about; random positions with the bodies' offsets if None.
+        around: a body; then the set that holds it, whatever its size.
+
+    Returns:
+        (k,) bodies; a single one if no pair ties any two.
+    """
+    used = edges[bodies.joins(edges)]
+    if locations is None:
+        locations = general_positions(bodies)
+    if around is not None:  # outweighs all others together
+        sizes = np.where(np.arange(bodies.num_bodies) == around, sizes.sum() + 1, sizes)
+    best = np.array([int(np.argmax(sizes))])
+    ends = bodies.body_of[used]
+    for members in _components(ends, bodies.num_bodies):
+        if len(members) < 2 or sizes[members].sum() <= sizes[best].sum():
+            continue
+        inside = np.isin(ends[:, 0], members)
+        nodes, renumbered = np.unique(used[inside], return_inverse=True)
+        part = bodies.restricted_to(nodes)
+        names = np.unique(bodies.body_of[nodes])
+        motions = _null_motions(renumbered.reshape(-1, 2), part, locations[nodes])
+        tied = names[_largest_alike(motions, sizes[names])]
+        if sizes[tied].sum() > sizes[best].sum():
+            best = tied
+    return best
+
+
+def general_positions(bodies: Bodies) -> FloatArray:
+    """Return random locations of the bodies, at distances comparable to the size of their offsets."""
+    unit = bodies.normalised()
+    x = np.random.default_rng(_SEED).standard_normal(unit.num_unknowns)
+    x[-1] = 1.0
+    return unit.expand(x)
+
+
+def _components(ends: IntArray, count: int) -> list[IntArray]:
+    """Return the connected components of the graph of bodies."""
+    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
+    labels = connected_components(links, directed=False)[1]
+    order = np.argsort(labels, kind="stable")
+    return np.split(order.astype(np.int64), np.cumsum(np.bincount(labels))[:-1])
+
+
+def _null_motions(edges: IntArray, bodies: Bodies, locations: FloatArray) -> FloatArray:
+    """Return random null vectors of K for connected bodies, (B, d * probes), up to a translation each."""
+    d = locations.shape[1]
+    still = Bodies(body_of=bodies.body_of, offsets=np.zeros_like(locations))
+    u = normalized(differences(locations, edges))  # NaN where two nodes coincide, which says nothing
+    blocks = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :])
+    factor = ReducedFactor(edges, still)
+    try:
+        factor.refactor(blocks + _EPSILON * np.eye(d))
+    except UnsolvableError:  # regular but for rounding: nothing can be told apart
+        return np.arange(bodies.num_bodies, dtype=np.float64)[:, None]
+    rng = np.random.default_rng(_SEED)
+    ends = bodies.body_of[edges]
+    motions = []
+    for _ in range(_PROBES):
+        z = rng.standard_normal((bodies.num_bodies, d))
+        for _ in range(_STEPS):
+            pull = np.zeros_like(z)
+            np.add.at(pull, ends[:, 0], z[ends[:, 0]] - z[ends[:, 1]])
+            np.subtract.at(pull, ends[:, 1], z[ends[:, 0]] - z[ends[:, 1]])
+            z = factor.factor.solve(_EPSILON * pull)
+        motions.append(z)
+    return np.concatenate(motions, axis=1)
+
+
+def _largest_alike(motions: FloatArray, sizes: IntArray) -> IntArray:
+    """Return the largest group of rows that agree, weighed by their sizes."""
+    left = np.ones(len(motions), dtype=np.bool_)
+    best = np.zeros(0, dtype=np.int64)
+    while left.any() and sizes[left].sum() > sizes[best].sum():
+        reference = int(np.flatnonzero(left)[0])
+        group = left & (np.abs(motions - motions[reference]).max(axis=1) <= _ALIKE)
+        left &= ~group
+        if sizes[group].sum() > sizes[best].sum():
+            best = np.flatnonzero(group)
+    return best

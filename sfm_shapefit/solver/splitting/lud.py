@@ -1,0 +1,152 @@
+"""LUD, least unsquared deviations: the convex start that does not collapse on long chains.
+
+    minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
+
+The bound on each length is a gauge that no stretch of a chain can escape, where ShapeFit's single
+constraint <c, T> = kappa lets all length gather on the cleanest stretch. The dual is
+
+    maximise  sum_e nu_e,  nu_e = -<y_e, v_e>    subject to  D^T y = 0,  ||y_e|| <= w_e,  nu_e >= 0
+
+An approximate y is made feasible by y' = y - N D h with (D^T N D) h = D^T y, where N_e = I on edges with
+nu_e > 0 and N_e = P_e (orthogonal to v_e) on the others, and by a common scaling. Edges whose nu_e turns
+negative join the others, and the repair is repeated.
+
+Source: Ozyesil and Singer, "Robust camera location estimation by convex programming", CVPR 2015, eq. 7.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.laplacian.approximate import Preconditioner, conjugate_gradients
+from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.solver.options import OnIteration
+from sfm_shapefit.solver.program import across, adjoint, along, differences
+from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
+from sfm_shapefit.solver.splitting.engine import Iteration, Settings, Stop
+from sfm_shapefit.solver.splitting.linear import LaplacianFactor, laplacian_factor
+from sfm_shapefit.viewgraph import ViewGraph
+
+_LEAST_LENGTH = 1.0
+_REPAIRS = 12
+_CG_TOL = 1e-7  # twice, which makes 1e-14
+_CG_STEPS = 300
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LudResult:
+    """A solution of LUD with the bound that its dual proves."""
+
+    locations: FloatArray
+    """(n, d) centred; the least edge length is about 1."""
+    lengths: FloatArray
+    """(m,) s_e >= 1, the best ones for the locations."""
+    objective: float
+    """sum_e w_e ||t_i - t_j - s_e v_e||."""
+    dual_bound: float
+    """No locations have an objective below this, up to `equality_residual`; 0 if it was not asked for."""
+    equality_residual: float
+    """Largest violation of D^T y = 0 at a camera, relative to the largest weighted degree."""
+    iterations: int
+    stop: Stop
+    """Why the iteration ended."""
+
+
+@one_blas_thread()  # more would split, and round, the sums of long vectors differently
+def solve_lud(
+    graph: ViewGraph,
+    max_iterations: int = 50,
+    factor: LaplacianFactor | None = None,
+    *,
+    tol: float = 1e-8,
+    certified: bool = True,
+    threads: int = 1,
+    on_iteration: OnIteration | None = None,
+) -> LudResult:
+    """Solve LUD by ADMM with constant penalties, so that its Laplacian is factored once.
+
+    Args:
+        graph: a connected view graph.
+        max_iterations: 25 to 50 suffice as the start of a robust refinement.
+        factor: solver for the graph's Laplacian, overwritten; by default what `laplacian_factor` picks.
+        tol: relative error of the objective, estimated, at which to stop early.
+        certified: compute the dual bound, at the price of about 100 iterations.
+        threads: of the passes over edges; the result does not depend on it.
+        on_iteration: called after each iteration; returning False cancels and returns the iterate.
+    """
+    settings = Settings(
+        absolute_tol=0.0,
+        tol=tol,
+        max_iterations=max_iterations,
+        relaxation=1.6,
+        renewals=(),
+        penalty=1.0,
+        accelerate=False,
+    )
+    factor = laplacian_factor(graph) if factor is None else factor
+    passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), threads)
+    try:
+        outcome = Iteration(passes, factor, settings, None, float(graph.weights.sum())).run(on_iteration)
+        dual = passes.in_graph_order(passes.dual(outcome.state.x, outcome.state.rho))
+    finally:
+        passes.close()
+    t = outcome.state.t - outcome.state.t.mean(axis=0)
+    baselines = differences(t, graph.edges)
+    lengths = np.maximum(along(baselines, graph.directions), _LEAST_LENGTH)
+    deviations = np.linalg.norm(baselines - lengths[:, None] * graph.directions, axis=1)
+    bound, residual = 0.0, 0.0
+    if certified:
+        factor.refactor(np.ones(graph.num_edges))
+        bound, residual = _dual_bound(graph, dual, factor)
+    return LudResult(
+        locations=t,
+        lengths=lengths,
+        objective=float(graph.weights @ deviations),
+        dual_bound=bound,
+        equality_residual=residual,
+        iterations=outcome.iterations,
+        stop=outcome.stop,
+    )
+
+
+def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner) -> tuple[float, float]:
+    """Return the value of the feasible dual point nearest to `dual`, and its equality residual."""
+    v, w, n = graph.directions, graph.weights, graph.num_cameras
+    bound_active = along(dual, v) < -1e-6 * w
+    for _ in range(_REPAIRS):
+        y = _balanced(graph, dual, bound_active, precondition)
+        still_active = bound_active & (along(y, v) <= 0.0)
+        if (still_active == bound_active).all():  # then once more, to rounding
+            y = _balanced(graph, y, bound_active, precondition)
+            still_active = bound_active & (along(y, v) <= 0.0)
+        if (still_active == bound_active).all():
+            break
+        bound_active = still_active
+    else:
+        return 0.0, 0.0
+    y /= max(1.0, float(np.max(np.linalg.norm(y, axis=1) / w)))
+    degree = np.bincount(graph.edges.ravel(), weights=np.repeat(w, 2), minlength=n).max()
+    residual = float(np.linalg.norm(adjoint(y, graph.edges, n), axis=1).max() / degree)
+    return float(-along(y, v)[bound_active].sum()), residual
+
+
+def _balanced(
+    graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner
+) -> FloatArray:
+    """Return the dual moved to D^T y = 0, by all directions on `free` edges and across v on the others."""
+    edges, v, n = graph.edges, graph.directions, graph.num_cameras
+
+    def allowed(z: FloatArray) -> FloatArray:
+        return np.where(free[:, None], z, across(z, v))
+
+    y = allowed(dual)
+    h = conjugate_gradients(
+        lambda x: adjoint(allowed(differences(x, edges)), edges, n),
+        precondition,
+        adjoint(y, edges, n),
+        tol=_CG_TOL,
+        max_iterations=_CG_STEPS,
+        coupled=True,
+    ).x
+    return np.asarray(y - allowed(differences(h, edges)))

@@ -1,0 +1,199 @@
+"""Large graphs to a proven gap: splitting, then a certificate, then Newton steps only if it must be.
+
+Splitting is cheap but proves nothing; the certificate makes its dual feasible at the price of some twenty
+iterations, and the gap it then proves is mostly below the error that the splitting estimates for itself, and
+hardly ever above three times it. So the splitting is asked for a third of the gap, and its answer certified.
+If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes
+over from the certified point, if its factor fits. Newton's method converges from near a solution or from its
+own beginning: if the point was of no use, it begins again there.
+"""
+
+import enum
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor
+from sfm_shapefit.solver.certificate import Certificate, certify, certify_within
+from sfm_shapefit.solver.newton import solve_newton_sparse
+from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.program import projected_length
+from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor, Prediction
+from sfm_shapefit.viewgraph import ViewGraph
+
+_SHARE = 0.3  # of the gap, that the splitting is asked for first
+_TIGHTER = 0.1  # of the first share, when it is asked again
+_CERTIFICATES = 4
+_NEWTON_STEPS = 30
+_CHEAP_FLOPS = 4e9  # of one factorisation in blocks: Newton's method may take over early, and begin twice
+_PATIENCE = 500  # iterations of the splitting after which it does
+_NEWTON_FLOPS = 2e12  # of one factorisation in blocks: about a minute
+
+
+class Finish(enum.Enum):
+    """Why the solver returned; the value is the sentence shown to the user."""
+
+    CERTIFIED = "the certified gap is below the tolerance"
+    NEWTON = (
+        "the splitting stalled; Newton steps from its point brought the certified gap below the tolerance"
+    )
+    INACCURATE = "the certified gap stayed above the tolerance, also with Newton steps at the end"
+    TOO_LARGE = (
+        "the certified gap stayed above the tolerance, and the factor for Newton steps would be too large"
+    )
+    MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
+    CANCELLED = "cancelled by on_iteration"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class HybridResult:
+    """Locations and what is proven about them."""
+
+    locations: FloatArray
+    """(n, d) centred, with L(T) = sum of the weights."""
+    certificate: Certificate
+    """Of these locations; its dual is feasible."""
+    iterations: int
+    """Of the splitting."""
+    factorisations: int
+    """Of the Newton steps, 0 if there were none."""
+    finish: Finish
+    """Why the solver returned."""
+
+
+def solve_hybrid(
+    graph: ViewGraph,
+    tol: float,
+    max_iterations: int,
+    *,
+    threads: int = 1,
+    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    prediction: Prediction | None = None,
+    on_iteration: OnIteration | None = None,
+) -> HybridResult:
+    """Solve ShapeFit by splitting, certify, and finish with Newton steps if the gap needs them.
+
+    Args:
+        graph: a connected, parallel-rigid view graph whose directions do not cancel.
+        tol: the certified gap wanted, in units of the objective.
+        max_iterations: limit of iterations of the splitting. Newton steps follow a stall, or a few hundred
+            iterations where they are cheap, not this limit.
+        threads: of the passes over edges and of the factor; the result does not depend on it.
+        memory_bytes: what a factor may take.
+        prediction: of the factor, if it is there already, to save a second ordering.
+        on_iteration: called after each iteration and each factorisation; returning False cancels. What
+            has been reached is certified all the same.
+
+    Raises:
+        UnsolvableError: if the graph is not connected.
+    """
+    factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
+    patience = min(max_iterations, _PATIENCE) if _is_cheap(factor, graph.dimension) else max_iterations
+    splitting = Splitting(graph, factor, threads)
+    try:
+        result = _split(splitting, graph, factor, tol, patience, threads, on_iteration)
+    finally:
+        splitting.close()
+    gave_up = result.finish is Finish.MAX_ITERATIONS and patience < max_iterations
+    if not gave_up and result.finish is not Finish.INACCURATE:
+        return result
+    del splitting  # its arrays over edges make room for the factor
+    return _newton(graph, factor, result, tol, memory_bytes, on_iteration)
+
+
+def _split(
+    splitting: Splitting,
+    graph: ViewGraph,
+    factor: LaplacianFactor,
+    tol: float,
+    max_iterations: int,
+    threads: int,
+    on_iteration: OnIteration | None,
+) -> HybridResult:
+    """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
+    target = _SHARE * tol
+    for attempts_left in reversed(range(_CERTIFICATES)):
+        step = splitting.run(0.0, target, max_iterations, on_iteration)
+        t, y = step.locations, step.dual
+        if step.stop is Stop.ACCURATE and attempts_left:
+            certificate = certify_within(graph, t, y, tol, factor=factor, threads=threads)
+        else:
+            certificate = certify(graph, t, y, tol=tol, factor=factor, threads=threads, overwrite_dual=True)
+        if certificate is not None:
+            break
+        target *= _TIGHTER
+    assert certificate is not None, "the last one is taken as it is"
+    return HybridResult(
+        locations=t,
+        certificate=certificate,
+        iterations=step.iterations,
+        factorisations=0,
+        finish=_verdict(certificate, step.stop, tol),
+    )
+
+
+def _verdict(certificate: Certificate, stop: Stop, tol: float) -> Finish:
+    """Return what a certified answer of the splitting amounts to."""
+    if certificate.gap <= tol:
+        return Finish.CERTIFIED
+    ends = {Stop.CANCELLED: Finish.CANCELLED, Stop.MAX_ITERATIONS: Finish.MAX_ITERATIONS}
+    return ends.get(stop, Finish.INACCURATE)
+
+
+def _newton(
+    graph: ViewGraph,
+    factor: LaplacianFactor,
+    result: HybridResult,
+    tol: float,
+    memory_bytes: int,
+    on_iteration: OnIteration | None,
+) -> HybridResult:
+    """Go on from the best certified point by Newton steps, if their factor fits."""
+    d = graph.dimension
+    plan = factor.symbolic if isinstance(factor, CholeskyFactor) else None
+    fits = plan is not None and plan.num_bytes(d, np.float64) <= memory_bytes
+    if plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
+        return replace(result, finish=Finish.TOO_LARGE)
+    cancelled = False
+
+    def report(info: IterationInfo) -> bool | None:
+        nonlocal cancelled
+        if on_iteration is None:
+            return None
+        answer = on_iteration(
+            IterationInfo(result.iterations + info.iteration, info.objective, info.dual_bound)
+        )
+        cancelled = answer is not None and not answer
+        return not cancelled
+
+    count = 0
+    for start in (result.locations, result.certificate.dual), None:
+        if start is None and not _is_cheap(factor, d):
+            break
+        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, report, start=start, plan=plan)
+        result, count = _better(graph, result, t, y, tol, factor), count + steps
+        if cancelled or result.certificate.gap <= tol:
+            break
+    finish = Finish.NEWTON if result.certificate.gap <= tol else Finish.INACCURATE
+    if cancelled and finish is Finish.INACCURATE:
+        finish = Finish.CANCELLED
+    return replace(result, factorisations=count, finish=finish)
+
+
+def _is_cheap(factor: LaplacianFactor, dimension: int) -> bool:
+    """Return whether a factorisation in blocks takes no time to speak of."""
+    return isinstance(factor, CholeskyFactor) and factor.symbolic.flops * dimension**3 <= _CHEAP_FLOPS
+
+
+def _better(
+    graph: ViewGraph, result: HybridResult, t: FloatArray, y: FloatArray, tol: float, factor: LaplacianFactor
+) -> HybridResult:
+    """Return the result with other locations and their certificate, if its gap is smaller."""
+    if not (np.isfinite(t).all() and projected_length(graph, t) > 0.0):
+        return result
+    certificate = certify(graph, t, y, tol=tol, factor=factor)
+    if not certificate.gap < result.certificate.gap:
+        return result
+    return replace(result, locations=t - t.mean(axis=0), certificate=certificate)
