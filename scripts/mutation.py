@@ -60,7 +60,9 @@ GROUPS = {
     "program": ["solver/program.py", "solver/options.py"],
     "solve": ["solver/solve.py", "solver/splitting/split_then_newton.py"],
     "angular": ["refinement/angular.py"],
-    "bodies": [f"solver/bodies/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")],
+    "rigid_groups": [
+        f"solver/groups/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")
+    ],
 }
 TESTS = {
     "rigidity": ["rigidity"],
@@ -70,7 +72,7 @@ TESTS = {
     "program": ["solver", "newton"],
     "solve": ["solver", "certificate", "admm"],
     "angular": ["angular"],
-    "bodies": ["bodies"],
+    "rigid_groups": ["rigid_groups"],
 }
 LONGEST_TEST_S = 2.0  # of processor time, interpreted and observed: longer ones are left out
 BUDGET_S = 12.0  # of tests per mutant, by their time in the first run

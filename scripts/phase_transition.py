@@ -187,7 +187,7 @@ def _apart(results: Results) -> str:
 def _are_unique(cell: Cell, trials: int) -> bool:
     """Return whether each problem of a cell has an optimum certified to be unique, or none at all."""
     graphs = [ViewGraph(cell.n, p.edges, p.directions) for p in problems(cell, trials, SEED)]
-    rigid = [g for g in graphs if is_parallel_rigid(g.num_cameras, g.edges, g.dimension)]
+    rigid = [g for g in graphs if is_parallel_rigid(g.num_nodes, g.edges, g.dimension)]
     return all(solve(graph, SolverOptions(tol=1e-12)).unique for graph in rigid)
 
 

@@ -1,4 +1,4 @@
-"""The view graph: cameras, pairs, and one direction per pair.
+"""The view graph: nodes (cameras, and 3D points where they help), pairs, and one direction per pair.
 
 An edge (i, j) carries the unit direction of t_i - t_j: it points from camera j to camera i
 (Hand, Lee, Voroninski 2015, eq. 1).
@@ -29,7 +29,7 @@ class ViewGraph:
     to rounding are kept to the last bit, so that a graph of a graph's edges has the same directions.
     """
 
-    num_cameras: int
+    num_nodes: int
     edges: IntArray
     """(m, 2) camera indices (i, j); each unordered pair stands once."""
     directions: FloatArray
@@ -41,7 +41,7 @@ class ViewGraph:
 
     def __init__(
         self,
-        num_cameras: int,
+        num_nodes: int,
         edges: npt.ArrayLike,
         directions: npt.ArrayLike,
         weights: npt.ArrayLike | None = None,
@@ -50,7 +50,7 @@ class ViewGraph:
         """Check and store a view graph.
 
         Args:
-            num_cameras: n >= 0; a graph without cameras is what no edges at all are restricted to.
+            num_nodes: n >= 0; a graph without cameras is what no edges at all are restricted to.
             edges: (m, 2) integers in [0, n).
             directions: (m, d) unit vectors, d >= 2.
             weights: (m,) finite and positive; 1 if None.
@@ -60,15 +60,13 @@ class ViewGraph:
             InputError: naming the first edge that is out of range, a self-loop, not a unit vector, not
                 of positive weight, or whose duplicates cancel each other.
         """
-        edge_array, direction_array, weight_array = _checked_arrays(num_cameras, edges, directions, weights)
-        if names is not None and len(names) != num_cameras:
-            raise InputError(
-                f"the graph has {num_cameras} cameras but {len(names)} names; give one name each"
-            )
+        edge_array, direction_array, weight_array = _checked_arrays(num_nodes, edges, directions, weights)
+        if names is not None and len(names) != num_nodes:
+            raise InputError(f"the graph has {num_nodes} cameras but {len(names)} names; give one name each")
         edge_array, direction_array, weight_array = _merge_duplicates(
             edge_array, direction_array, weight_array
         )
-        object.__setattr__(self, "num_cameras", int(num_cameras))
+        object.__setattr__(self, "num_nodes", int(num_nodes))
         object.__setattr__(self, "edges", frozen(edge_array))
         object.__setattr__(self, "directions", frozen(direction_array))
         object.__setattr__(self, "weights", frozen(weight_array))
@@ -86,12 +84,12 @@ class ViewGraph:
 
     def degrees(self) -> IntArray:
         """Return the number of pairs of each camera, shape (n,)."""
-        return np.bincount(self.edges.ravel(), minlength=self.num_cameras).astype(np.int64)
+        return np.bincount(self.edges.ravel(), minlength=self.num_nodes).astype(np.int64)
 
     def components(self) -> IntArray:
         """Return the connected component of each camera, shape (n,), numbered from 0 by first camera."""
         i, j = self.edges.T
-        adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(self.num_cameras, self.num_cameras))
+        adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(self.num_nodes, self.num_nodes))
         labels = connected_components(adjacency, directed=False)[1]
         return np.asarray(labels, dtype=np.int64)
 
@@ -117,11 +115,11 @@ class ViewGraph:
 
 
 def _checked_arrays(
-    num_cameras: int, edges: npt.ArrayLike, directions: npt.ArrayLike, weights: npt.ArrayLike | None
+    num_nodes: int, edges: npt.ArrayLike, directions: npt.ArrayLike, weights: npt.ArrayLike | None
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the inputs as arrays of the right type and shape, or raise InputError."""
-    if not isinstance(num_cameras, numbers.Integral) or num_cameras < 0:
-        raise InputError(f"num_cameras must be a whole number >= 0, got {num_cameras}")
+    if not isinstance(num_nodes, numbers.Integral) or num_nodes < 0:
+        raise InputError(f"num_nodes must be a whole number >= 0, got {num_nodes}")
     given = np.asarray(edges)
     if given.size and not np.issubdtype(given.dtype, np.integer):
         raise InputError(f"edges must be integers, got {given.dtype}; give camera indices in [0, n)")
@@ -137,7 +135,7 @@ def _checked_arrays(
     if w.shape != (len(i),):
         raise InputError(f"weights have shape {w.shape} for {len(i)} edges; give one number per edge")
 
-    _refuse(~((i >= 0) & (i < num_cameras)).all(axis=1), i, f"is outside the cameras 0..{num_cameras - 1}")
+    _refuse(~((i >= 0) & (i < num_nodes)).all(axis=1), i, f"is outside the cameras 0..{num_nodes - 1}")
     _refuse(i[:, 0] == i[:, 1], i, "joins a camera with itself; remove it")
     with np.errstate(over="ignore"):
         norms = np.linalg.norm(v, axis=1)

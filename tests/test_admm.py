@@ -168,7 +168,7 @@ def test_the_order_and_orientation_of_the_edges_do_not_matter():
     graph, _ = small_problem(4, 3)
     shuffle = np.random.default_rng(0).permutation(graph.num_edges)
     other = ViewGraph(
-        graph.num_cameras, graph.edges[shuffle][:, ::-1], -graph.directions[shuffle], graph.weights[shuffle]
+        graph.num_nodes, graph.edges[shuffle][:, ::-1], -graph.directions[shuffle], graph.weights[shuffle]
     )
     first, second = solve_admm(graph, 1e-12, 2000), solve_admm(other, 1e-12, 2000)
     np.testing.assert_allclose(first.locations, second.locations, atol=1e-6)
@@ -177,7 +177,7 @@ def test_the_order_and_orientation_of_the_edges_do_not_matter():
 
 def test_a_common_factor_on_the_weights_changes_no_location():
     graph, _ = small_problem(5, 3)
-    scaled = ViewGraph(graph.num_cameras, graph.edges, graph.directions, 1000.0 * graph.weights)
+    scaled = ViewGraph(graph.num_nodes, graph.edges, graph.directions, 1000.0 * graph.weights)
     first, second = solve_admm(graph, 1e-10, 2000), solve_admm(scaled, 1e-10, 2000)
     assert first.iterations == second.iterations
     np.testing.assert_allclose(first.locations, second.locations, atol=1e-8)
@@ -248,7 +248,7 @@ def test_the_iteration_limit_is_reported():
 def lud_reference(graph):
     """LUD through cvxpy and Clarabel: optimal value and locations."""
     cp = pytest.importorskip("cvxpy")
-    t, s = cp.Variable((graph.num_cameras, graph.dimension)), cp.Variable(graph.num_edges)
+    t, s = cp.Variable((graph.num_nodes, graph.dimension)), cp.Variable(graph.num_edges)
     i, j = graph.edges.T
     deviations = t[i] - t[j] - cp.multiply(cp.reshape(s, (graph.num_edges, 1), order="F"), graph.directions)
     program = cp.Problem(cp.Minimize(graph.weights @ cp.norm(deviations, 2, axis=1)), [s >= 1, t[0] == 0])
@@ -316,7 +316,7 @@ def plain_step(graph, least, x, t, rho, relaxation):
     }
     y, y_next = x - clip(x), x_next - u
     residuals = np.sum(rho[:, None] * (baselines - y_next) ** 2), np.sum(rho[:, None] * (y_next - y) ** 2)
-    pull = adjoint(rho[:, None] * (x_next - 2.0 * u - baselines), graph.edges, graph.num_cameras)
+    pull = adjoint(rho[:, None] * (x_next - 2.0 * u - baselines), graph.edges, graph.num_nodes)
     return x_next, pull, [sums[k] for k in range(5)], residuals
 
 
@@ -337,7 +337,7 @@ def test_the_fused_pass_is_the_proximal_step_written_plainly(d, least):
     np.testing.assert_allclose(pull, expected_pull, atol=1e-11)
     np.testing.assert_allclose(sums, expected_sums, rtol=1e-12, atol=1e-11)
     np.testing.assert_allclose(passes.pull(ours, t, rho[order]), expected_pull, atol=1e-11)
-    pushed = adjoint(rho[:, None] * differences(t, graph.edges), graph.edges, graph.num_cameras)
+    pushed = adjoint(rho[:, None] * differences(t, graph.edges), graph.edges, graph.num_nodes)
     np.testing.assert_allclose(passes.laplacian(t, rho[order]), pushed, atol=1e-11)
     np.testing.assert_allclose(passes.imbalance(x[order], ours, t, rho[order]), residuals, rtol=1e-12)
 

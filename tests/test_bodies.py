@@ -1,4 +1,4 @@
-"""ShapeFit over rigid bodies: the program, its dual and certificate, what hangs free, and the refinement."""
+"""ShapeFit over rigid groups: the program, its dual and certificate, what hangs free, and the refinement."""
 
 from dataclasses import replace
 
@@ -7,13 +7,13 @@ import pytest
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement.rigs import place_bodies
+from sfm_shapefit.placement.rigs import place_groups
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
-from sfm_shapefit.solver.rigs import certify_bodies, largest_tied, lud_over_bodies, solve_bodies
-from sfm_shapefit.solver.rigs import newton as bodies_newton
-from sfm_shapefit.solver.rigs.groups import Bodies, separate
+from sfm_shapefit.solver.rigs import certify_groups, largest_tied, lud_over_groups, solve_groups
+from sfm_shapefit.solver.rigs import newton as groups_newton
+from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor, factor_pinned
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting import solve_lud
@@ -37,13 +37,13 @@ def rig_problem(seed, frames=8, sensors=3, wrong=0.2, noise=0.0, share=0.5):
     bad = rng.random(len(edges)) < wrong
     v[bad] = normalized(rng.normal(size=v.shape))[bad]
     graph = ViewGraph(n, edges, v, rng.uniform(0.5, 2.0, len(edges)))
-    return graph, Bodies(body_of=labels, offsets=offsets), t
+    return graph, RigidGroups(group_of=labels, offsets=offsets), t
 
 
-def outer(graph, bodies):
+def outer(graph, groups):
     """The graph without the pairs inside a body."""
-    kept = bodies.joins(graph.edges)
-    return ViewGraph(graph.num_cameras, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
+    kept = groups.joins(graph.edges)
+    return ViewGraph(graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
 
 
 def centred(t):
@@ -54,28 +54,30 @@ def centred(t):
 
 
 def test_reducing_is_the_adjoint_of_expanding():
-    bodies = rig_problem(0)[1]
+    groups = rig_problem(0)[1]
     rng = np.random.default_rng(1)
-    x, g = rng.normal(size=bodies.num_unknowns), rng.normal(size=bodies.offsets.shape)
-    assert np.vdot(bodies.expand(x), g) == pytest.approx(np.vdot(x, bodies.reduce(g)), rel=1e-13)
+    x, g = rng.normal(size=groups.num_unknowns), rng.normal(size=groups.offsets.shape)
+    assert np.vdot(groups.expand(x), g) == pytest.approx(np.vdot(x, groups.reduce(g)), rel=1e-13)
 
 
 def test_fitting_finds_the_unknowns_and_how_far_a_node_is_off():
-    bodies = rig_problem(0)[1]
-    x = np.random.default_rng(1).normal(size=bodies.num_unknowns)
-    t = bodies.expand(x)
-    found, apart = bodies.fit(t)
+    groups = rig_problem(0)[1]
+    x = np.random.default_rng(1).normal(size=groups.num_unknowns)
+    t = groups.expand(x)
+    found, apart = groups.fit(t)
     np.testing.assert_allclose(found, x, atol=1e-13)
     assert apart < 1e-13
-    t[4] += [0.3, 0.0, 0.0]  # of a body of three: the mean takes up a third, the scale a little
-    assert 0.1 < bodies.fit(t)[1] < 0.25
+    t[4] += [0.3, 0.0, 0.0]  # of a group of three: the mean takes up a third, the scale a little
+    assert 0.1 < groups.fit(t)[1] < 0.25
 
 
-def test_bodies_with_fixed_nodes_become_one_whole_frames_with_them():
-    bodies = Bodies(body_of=[0, 0, 1, 1, 2], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 0]])
+def test_groups_with_fixed_nodes_become_one_whole_frames_with_them():
+    groups = RigidGroups(
+        group_of=[0, 0, 1, 1, 2], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, 0]]
+    )
     centers = np.array([[5.0, 0, 0], [6.0, 0, 0], [9.0, 9, 9], [8.0, 1, 0], [7.0, 7, 7]])
-    joined = bodies.with_fixed(np.array([True, False, False, True, False]), centers)
-    np.testing.assert_array_equal(joined.body_of, [0, 0, 0, 0, 1])
+    joined = groups.with_fixed(np.array([True, False, False, True, False]), centers)
+    np.testing.assert_array_equal(joined.group_of, [0, 0, 0, 0, 1])
     # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own centre.
     expected = np.array([[5.0, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, 0]])
     np.testing.assert_allclose(centred(joined.offsets[:4]), centred(expected), atol=1e-14)
@@ -89,15 +91,15 @@ def test_bodies_with_fixed_nodes_become_one_whole_frames_with_them():
         ([0, 1], np.full((2, 3), np.nan), "offset of node 0 is not finite"),
     ],
 )
-def test_bodies_that_make_no_sense_are_refused(labels, offsets, message):
+def test_groups_that_make_no_sense_are_refused(labels, offsets, message):
     with pytest.raises(InputError, match=message):
-        Bodies(body_of=labels, offsets=offsets)
+        RigidGroups(group_of=labels, offsets=offsets)
 
 
-def written_out(edges, bodies, blocks):
+def written_out(edges, groups, blocks):
     """A^T D^T S D A and A, dense."""
-    n, d = bodies.offsets.shape
-    expand = np.stack([bodies.expand(x).ravel() for x in np.eye(bodies.num_unknowns)], axis=1)
+    n, d = groups.offsets.shape
+    expand = np.stack([groups.expand(x).ravel() for x in np.eye(groups.num_unknowns)], axis=1)
     baselines = np.zeros((len(edges), n))
     baselines[np.arange(len(edges)), edges[:, 0]] = 1.0
     baselines[np.arange(len(edges)), edges[:, 1]] -= 1.0
@@ -108,10 +110,12 @@ def written_out(edges, bodies, blocks):
 
 @pytest.mark.parametrize("metric", [True, False])
 def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric):
-    graph, bodies, _ = rig_problem(13, frames=5)
-    between = outer(graph, bodies)[0]
-    edges, v, n = between.edges, between.directions, graph.num_cameras
-    unit = bodies.normalised() if metric else Bodies(body_of=bodies.body_of, offsets=0.0 * bodies.offsets)
+    graph, groups, _ = rig_problem(13, frames=5)
+    between = outer(graph, groups)[0]
+    edges, v, n = between.edges, between.directions, graph.num_nodes
+    unit = (
+        groups.normalised() if metric else RigidGroups(group_of=groups.group_of, offsets=0.0 * groups.offsets)
+    )
     rng = np.random.default_rng(2)
     roots = rng.normal(size=(len(edges), 3, 3))
     blocks = np.eye(3) + roots @ roots.transpose(0, 2, 1)
@@ -141,10 +145,10 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
 
 
 def test_a_scale_that_nothing_holds_is_refused():
-    graph, bodies, _ = rig_problem(13, frames=5, wrong=0.0)
-    between = outer(graph, bodies)[0]
+    graph, groups, _ = rig_problem(13, frames=5, wrong=0.0)
+    between = outer(graph, groups)[0]
     edges, v = between.edges, between.directions
-    factor = ReducedFactor(edges, bodies.normalised())
+    factor = ReducedFactor(edges, groups.normalised())
     with pytest.raises(UnsolvableError, match="do not determine a scale"):  # all may grow along the solution
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
@@ -155,9 +159,9 @@ def test_a_scale_that_nothing_holds_is_refused():
 
 
 def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
-    graph, bodies, t = rig_problem(1)
-    result = solve_bodies(graph, bodies)
-    x, apart = bodies.fit(result.locations)
+    graph, groups, t = rig_problem(1)
+    result = solve_groups(graph, groups)
+    x, apart = groups.fit(result.locations)
     assert result.status is Status.CONVERGED
     assert result.unique
     assert apart < 1e-12
@@ -166,100 +170,100 @@ def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_the_answer_is_that_of_the_conic_program_over_the_same_bodies(noise):
-    graph, bodies, _ = rig_problem(2, noise=noise)
-    result = solve_bodies(graph, bodies)
-    locations, dual, _ = solve_conic(outer(graph, bodies)[0], 1e-9, 200, bodies)
+def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
+    graph, groups, _ = rig_problem(2, noise=noise)
+    result = solve_groups(graph, groups)
+    locations, dual, _ = solve_conic(outer(graph, groups)[0], 1e-9, 200, groups)
     every = np.zeros_like(graph.directions)
-    every[bodies.joins(graph.edges)] = dual
-    reference = certify_bodies(graph, bodies, centred(locations), every)
+    every[groups.joins(graph.edges)] = dual
+    reference = certify_groups(graph, groups, centred(locations), every)
     assert reference.gap < 1e-9  # so the two optima agree to the sum of both gaps
     assert result.objective == pytest.approx(reference.objective, abs=1e-8)
     # The objective is sharp here: locations agree to a few times its error.
     np.testing.assert_allclose(result.locations, centred(locations), atol=1e-6)
 
 
-def test_bodies_of_one_node_are_the_plain_program_and_s_stays_zero():
+def test_groups_of_one_node_are_the_plain_program_and_s_stays_zero():
     graph, _, _ = rig_problem(3, noise=0.01)
-    result = solve_bodies(graph, separate(graph.num_cameras, 3))
+    result = solve_groups(graph, separate(graph.num_nodes, 3))
     plain = solve(graph)
     assert result.objective == pytest.approx(plain.objective, abs=2e-8)
     np.testing.assert_allclose(result.locations, plain.locations, atol=1e-6)
 
 
 def test_admitting_fewer_locations_raises_the_optimum():
-    graph, bodies, _ = rig_problem(4, noise=0.05)
-    between = outer(graph, bodies)[0]
-    assert solve_bodies(graph, bodies).dual_bound > solve(between).objective + 1e-4
+    graph, groups, _ = rig_problem(4, noise=0.05)
+    between = outer(graph, groups)[0]
+    assert solve_groups(graph, groups).dual_bound > solve(between).objective + 1e-4
 
 
-def test_the_dual_balances_over_each_body_and_for_the_scale():
-    graph, bodies, _ = rig_problem(5, noise=0.02)
-    result = solve_bodies(graph, bodies)
-    between, kept = outer(graph, bodies)
+def test_the_dual_balances_over_each_group_and_for_the_scale():
+    graph, groups, _ = rig_problem(5, noise=0.02)
+    result = solve_groups(graph, groups)
+    between, kept = outer(graph, groups)
     y, w = result.dual[kept], between.weights
-    total = bodies.reduce(adjoint(y, between.edges, graph.num_cameras))
-    wanted = result.dual_bound * bodies.reduce(scale_functional(between))
+    total = groups.reduce(adjoint(y, between.edges, graph.num_nodes))
+    wanted = result.dual_bound * groups.reduce(scale_functional(between))
     assert np.linalg.norm(y, axis=1).max() <= w.max() * (1 + 1e-14)
     assert (np.linalg.norm(y, axis=1) <= w * (1 + 1e-14)).all()
     assert np.abs(np.sum(y * between.directions, axis=1)).max() < 1e-13
     # The solver leaves 1e-13 of the degree at most; one camera alone is not balanced.
     np.testing.assert_allclose(total, wanted, atol=1e-11 * np.abs(wanted).max())
-    alone = adjoint(y, between.edges, graph.num_cameras) - result.dual_bound * scale_functional(between)
+    alone = adjoint(y, between.edges, graph.num_nodes) - result.dual_bound * scale_functional(between)
     assert np.abs(alone).max() > 1e-3
     assert not result.dual[~kept].any()
 
 
 def test_any_dual_gives_a_bound_below_the_optimum_and_a_near_one_a_close_bound():
-    graph, bodies, _ = rig_problem(6, noise=0.02)
-    result = solve_bodies(graph, bodies)
+    graph, groups, _ = rig_problem(6, noise=0.02)
+    result = solve_groups(graph, groups)
     rng = np.random.default_rng(0)
     for size, loss in ((1e-4, 1e-2), (1.0, np.inf)):
         spoilt = result.dual + size * rng.normal(size=result.dual.shape)
-        found = certify_bodies(graph, bodies, result.locations, spoilt)
+        found = certify_groups(graph, groups, result.locations, spoilt)
         assert found.dual_bound <= result.objective
         assert found.equality_residual < 1e-11
         assert result.dual_bound - found.dual_bound < loss
-    assert certify_bodies(graph, bodies, result.locations, 0.0 * result.dual).dual_bound == 0.0
+    assert certify_groups(graph, groups, result.locations, 0.0 * result.dual).dual_bound == 0.0
 
 
-def test_locations_that_are_not_those_of_the_bodies_are_not_certified():
-    graph, bodies, _ = rig_problem(7)
-    result = solve_bodies(graph, bodies)
+def test_locations_that_are_not_those_of_the_groups_are_not_certified():
+    graph, groups, _ = rig_problem(7)
+    result = solve_groups(graph, groups)
     moved = result.locations.copy()
     moved[3] += 1e-3
-    with pytest.raises(InputError, match="not those of rigid bodies"):
-        certify_bodies(graph, bodies, moved, result.dual)
+    with pytest.raises(InputError, match="not those of rigid groups"):
+        certify_groups(graph, groups, moved, result.dual)
     with pytest.raises(InputError, match="L\\(T\\) <= 0"):
-        certify_bodies(graph, bodies, -result.locations, result.dual)
+        certify_groups(graph, groups, -result.locations, result.dual)
 
 
 def test_what_cannot_be_certified_is_refused():
-    graph, bodies, t = rig_problem(7, wrong=0.0)
+    graph, groups, t = rig_problem(7, wrong=0.0)
     dual = np.zeros_like(graph.directions)
-    inside = bodies.body_of[graph.edges[:, 0]] == bodies.body_of[graph.edges[:, 1]]
-    inner = ViewGraph(graph.num_cameras, graph.edges[inside], graph.directions[inside])
+    inside = groups.group_of[graph.edges[:, 0]] == groups.group_of[graph.edges[:, 1]]
+    inner = ViewGraph(graph.num_nodes, graph.edges[inside], graph.directions[inside])
     for refused, message in (
-        ((graph, bodies, t[1:], dual), "have shapes"),
-        ((graph, bodies, t, dual[1:]), "have shapes"),
-        ((graph, bodies, t, np.vstack([dual, dual])), "have shapes"),
-        ((graph, separate(graph.num_cameras + 1, 3), t, dual), "have shapes"),
-        ((graph, bodies, np.where(np.arange(len(t))[:, None] == 2, np.nan, t), dual), "must be finite"),
-        ((graph, bodies, t, dual + np.inf), "must be finite"),
-        ((inner, bodies, t, dual[inside]), "no pair joins two bodies"),
+        ((graph, groups, t[1:], dual), "have shapes"),
+        ((graph, groups, t, dual[1:]), "have shapes"),
+        ((graph, groups, t, np.vstack([dual, dual])), "have shapes"),
+        ((graph, separate(graph.num_nodes + 1, 3), t, dual), "have shapes"),
+        ((graph, groups, np.where(np.arange(len(t))[:, None] == 2, np.nan, t), dual), "must be finite"),
+        ((graph, groups, t, dual + np.inf), "must be finite"),
+        ((inner, groups, t, dual[inside]), "no pair joins two groups"),
     ):
         with pytest.raises(InputError, match=message):
-            certify_bodies(*refused)
-    with pytest.raises(UnsolvableError, match="no pair joins two bodies"):
-        solve_bodies(inner, bodies)
+            certify_groups(*refused)
+    with pytest.raises(UnsolvableError, match="no pair joins two groups"):
+        solve_groups(inner, groups)
 
 
 def test_a_dual_that_balances_is_kept_as_it_is_and_any_is_shrunk_into_its_balls():
-    graph, bodies, _ = rig_problem(6, noise=0.02)
-    result = solve_bodies(graph, bodies)
-    again = certify_bodies(graph, bodies, result.locations, result.dual)
+    graph, groups, _ = rig_problem(6, noise=0.02)
+    result = solve_groups(graph, groups)
+    again = certify_groups(graph, groups, result.locations, result.dual)
     np.testing.assert_allclose(again.dual, result.dual, atol=1e-13)
-    large = certify_bodies(graph, bodies, result.locations, 3.0 * result.dual)
+    large = certify_groups(graph, groups, result.locations, 3.0 * result.dual)
     ratios = np.linalg.norm(large.dual, axis=1) / graph.weights
     assert ratios.max() == pytest.approx(1.0, abs=1e-12)
     assert large.dual_bound == pytest.approx(
@@ -268,20 +272,20 @@ def test_a_dual_that_balances_is_kept_as_it_is_and_any_is_shrunk_into_its_balls(
 
 
 def test_what_is_not_certified_is_not_called_converged(monkeypatch):
-    graph, bodies, _ = rig_problem(6, noise=0.02)
-    early = solve_bodies(graph, bodies, SolverOptions(max_iterations=2))
+    graph, groups, _ = rig_problem(6, noise=0.02)
+    early = solve_groups(graph, groups, SolverOptions(max_iterations=2))
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
-    certify = bodies_newton.certify_bodies
+    certify = groups_newton.certify_groups
     monkeypatch.setattr(
-        bodies_newton, "certify_bodies", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
+        groups_newton, "certify_groups", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
     )
-    assert solve_bodies(graph, bodies).status is Status.INACCURATE
+    assert solve_groups(graph, groups).status is Status.INACCURATE
 
 
 def test_the_same_problem_gives_the_same_bits():
-    graph, bodies, _ = rig_problem(8, noise=0.02)
-    first, second = solve_bodies(graph, bodies), solve_bodies(graph, bodies)
+    graph, groups, _ = rig_problem(8, noise=0.02)
+    first, second = solve_groups(graph, groups), solve_groups(graph, groups)
     np.testing.assert_array_equal(first.locations, second.locations)
     np.testing.assert_array_equal(first.dual, second.dual)
 
@@ -289,34 +293,34 @@ def test_the_same_problem_gives_the_same_bits():
 # --- what hangs free -----------------------------------------------------------------------------------
 
 
-def test_a_body_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
-    graph, bodies, _ = rig_problem(9, frames=6, share=1.0)
-    ends = bodies.body_of[graph.edges]
+def test_a_group_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
+    graph, groups, _ = rig_problem(9, frames=6, share=1.0)
+    ends = groups.group_of[graph.edges]
     to_last = np.flatnonzero((ends == 5).any(axis=1) & (ends[:, 0] != ends[:, 1]))
-    sizes = np.bincount(bodies.body_of)
+    sizes = np.bincount(groups.group_of)
     for count, expected in ((1, 5), (2, 6)):
-        # Pairs of different sensors: in three dimensions two directions fix a body whose scale is known.
+        # Pairs of different sensors: in three dimensions two directions fix a group whose scale is known.
         dropped = np.delete(to_last, [0, 7][:count])
         kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-        assert len(largest_tied(graph.edges[kept], bodies, sizes)) == expected
+        assert len(largest_tied(graph.edges[kept], groups, sizes)) == expected
 
 
 def test_without_offsets_nothing_is_tied_for_the_scale_is_open():
-    graph, bodies, _ = rig_problem(10)
-    flat = Bodies(body_of=bodies.body_of, offsets=np.zeros_like(bodies.offsets))
-    assert len(largest_tied(graph.edges, flat, np.bincount(flat.body_of))) == 1
+    graph, groups, _ = rig_problem(10)
+    flat = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(groups.offsets))
+    assert len(largest_tied(graph.edges, flat, np.bincount(flat.group_of))) == 1
     with pytest.raises(UnsolvableError, match="nothing determines the scale"):
-        place_bodies(graph, flat)
+        place_groups(graph, flat)
 
 
-def test_the_set_around_a_body_is_found_even_where_another_is_larger():
-    first, bodies, _ = rig_problem(11, frames=5, share=1.0)
+def test_the_set_around_a_group_is_found_even_where_another_is_larger():
+    first, groups, _ = rig_problem(11, frames=5, share=1.0)
     second = rig_problem(12, frames=3, share=1.0)[0]
-    n = first.num_cameras
+    n = first.num_nodes
     edges = np.concatenate([first.edges, second.edges + n])
-    both = Bodies(
-        body_of=np.repeat(np.arange(8), 3),
-        offsets=np.concatenate([bodies.offsets, rig_problem(12, frames=3)[1].offsets]),
+    both = RigidGroups(
+        group_of=np.repeat(np.arange(8), 3),
+        offsets=np.concatenate([groups.offsets, rig_problem(12, frames=3)[1].offsets]),
     )
     sizes = np.full(8, 3)
     np.testing.assert_array_equal(largest_tied(edges, both, sizes), range(5))
@@ -325,22 +329,22 @@ def test_the_set_around_a_body_is_found_even_where_another_is_larger():
 
 def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_one_does_not():
     # Two frames, displaced along the line on which both sensors of each stand: all directions are equal.
-    bodies = Bodies(body_of=[0, 0, 1, 1], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
-    t = bodies.expand(np.array([0.0, 0, 0, 5, 0, 0, 1]))
+    groups = RigidGroups(group_of=[0, 0, 1, 1], offsets=[[0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]])
+    t = groups.expand(np.array([0.0, 0, 0, 5, 0, 0, 1]))
     edges = np.array([[0, 2], [0, 3], [1, 2], [1, 3]])
     sizes = np.array([2, 2])
-    assert len(largest_tied(edges, bodies, sizes)) == 2
-    assert len(largest_tied(edges, bodies, sizes, t)) == 1
+    assert len(largest_tied(edges, groups, sizes)) == 2
+    assert len(largest_tied(edges, groups, sizes, t)) == 1
 
 
 # --- starts, refinement, judgement -----------------------------------------------------------------------
 
 
-def test_lud_over_bodies_stays_with_the_bodies_and_near_the_truth():
-    graph, bodies, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
-    between = outer(graph, bodies)[0]
-    locations = lud_over_bodies(between, bodies)
-    x, apart = bodies.fit(locations)
+def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():
+    graph, groups, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
+    between = outer(graph, groups)[0]
+    locations = lud_over_groups(between, groups)
+    x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
     errors = np.linalg.norm(locations / x[-1] - centred(t), axis=1)
     assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centred(t), axis=1))
@@ -355,34 +359,34 @@ def test_lud_over_single_nodes_has_the_optimum_of_lud():
         return graph.weights @ np.linalg.norm(baselines - lengths[:, None] * graph.directions, axis=1)
 
     least = value(solve_lud(graph, 2000, tol=1e-9).locations)
-    ours = value(lud_over_bodies(graph, separate(graph.num_cameras, 3), 1500))
+    ours = value(lud_over_groups(graph, separate(graph.num_nodes, 3), 1500))
     assert ours == pytest.approx(least, rel=1e-5)
 
 
 def test_the_placement_has_the_errors_that_it_states():
     noise, errors, stated = 0.003, [], []
     for seed in range(3):
-        graph, bodies, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
-        placed = place_bodies(graph, bodies)
+        graph, groups, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
+        placed = place_groups(graph, groups)
         errors.append(centred(placed.locations / placed.unit) - centred(t))
         stated.append(placed.assessment.sigmas / placed.unit)
         assert placed.finish.refined
         assert placed.assessment.trust.min() > 0.9
-        assert bodies.fit(placed.locations)[1] < 1e-9
+        assert groups.fit(placed.locations)[1] < 1e-9
     rms, said = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, stated))
     # 180 coordinates, not independent within a frame: 60 give the ratio to about 10 %, twice that is allowed.
     assert 0.8 < rms / said < 1.25
 
 
 def test_a_frame_whose_pairs_are_wrong_is_not_trusted_as_a_whole():
-    graph, bodies, _ = rig_problem(30, frames=10, wrong=0.05, noise=0.002)
+    graph, groups, _ = rig_problem(30, frames=10, wrong=0.05, noise=0.002)
     rng = np.random.default_rng(0)
     v = graph.directions.copy()
-    touched = (bodies.body_of[graph.edges] == 4).any(axis=1)
+    touched = (groups.group_of[graph.edges] == 4).any(axis=1)
     v[touched] = normalized(rng.normal(size=v.shape))[touched]
-    placed = place_bodies(ViewGraph(graph.num_cameras, graph.edges, v, graph.weights), bodies)
+    placed = place_groups(ViewGraph(graph.num_nodes, graph.edges, v, graph.weights), groups)
     trust = placed.assessment.trust
-    spoilt = bodies.body_of[placed.cameras] == 4
+    spoilt = groups.group_of[placed.cameras] == 4
     assert len(set(trust[spoilt])) == 1  # one judgement for all cameras of a frame
     assert trust[spoilt].max() < 0.5
     assert trust[~spoilt].min() > 0.9
@@ -397,7 +401,7 @@ def test_fixed_nodes_keep_their_shape_and_the_others_find_their_scale():
     wrong = rng.random(len(edges)) < 0.2
     v[wrong] = normalized(rng.normal(size=v.shape))[wrong]
     fixed = np.arange(24) < 8
-    placed = place_bodies(ViewGraph(24, edges, v), separate(24, 3).with_fixed(fixed, t), held=0)
+    placed = place_groups(ViewGraph(24, edges, v), separate(24, 3).with_fixed(fixed, t), held=0)
     still = fixed[placed.cameras]
     found = placed.locations / placed.unit
     found = found + (t[placed.cameras][still] - found[still]).mean(axis=0)
@@ -410,7 +414,7 @@ def test_fixed_nodes_keep_their_shape_and_the_others_find_their_scale():
 
 
 def test_offsets_that_the_directions_contradict_are_an_error_not_a_scale():
-    graph, bodies, _ = rig_problem(14, wrong=0.0)
-    mirrored = Bodies(body_of=bodies.body_of, offsets=-bodies.offsets)
+    graph, groups, _ = rig_problem(14, wrong=0.0)
+    mirrored = RigidGroups(group_of=groups.group_of, offsets=-groups.offsets)
     with pytest.raises(UnsolvableError, match="contradict the known offsets"):
-        place_bodies(graph, mirrored)
+        place_groups(graph, mirrored)

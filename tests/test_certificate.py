@@ -48,7 +48,7 @@ def assert_feasible(graph, certificate):
     y, v, w = certificate.dual, graph.directions, graph.weights
     assert np.all(np.linalg.norm(y, axis=1) <= w * (1.0 + 1e-14))
     assert np.abs(np.sum(y * v, axis=1)).max() <= 1e-14 * w.max()
-    violation = adjoint(y, graph.edges, graph.num_cameras) - certificate.dual_bound * scale_functional(graph)
+    violation = adjoint(y, graph.edges, graph.num_nodes) - certificate.dual_bound * scale_functional(graph)
     degree = np.bincount(graph.edges.ravel(), weights=np.repeat(w, 2)).max()
     # What needs no repair: a 1e5th of the gap, from 1e-12 to 5e-10.
     allowed = min(max(1e-5 * certificate.gap, 1e-12), 5e-10)
@@ -57,7 +57,7 @@ def assert_feasible(graph, certificate):
 
 def unit_bound(graph, t, dual):
     """The bound after one repair in the metric of ones, as the certificate did before it had a better one."""
-    edges, v, n = graph.edges, graph.directions, graph.num_cameras
+    edges, v, n = graph.edges, graph.directions, graph.num_nodes
     c, y = scale_functional(graph), across(dual, graph.directions)
     multiplier = np.sum(y * differences(t, edges)) / np.sum(c * t)
     h = conjugate_gradients(
@@ -278,7 +278,7 @@ def test_a_solver_without_fill_serves_as_well():
     graph = drawn("geo", 600, 24)
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
-    iterative = IterativeSolver(adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges)))
+    iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
     certificate = certify(graph, split.locations, split.dual, factor=iterative)
     assert_feasible(graph, certificate)
     # The rounds stop at a tenth of the violation, not at the same point of it.
@@ -299,7 +299,7 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
 
 def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
     graph = drawn("geo", 300, 16)
-    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
     used, new = IterativeSolver(neighbours), IterativeSolver(neighbours)
     used.refactor(graph.weights)

@@ -465,7 +465,7 @@ def test_the_offset_of_an_image_in_its_frame_is_that_of_its_sensor_turned_with_t
     origins = [-f.rig_from_world.rotation.matrix().T @ f.rig_from_world.translation for f in frames]
     np.testing.assert_allclose(model.centers - origins, model.frame_offsets, atol=1e-12)
     assert model.has_rigs
-    assert [len(set(group)) for group in (model.frame_ids.tolist(), model.bodies.body_of.tolist())] == [3, 3]
+    assert [len(set(group)) for group in (model.frame_ids.tolist(), model.groups.group_of.tolist())] == [3, 3]
 
 
 # --- rays and tracks ---------------------------------------------------------------------------------

@@ -67,7 +67,7 @@ def test_the_bound_of_any_dual_made_feasible_holds_exactly(seed):
     graph = problem(seed)
     rng = np.random.default_rng(seed)
     dual = solve(graph).dual + 0.05 * rng.standard_normal((graph.num_edges, graph.dimension))
-    locations = rng.standard_normal((graph.num_cameras, graph.dimension))
+    locations = rng.standard_normal((graph.num_nodes, graph.dimension))
     if np.sum(scale_functional(graph) * locations) < 0.0:
         locations = -locations
     found = certify(graph, locations, dual)

@@ -121,7 +121,7 @@ def test_the_optimality_conditions_hold(solver):
     assert np.abs(np.sum(y * graph.directions, axis=1)).max() < 1e-12
     multiplier = np.sum(y * r) / kappa
     # Refined until the violation is 1e-13 of the mean degree, or 1e-5 of the gap before the last step.
-    violation = adjoint(y, graph.edges, graph.num_cameras) - multiplier * scale_functional(graph)
+    violation = adjoint(y, graph.edges, graph.num_nodes) - multiplier * scale_functional(graph)
     assert np.abs(violation).max() < 1e-10
     # Complementarity: every pair's share of the gap is positive and at most the whole of it.
     shares = (w * norms - np.sum(y * r, axis=1)) / kappa
@@ -140,7 +140,7 @@ def test_the_answer_follows_rotation_relabelling_flips_and_the_scale_of_weights(
     t = shape(solved(graph, tol=1e-11)[0])
     rng = np.random.default_rng(0)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    order = rng.permutation(graph.num_cameras)
+    order = rng.permutation(graph.num_nodes)
     flip = rng.random(graph.num_edges) < 0.5
     edges = np.where(flip[:, None], graph.edges[:, ::-1], graph.edges)
     v = np.where(flip[:, None], -graph.directions, graph.directions)

@@ -216,8 +216,8 @@ def test_the_shortcuts_change_nothing(dimension, span, monkeypatch):
     in_steps = [parallel_rigid_pieces(200, edges, dimension) for edges in graphs]
     monkeypatch.setattr(rigidity.pieces, "_FIRST_GAME_CAMERAS", 200)
     monkeypatch.setattr(rigidity.game, "_GAME_WORK", 10**6)
-    monkeypatch.setattr(rigidity.pieces, "triangle_bodies", lambda _, edges: np.arange(len(edges)))
-    monkeypatch.setattr(rigidity.pieces, "grown", lambda *given: given[-1])
+    monkeypatch.setattr(rigidity.pieces, "triangle_sets", lambda _, edges: np.arange(len(edges)))
+    monkeypatch.setattr(rigidity.pieces, "grow_sets", lambda *given: given[-1])
     pebbles_only = [parallel_rigid_pieces(200, edges, dimension) for edges in graphs]
     for label, stepped, plain in zip(expected, in_steps, pebbles_only, strict=True):
         np.testing.assert_array_equal(stepped, label)
@@ -240,7 +240,7 @@ def test_edges_are_joined_by_triangles_exactly_where_a_chain_of_them_leads(seed)
         sides = [number.get(frozenset(pair), -1) for pair in complete(triangle)]
         if min(sides) >= 0:
             chain[np.isin(chain, chain[sides])] = chain[sides].min()
-    np.testing.assert_array_equal(chain, rigidity.growth.triangle_bodies(n, edges))
+    np.testing.assert_array_equal(chain, rigidity.growth.triangle_sets(n, edges))
     assert 1 < len(np.unique(chain)) < m
 
 
@@ -322,14 +322,14 @@ def test_pieces_are_ordered_by_cameras_then_edges_then_first_cameras():
     square = [(10, 11), (11, 12), (12, 13), (10, 13)]
     edges = [(8, 9), (7, 9), (6, 7), *complete([0, 1, 2]), (6, 8), *square, *complete([3, 4, 5, 14])]
     pieces = rigid_pieces(graph_of(15, edges))
-    assert [piece.cameras.tolist() for piece in pieces] == [
+    assert [piece.nodes.tolist() for piece in pieces] == [
         [3, 4, 5, 14],  # four cameras, six pairs
         [6, 7, 8, 9],  # four cameras, four pairs, smaller first camera
         [10, 11, 12, 13],
         [0, 1, 2],
     ]
     star = rigid_pieces(graph_of(4, [(0, 3), (0, 1), (0, 2)]))
-    assert [piece.cameras.tolist() for piece in star] == [[0, 1], [0, 2], [0, 3]]
+    assert [piece.nodes.tolist() for piece in star] == [[0, 1], [0, 2], [0, 3]]
 
 
 def test_a_pair_given_twice_counts_once():
@@ -453,10 +453,10 @@ def test_a_random_graph_of_few_triangles_is_decided_by_the_game_in_steps():
 def test_growth_ends_with_the_seed_at_which_its_work_is_used_up(monkeypatch):
     part = np.array([[0, 1], [1, 2], [0, 2], [0, 3], [1, 3]])  # a triangle, and a camera joined to it twice
     edges, body = np.concatenate([part, part + 4]), np.array([0, 0, 0, 1, 2, 3, 3, 3, 4, 5])
-    np.testing.assert_array_equal(rigidity.growth.grown(8, edges, body), [0] * 5 + [1] * 5)
+    np.testing.assert_array_equal(rigidity.growth.grow_sets(8, edges, body), [0] * 5 + [1] * 5)
     monkeypatch.setattr(rigidity.growth, "_GROWTH_WORK", 0)
     monkeypatch.setattr(rigidity.growth, "_GROWTH_ROUNDS", 1)
-    np.testing.assert_array_equal(rigidity.growth.grown(8, edges, body), [0] * 5 + [1, 1, 1, 2, 3])
+    np.testing.assert_array_equal(rigidity.growth.grow_sets(8, edges, body), [0] * 5 + [1, 1, 1, 2, 3])
 
 
 def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
@@ -468,7 +468,7 @@ def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
         ends=ends,
         copies=np.ones(6, np.int64),
         owner=np.arange(6),
-        num_bodies=6,
+        num_sets=6,
         is_whole=False,
     )
     united, is_final = rigidity.game.play(game, 2)

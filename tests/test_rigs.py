@@ -69,7 +69,7 @@ def test_offsets_of_frames_are_read_in_world_axes(rigs, workspace):
     expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
     np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
     assert not model.frame_offsets[first].any()
-    np.testing.assert_array_equal(model.bodies.body_of, rigs.frame_of_image)
+    np.testing.assert_array_equal(model.groups.group_of, rigs.frame_of_image)
     assert model.has_rigs
 
 
@@ -135,8 +135,8 @@ def test_images_stand_where_their_frames_and_sensors_put_them(found):
 def test_tables_say_what_moved_together(found, tmp_path):
     write_result(found, tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
-    inner = facts["bodies"].pop("num_inner_pairs")
-    assert facts["bodies"] == {"num_bodies": 12, "num_placed": 12, "num_fixed": 0}
+    inner = facts["rigid_groups"].pop("num_inner_pairs")
+    assert facts["rigid_groups"] == {"num_groups": 12, "num_placed": 12, "num_fixed": 0}
     assert sum("inside a frame" in row.reason for row in found.pairs) == inner
     assert facts["num_placed"] == 36
     again = pycolmap.Reconstruction(tmp_path / "out")
@@ -253,7 +253,7 @@ def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(
         np.testing.assert_array_equal(after[name], given[name])
     errors = np.linalg.norm(centres(found.reconstruction)[1] - centers, axis=1) * 0.37
     assert errors.max() < 0.02  # metres; half a pixel at 4 m is 2 mm
-    assert summary(found)["bodies"]["num_fixed"] == 5
+    assert summary(found)["rigid_groups"]["num_fixed"] == 5
     assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
     assert found.solve.gap <= 1e-8
 
@@ -283,7 +283,7 @@ def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
     given = poses(solved)
     found = sfm_shapefit.locate(solved, RING / "database.db", LocateOptions(fix="solved"))
     after = poses(found.reconstruction)
-    assert summary(found)["bodies"]["num_fixed"] == len(all_names) - 1
+    assert summary(found)["rigid_groups"]["num_fixed"] == len(all_names) - 1
     for name in all_names[:-1]:
         np.testing.assert_array_equal(after[name], given[name])
     assert np.abs(after[new] - given[new]).max() > 1.0

@@ -105,7 +105,7 @@ def test_a_bare_graph_written_as_1dsfm_has_the_same_directions(tmp_path):
 
 def test_reversed_directions_give_the_same_scene(tmp_path):
     graph = read_graph(BUNDLED / "graph40.txt")
-    turned = ViewGraph(graph.num_cameras, graph.edges, -graph.directions, graph.weights, graph.names)
+    turned = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     (tmp_path / "prob.txt").write_text(graph_text(turned))
     solve(BUNDLED / "graph40.txt", tmp_path / "a")
     solve(tmp_path / "prob.txt", tmp_path / "b", "--reverse")

@@ -154,15 +154,15 @@ def test_stationarity_holds_edge_by_edge():
 def test_turning_the_world_turns_the_answer():
     graph, _ = problem(4, sigma=0.05)
     rotation = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
-    turned = solve(ViewGraph(graph.num_cameras, graph.edges, graph.directions @ rotation.T))
+    turned = solve(ViewGraph(graph.num_nodes, graph.edges, graph.directions @ rotation.T))
     # The optimum is unique; a gap of 1e-8 leaves about the square root of it.
     np.testing.assert_allclose(shape(turned.locations), shape(solve(graph).locations) @ rotation.T, atol=1e-5)
 
 
 def test_relabelling_cameras_relabels_the_answer():
     graph, _ = problem(5, sigma=0.05)
-    order = np.random.default_rng(5).permutation(graph.num_cameras)
-    relabelled = solve(ViewGraph(graph.num_cameras, order[graph.edges], graph.directions))
+    order = np.random.default_rng(5).permutation(graph.num_nodes)
+    relabelled = solve(ViewGraph(graph.num_nodes, order[graph.edges], graph.directions))
     np.testing.assert_allclose(shape(relabelled.locations)[order], shape(solve(graph).locations), atol=1e-5)
 
 
@@ -171,7 +171,7 @@ def test_reversing_an_edge_and_its_direction_changes_nothing():
     flip = np.random.default_rng(6).random(graph.num_edges) < 0.5
     edges = np.where(flip[:, None], graph.edges[:, ::-1], graph.edges)
     directions = np.where(flip[:, None], -graph.directions, graph.directions)
-    reversed_result = solve(ViewGraph(graph.num_cameras, edges, directions))
+    reversed_result = solve(ViewGraph(graph.num_nodes, edges, directions))
     assert reversed_result.objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
     np.testing.assert_allclose(shape(reversed_result.locations), shape(solve(graph).locations), atol=1e-5)
 
@@ -179,11 +179,11 @@ def test_reversing_an_edge_and_its_direction_changes_nothing():
 def test_weight_two_is_a_pair_given_twice():
     graph, _ = problem(7, sigma=0.05)
     weights = np.where(np.arange(graph.num_edges) % 3 == 0, 2.0, 1.0)
-    weighted = solve(ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights))
+    weighted = solve(ViewGraph(graph.num_nodes, graph.edges, graph.directions, weights))
     again = np.flatnonzero(weights == 2.0)
     doubled = solve(
         ViewGraph(
-            graph.num_cameras,
+            graph.num_nodes,
             np.concatenate([graph.edges, graph.edges[again]]),
             np.concatenate([graph.directions, graph.directions[again]]),
         )
@@ -194,7 +194,7 @@ def test_weight_two_is_a_pair_given_twice():
 
 def test_scaling_all_weights_changes_nothing():
     graph, _ = problem(8, sigma=0.05)
-    scaled = ViewGraph(graph.num_cameras, graph.edges, graph.directions, np.full(graph.num_edges, 1e4))
+    scaled = ViewGraph(graph.num_nodes, graph.edges, graph.directions, np.full(graph.num_edges, 1e4))
     assert solve(scaled).objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
 
 

@@ -6,7 +6,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.judgement.conditioning import condition
-from sfm_shapefit.judgement.trust import Evidence, judge_cameras, main_body
+from sfm_shapefit.judgement.trust import Evidence, find_consensus, judge_cameras
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.program import differences
@@ -142,8 +142,8 @@ def test_evidence_follows_its_cameras_and_pairs():
 
 def test_bodies_join_while_more_speaks_for_it_than_against():
     pairs = np.array([(0, 1), (1, 2), (3, 4), (2, 3), (0, 4)])
-    assert main_body(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, -2.0])).all()
-    assert main_body(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, -4.0])).tolist() == [True] * 3 + [False] * 2
+    assert find_consensus(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, -2.0])).all()
+    assert find_consensus(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, -4.0])).tolist() == [True] * 3 + [False] * 2
 
 
 def test_turned_cameras_of_a_scene_are_left_out_named_and_can_be_kept():

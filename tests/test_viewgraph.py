@@ -47,7 +47,7 @@ def test_a_graph_is_a_value_that_neither_its_user_nor_its_inputs_can_change():
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 0
     with pytest.raises(dataclasses.FrozenInstanceError):
-        graph.num_cameras = 5
+        graph.num_nodes = 5
 
 
 @pytest.mark.parametrize(
@@ -149,7 +149,7 @@ def test_merging_agrees_with_a_plain_loop(seed, n, m, d):
 @given(seed=seeds)
 def test_a_graph_made_from_a_graph_is_equal_to_the_last_bit(seed):
     graph = random_graph(seed)
-    again = ViewGraph(graph.num_cameras, graph.edges, graph.directions, graph.weights, graph.names)
+    again = ViewGraph(graph.num_nodes, graph.edges, graph.directions, graph.weights, graph.names)
     np.testing.assert_array_equal(again.edges, graph.edges)
     np.testing.assert_array_equal(again.directions, graph.directions)
     np.testing.assert_array_equal(again.weights, graph.weights)
@@ -166,8 +166,8 @@ def test_components_are_numbered_by_their_first_camera_and_lone_cameras_are_comp
 
 
 def brute_force_components(graph: ViewGraph) -> list[int]:
-    label = list(range(graph.num_cameras))
-    for _ in range(graph.num_cameras):
+    label = list(range(graph.num_nodes))
+    for _ in range(graph.num_nodes):
         for i, j in graph.edges.tolist():
             label[i] = label[j] = min(label[i], label[j])
     numbers = {first: number for number, first in enumerate(sorted(set(label)))}
@@ -211,5 +211,5 @@ def test_a_graph_without_edges_has_only_lone_cameras():
     np.testing.assert_array_equal(graph.components(), [0, 1, 2])
     np.testing.assert_array_equal(graph.degrees(), [0, 0, 0])
     part, cameras = graph.restricted_to(np.array([], dtype=int))
-    assert (part.num_cameras, part.num_edges, len(cameras)) == (0, 0, 0)
+    assert (part.num_nodes, part.num_edges, len(cameras)) == (0, 0, 0)
     assert len(part.components()) == 0

@@ -34,7 +34,7 @@ def solve_direct(graph: "ViewGraph", tol: float) -> DirectAnswer:
     from sfm_shapefit.geometry import tangent_bases
     from sfm_shapefit.solver.program import scale_functional
 
-    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
+    n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
     bases = tangent_bases(graph.directions)
     unknowns = (n - 1) * d + m
     c = scale_functional(graph)[1:].ravel()
@@ -67,7 +67,7 @@ def _cone_entries(graph: "ViewGraph", bases: "FloatArray") -> tuple["FloatArray"
     """Return values, rows and columns of -(s_e, B_e^T (t_i - t_j)) below row 0."""
     m, d, k = bases.shape
     first = 1 + d * np.arange(m)
-    parts = [(-np.ones(m), first, (graph.num_cameras - 1) * d + np.arange(m))]
+    parts = [(-np.ones(m), first, (graph.num_nodes - 1) * d + np.arange(m))]
     for end, sign in ((0, -1.0), (1, 1.0)):
         nodes = graph.edges[:, end] - 1
         kept = nodes >= 0

@@ -250,7 +250,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     aligned = fit_similarity(placement.locations[kept], truth[kept], rotate=False)
     distances = np.linalg.norm(aligned.apply(placement.locations[kept]) - truth[kept], axis=1)
     best = np.nan
-    if one.graph.num_cameras <= _ORACLE_NODES and problem.spec.family != "madrid":
+    if one.graph.num_nodes <= _ORACLE_NODES and problem.spec.family != "madrid":
         best = relative_error(oracle(one)[rows], truth)
     placed = relative_error(placement.locations, truth)
     return Trial(

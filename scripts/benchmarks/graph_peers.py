@@ -137,7 +137,7 @@ def _prepare_placed(graph: "ViewGraph") -> Solver:
     def run_it() -> tuple["FloatArray", str]:
         found = place(graph, options)
         positions = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-        return _gathered(positions, graph.num_cameras), f"from {found.finish.start}, verdicts included"
+        return _gathered(positions, graph.num_nodes), f"from {found.finish.start}, verdicts included"
 
     return run_it
 
@@ -154,12 +154,12 @@ def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["Vie
             info.position_2 = -v if i < j else v  # where the second camera is, seen from the first
             info.num_verified_matches = 100
             pairs[min(i, j), max(i, j)] = info
-        orientations = {camera: np.zeros(3) for camera in range(graph.num_cameras)}
+        orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
 
         def run_it() -> tuple["FloatArray", str]:
             with _silence():
                 found = estimate(pytheia.sfm, pairs, orientations)
-            return _gathered({k: np.ravel(p) for k, p in found.items()}, graph.num_cameras), ""
+            return _gathered({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
 
         return run_it
 
@@ -194,8 +194,8 @@ def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph
         def run_it() -> tuple["FloatArray", str]:
             with _silence():
                 values = recovery.run(measurements, 1.0)
-            points = {k: values.atPoint3(k) for k in range(graph.num_cameras) if values.exists(k)}
-            return _gathered(points, graph.num_cameras), ""
+            points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
+            return _gathered(points, graph.num_nodes), ""
 
         return run_it
 

@@ -116,7 +116,7 @@ def measure(source: Path) -> tuple[str, list[Outcome]]:
     found = solve_graph_file(source, PlacementOptions())  # also loads compiled code
     graph = found.placement.graph
     stages = ", ".join(f"{name} {number(seconds)} s" for name, seconds in found.timings_s.items())
-    statement = f"{graph.num_cameras} cameras, {graph.num_edges} pairs; {found.statement}. Stages: {stages}."
+    statement = f"{graph.num_nodes} cameras, {graph.num_edges} pairs; {found.statement}. Stages: {stages}."
     return statement, [_outcome(name, graph, PlacementOptions(**given)) for name, given in RUNS.items()]
 
 

@@ -146,14 +146,14 @@ def place_graph(spec: GraphSpec, in_pieces: bool) -> Placed:
     from sfm_shapefit.solver.solve import solve
 
     problem = draw(spec)
-    body = max(rigid_pieces(view_graph(problem)), key=lambda piece: len(piece.cameras))
+    body = max(rigid_pieces(view_graph(problem)), key=lambda piece: len(piece.nodes))
     graph, nodes = view_graph(problem).restricted_to(body.edges)
     truth = problem.locations[nodes]
     options = PlacementOptions(tol=1e-4, factor_memory=500 if in_pieces else 100_000, threads=WORKERS)
     start, used = time.perf_counter(), _cpu_s()
     executor, joined = FreshProcesses(), None
     if in_pieces:
-        part_of = partition(adjacency(graph.num_cameras, graph.edges), max(4, graph.num_cameras // PIECE))
+        part_of = partition(adjacency(graph.num_nodes, graph.edges), max(4, graph.num_nodes // PIECE))
         joined = place_partitioned(graph, part_of, options, executor=executor)
     solved = solve(graph, options) if joined is None else joined.solve
     found = finish(graph, solved, options) if joined is None else joined.finish

@@ -259,7 +259,7 @@ def solve_cvxpy(graph: "ViewGraph", tol: float) -> tuple["FloatArray", int]:
     import cvxpy as cp
 
     v, m = graph.directions, graph.num_edges
-    t = cp.Variable((graph.num_cameras, graph.dimension))
+    t = cp.Variable((graph.num_nodes, graph.dimension))
     baselines = t[graph.edges[:, 0]] - t[graph.edges[:, 1]]
     lengths = cp.sum(cp.multiply(v, baselines), axis=1)
     residuals = baselines - cp.multiply(v, cp.reshape(lengths, (m, 1), order="C"))
@@ -375,7 +375,7 @@ def measure_real(name: str, folder: Path, points: "Points") -> RealGraph:
             seconds.append(time.perf_counter() - start)
     return RealGraph(
         name=name,
-        num_cameras=graph.num_cameras - num_points,
+        num_cameras=graph.num_nodes - num_points,
         num_points=num_points,
         num_edges=graph.num_edges,
         method=found.method,

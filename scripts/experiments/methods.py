@@ -46,8 +46,8 @@ def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
     is small near 180 degrees too, and the first answer is kept: whichever fits the directions better.
     """
     clean, cameras = graph.restricted_to(np.flatnonzero(~problem.corrupted))
-    if len(cameras) < graph.num_cameras:
-        return np.full((graph.num_cameras, graph.dimension), np.nan)
+    if len(cameras) < graph.num_nodes:
+        return np.full((graph.num_nodes, graph.dimension), np.nan)
     answers = [locate_least_squares(clean, reweightings=count) for count in (0, 10)]
     return min(answers, key=lambda t: _misfit(clean, t))
 

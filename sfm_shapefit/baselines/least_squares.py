@@ -37,7 +37,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
     Returns:
         (n, d) locations, centred and of unit norm.
     """
-    pattern = laplacian_pattern(graph.num_cameras, graph.edges)
+    pattern = laplacian_pattern(graph.num_nodes, graph.edges)
     projections = np.eye(graph.dimension) - np.einsum("ea,eb->eab", graph.directions, graph.directions)
     weights = graph.weights
     for left in range(reweightings, -1, -1):

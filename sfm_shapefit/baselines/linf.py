@@ -29,7 +29,7 @@ def locate_linf(graph: ViewGraph) -> FloatArray:
     """
     import cvxpy as cp
 
-    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
+    n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
     if m > _MOST_PAIRS:
         raise UnsolvableError(
             f"l_inf goes through a generic cone solver, for at most {_MOST_PAIRS} pairs; this graph has {m}, "

@@ -44,7 +44,7 @@ def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> Fl
     scores = np.zeros(graph.num_edges)
     for axis in axes:
         ahead = graph.directions @ axis  # positive: camera i comes after camera j
-        place = _greedy_order(graph.num_cameras, graph.edges, ahead)
+        place = _greedy_order(graph.num_nodes, graph.edges, ahead)
         before = place[graph.edges[:, 0]] < place[graph.edges[:, 1]]
         scores += np.where(before == (ahead > 0.0), np.abs(ahead), 0.0)
     return scores / num_axes

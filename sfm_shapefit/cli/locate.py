@@ -110,7 +110,7 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str, *, verbose: b
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", shortened(left_out))] if left_out else []),
-        *_bodies_line(facts),
+        *_groups_line(facts),
         *pieces_line(facts),
         ("pairs", _pairs_line(facts)),
         ("objective", objective_line(found.solve)),
@@ -125,13 +125,13 @@ def _locate_table(found: "LocateResult", out: Path, pictures: str, *, verbose: b
     ]
 
 
-def _bodies_line(facts: dict[str, Any]) -> Rows:
-    bodies = facts["bodies"]
-    if bodies is None:
+def _groups_line(facts: dict[str, Any]) -> Rows:
+    groups = facts["rigid_groups"]
+    if groups is None:
         return []
-    fixed = f", {bodies['num_fixed']} cameras fixed" if bodies["num_fixed"] else ""
-    inner = f"; {bodies['num_inner_pairs']} pairs inside them give no constraint"
-    return [("rigid bodies", f"{bodies['num_placed']} of {bodies['num_bodies']} placed{fixed}{inner}")]
+    fixed = f", {groups['num_fixed']} cameras fixed" if groups["num_fixed"] else ""
+    inner = f"; {groups['num_inner_pairs']} pairs inside them give no constraint"
+    return [("rigid groups", f"{groups['num_placed']} of {groups['num_groups']} placed{fixed}{inner}")]
 
 
 def _pairs_line(facts: dict[str, Any]) -> str:

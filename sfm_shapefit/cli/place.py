@@ -125,7 +125,7 @@ def solve_command(
             print_json(graph_summary(found))
         elif not quiet:
             print_table(
-                f"{found.placement.graph.num_cameras} nodes of {source}",
+                f"{found.placement.graph.num_nodes} nodes of {source}",
                 _solve_table(found, target, pictures_line(report, scene)),
             )
 
@@ -139,7 +139,7 @@ def _solve_table(found: "GraphResult", out: Path, pictures: str) -> Rows:
     return [
         ("directions", found.statement),
         ("dimension", str(placement.graph.dimension)),
-        ("placed", f"{len(placement.cameras)} of {placement.graph.num_cameras} nodes"),
+        ("placed", f"{len(placement.cameras)} of {placement.graph.num_nodes} nodes"),
         *([("not placed", shortened(left_out))] if left_out else []),
         *pieces_line(facts),
         (

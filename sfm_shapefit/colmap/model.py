@@ -29,7 +29,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.models import is_model_file, read_scene
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 UInt64Array = npt.NDArray[np.uint64]
 
@@ -69,10 +69,10 @@ class PosedModel:
     """(n, 3) C - C_frame in world axes and the unit of the rigs, exactly 0 for a rig's reference sensor."""
 
     @property
-    def bodies(self) -> Bodies:
-        """The frames as rigid bodies of images."""
+    def groups(self) -> RigidGroups:
+        """The frames as rigid groups of images."""
         _, labels = np.unique(self.frame_ids, return_inverse=True)
-        return Bodies(body_of=labels.ravel(), offsets=self.frame_offsets)
+        return RigidGroups(group_of=labels.ravel(), offsets=self.frame_offsets)
 
     @property
     def has_rigs(self) -> bool:

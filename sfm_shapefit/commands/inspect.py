@@ -121,7 +121,7 @@ def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspe
     graph = read_graph(path)
     return Inspection(
         directions=f"as given in {path}",
-        num_images=graph.num_cameras,
+        num_images=graph.num_nodes,
         statuses={DirectionStatus.USABLE.value: graph.num_edges},
         points="no: a bare graph has no matches",
         diagnosis=diagnose(graph, options.for_placement()),

@@ -89,7 +89,7 @@ def solve_graph_file(
         with clock("read"):
             graph = read_graph(path)
         if reverse:
-            graph = ViewGraph(graph.num_cameras, graph.edges, -graph.directions, graph.weights, graph.names)
+            graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
         placement = place(graph, options, on_iteration=clock.iteration, executor=executor)
     with clock("further pieces"):

@@ -73,7 +73,7 @@ class JointGraph:
     @property
     def num_points(self) -> int:
         """Number of points that joined."""
-        return self.graph.num_cameras - self.num_cameras
+        return self.graph.num_nodes - self.num_cameras
 
 
 def build_tracks(
@@ -231,7 +231,7 @@ def join_points(
         pixel_angles: (n,) angle of one pixel of each camera in radians.
         noise_px: standard deviation of an observation, per axis.
     """
-    n = graph.num_cameras
+    n = graph.num_nodes
     points = n + np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
     own = (noise_px * pixel_angles[tracks.cameras]) ** 2
     names = None if graph.names is None else [*graph.names, *(f"point {k}" for k in range(tracks.num_tracks))]

@@ -62,7 +62,7 @@ def _weighted_means(side: IntArray, angles: FloatArray, weights: FloatArray, num
 
 def _triangles(graph: ViewGraph) -> IntArray:
     """Return the triangles of each pair, (k, 3) edge indices: the pair (i, j), the pair of i, that of j."""
-    around = adjacency(graph.num_cameras, graph.edges)
+    around = adjacency(graph.num_nodes, graph.edges)
     found = [np.empty((0, 3), dtype=np.int64)]
     for e, (i, j) in enumerate(graph.edges.tolist()):
         rows = [slice(around.pointers[c], around.pointers[c + 1]) for c in (i, j)]

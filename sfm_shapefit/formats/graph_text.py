@@ -60,7 +60,7 @@ def read_graph(path: Path | str) -> ViewGraph:
 
 def graph_text(graph: ViewGraph) -> str:
     """Return a view graph in the text format that `read_graph` takes; numbers round-trip."""
-    ids = graph.names or tuple(str(k) for k in range(graph.num_cameras))
+    ids = graph.names or tuple(str(k) for k in range(graph.num_nodes))
     weighted = bool(np.any(graph.weights != 1.0))
     lines = []
     for (i, j), v, weight in zip(

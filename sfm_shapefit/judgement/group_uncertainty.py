@@ -1,9 +1,9 @@
-"""How uncertain the locations of rigid bodies are, and how much each direction decides for itself.
+"""How uncertain the locations of rigid groups are, and how much each direction decides for itself.
 
-As in `uncertainty`, with the centres f of the bodies as unknowns and their scale s held: it is the unit in
-which positions are given. The information about f is the Laplacian of the graph of bodies, its null space the
+As in `uncertainty`, with the centres f of the groups as unknowns and their scale s held: it is the unit in
+which positions are given. The information about f is the Laplacian of the graph of groups, its null space the
 translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T f held fixed: the mean of the
-cameras, or one body that stays where it is. All nodes of a body share its covariance.
+cameras, or one group that stays where it is. All nodes of a group share its covariance.
 """
 
 import numpy as np
@@ -14,29 +14,29 @@ from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 _RIDGE = 1e-12  # of each block's trace
 _SHORTEST = 1e-12  # of the longest baseline
 _MAX_BYTES = 2_000_000_000
 
 
-def propagate_bodies(
+def propagate_groups(
     locations: FloatArray,
     edges: IntArray,
     information: FloatArray,
-    bodies: Bodies,
+    groups: RigidGroups,
     share: FloatArray,
     errors: FloatArray | None = None,
 ) -> Uncertainty | None:
-    """Return the uncertainty of bodies from the information of the directions between them.
+    """Return the uncertainty of groups from the information of the directions between them.
 
     Args:
         locations: (n, d) at the solution.
-        edges: (m, 2) pairs that tie the bodies, each between two of them.
+        edges: (m, 2) pairs that tie the groups, each between two of them.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
-        bodies: of the nodes.
-        share: (B,) F, not negative, with sum 1: the bodies whose weighted mean is held fixed.
+        groups: of the nodes.
+        share: (B,) F, not negative, with sum 1: the groups whose weighted mean is held fixed.
         errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
             information if None.
 
@@ -44,7 +44,7 @@ def propagate_bodies(
         None if the factor would take more than 2 GB.
 
     Raises:
-        UnsolvableError: if the bodies hang loose.
+        UnsolvableError: if the groups hang loose.
     """
     d = locations.shape[1]
     baselines = differences(locations, edges)
@@ -54,8 +54,8 @@ def propagate_bodies(
     projectors = np.eye(d) - units[:, :, None] * units[:, None, :]
     across = projectors @ information @ projectors
     blocks = across / lengths[:, None, None] ** 2
-    ends = np.ascontiguousarray(bodies.body_of[edges])
-    plan = analyse(bodies.num_bodies, ends)
+    ends = np.ascontiguousarray(groups.group_of[edges])
+    plan = analyse(groups.num_groups, ends)
     if plan.num_bytes(d) > _MAX_BYTES:
         return None
     traces = np.trace(blocks, axis1=1, axis2=2)
@@ -69,9 +69,9 @@ def propagate_bodies(
         forces = (across @ errors.transpose(0, 2, 1)) / lengths[:, None, None]
         covariances = scatter(_moved(factor, ends, forces, share))
     return Uncertainty(
-        covariances=covariances[bodies.body_of],
+        covariances=covariances[groups.group_of],
         leverages=np.clip(leverages, 0.0, 1.0),
-        gauge=share[bodies.body_of] > 0.0,
+        gauge=share[groups.group_of] > 0.0,
     )
 
 

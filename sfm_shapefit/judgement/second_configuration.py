@@ -66,9 +66,9 @@ def find_rival(graph: ViewGraph, judged: IntArray, inliers: BoolArray, level_deg
     agreeing = len(judged) - len(rejected)
     if not _LEAST_OF_AGREEING * agreeing <= len(rejected) <= _MAX_PAIRS or len(rejected) < _FEWEST_SPARE:
         return None
-    pieces = parallel_rigid_pieces(graph.num_cameras, graph.edges[rejected], graph.dimension)
+    pieces = parallel_rigid_pieces(graph.num_nodes, graph.edges[rejected], graph.dimension)
     rigid, nodes = graph.restricted_to(rejected[pieces == np.argmax(np.bincount(pieces))])
-    fitted = (graph.dimension * (rigid.num_cameras - 1) - 1) / (graph.dimension - 1)
+    fitted = (graph.dimension * (rigid.num_nodes - 1) - 1) / (graph.dimension - 1)
     if rigid.num_edges - fitted < _FEWEST_SPARE:
         return None
     found = solve_lud(rigid, _STEPS, certified=False).locations

@@ -2,13 +2,13 @@
 
     trust = min(1, agreement / usual) * hold
 
-agreement    the share of the camera's matches with the main body of cameras that agree with the
-             solution, with a prior of a few matches, of which half the square of the median share are for
-             the camera. A pair agrees if its direction
-             lies within 3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts
-             if the direction lies farther off, or if it has none because most of its matches contradict
-             the given rotations. A pair counts with its number of matches, up to a limit; if it agrees,
-             less its leverage: a direction that decides itself where the camera goes is no evidence.
+agreement    the share of the camera's matches with the consensus, the largest set of cameras that agree
+             with one another, that agree with the solution, with a prior of a few matches, of which half
+             the square of the median share are for the camera. A pair agrees if its direction lies within
+             3 degrees, or 5 of its standard deviations, of the solved baseline. It contradicts if the
+             direction lies farther off, or if it has none because most of its matches contradict the given
+             rotations. A pair counts with its number of matches, up to a limit; if it agrees, less its
+             leverage: a direction that decides itself where the camera goes is no evidence.
 usual        3/4 of the median agreement of all cameras: where a part of the pairs is wrong everywhere,
              having its part of them says nothing against a camera.
 hold         tau^2 / (tau^2 + sigma^2), sigma the camera's standard deviation, tau 10 % of the median
@@ -22,11 +22,11 @@ as for it has 1/2 to 2/3, and below 1/2 more speaks against it than for it, or i
 
 Which cameras are well tied matters: several cameras whose rotations are wrong in the same way, as the
 symmetry of an object makes them, agree with one another in thousands of matches. Those tell nothing of how
-they stand to the rest. Counted are only the pairs with the main body of cameras. Bodies are found by
-correlation clustering: two bodies join while the agreeing matches between them outweigh the contradicting
-ones, the strongest first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of
-image and mesh graphs by lifted multicuts", section 4). So each group is judged by all its pairs with the rest
-together. Bodies are about who agrees with whom, not about evidence: leverages do not count there.
+they stand to the rest. Only the pairs with the consensus count. It is found by correlation clustering: two
+sets of cameras join while the agreeing matches between them outweigh the contradicting ones, the strongest
+first (greedy additive edge contraction: Keuper et al. 2015, "Efficient decomposition of image and mesh graphs
+by lifted multicuts", section 4). So each set is judged by all its pairs with the rest together. Sets are
+about who agrees with whom, not about evidence: leverages do not count there.
 
 Where repeated structure produces false pairs everywhere, contradictions say little of a single camera: all
 together they count at most half as much as all agreements.
@@ -44,7 +44,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _AGREEING_ANGLE_RAD = np.radians(3.0)
 _AGREEING_SIGMAS = 5.0
-_MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the main body
+_MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the consensus
 _LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
 _PRIOR = 30.0  # matches, half of them for the camera in a clean scene
 _LEAST_MEDIAN = 0.5
@@ -97,8 +97,8 @@ class CameraTrust:
     """(k,) in [0, 1]."""
     agreement: FloatArray
     """(k,) the first factor."""
-    body: BoolArray
-    """(k,) the main body of cameras, whose pairs count."""
+    consensus: BoolArray
+    """(k,) the consensus of cameras, whose pairs count."""
     reasons: tuple[str, ...]
     """k sentences, empty where the trust is not low."""
 
@@ -127,21 +127,21 @@ def judge_cameras(
         leverages: (m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside
             the largest rigid piece of those, and everywhere if unknown.
         evidence: support and contradicting pairs; unknown if None.
-        rigid: (n,) label of the rigid body of each node, such as its frame, which is judged by the pairs of
+        rigid: (n,) label of the rigid group of each node, such as its frame, which is judged by the pairs of
             all its cameras together; every node is its own if None.
     """
     num_cameras = len(conditioning.num_pairs)
     votes = _votes(graph, angles, sigmas_of_pairs, evidence)
-    labels = np.arange(graph.num_cameras) if rigid is None else rigid
-    heard, votes = _checked(votes, leverages), votes.of_bodies(labels)
-    body: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
+    labels = np.arange(graph.num_nodes) if rigid is None else rigid
+    heard, votes = _checked(votes, leverages), votes.of_groups(labels)
+    consensus: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
-        body = main_body(len(body), votes.pairs, signed)
-    agreement = _shares(heard.of_bodies(labels), body, int(labels[:num_cameras].max()) + 1)[
+        consensus = find_consensus(len(consensus), votes.pairs, signed)
+    agreement = _shares(heard.of_groups(labels), consensus, int(labels[:num_cameras].max()) + 1)[
         labels[:num_cameras]
     ]
-    body = body[labels]
+    consensus = consensus[labels]
     usual = _USUAL_SHARE * float(np.median(agreement))
     hold = _hold(locations[:num_cameras], sigmas[:num_cameras].max(axis=1))
     # Where most cameras have no agreement at all, any agreement is more than usual.
@@ -151,7 +151,9 @@ def judge_cameras(
     reasons = [""] * num_cameras
     for k in np.flatnonzero(trust < _LOW).tolist():
         reasons[k] = _reason(float(agreement[k]), usual, conditioning.causes[k], bool(few[k]))
-    return CameraTrust(trust=trust, agreement=agreement, body=body[:num_cameras], reasons=tuple(reasons))
+    return CameraTrust(
+        trust=trust, agreement=agreement, consensus=consensus[:num_cameras], reasons=tuple(reasons)
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -162,8 +164,8 @@ class _Votes:
     agrees: BoolArray
     weights: FloatArray
 
-    def of_bodies(self, labels: IntArray) -> "_Votes":
-        """Return the votes between the bodies of these labels (n,) in place of their nodes."""
+    def of_groups(self, labels: IntArray) -> "_Votes":
+        """Return the votes between the groups of these labels (n,) in place of their nodes."""
         pairs = labels[self.pairs]
         outer = pairs[:, 0] != pairs[:, 1]
         return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])
@@ -196,14 +198,14 @@ def _checked(votes: _Votes, leverages: FloatArray) -> _Votes:
     return _Votes(votes.pairs, votes.agrees, np.where(votes.agrees, checked, 1.0) * votes.weights)
 
 
-def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
-    """Return the share of each camera's matches with the body that agree, prior included."""
-    n = len(body)
+def _shares(votes: _Votes, consensus: BoolArray, num_cameras: int) -> FloatArray:
+    """Return the share of each camera's matches with the consensus that agree, prior included."""
+    n = len(consensus)
     i, j = votes.pairs.T
     counts = np.zeros((2, n))
     for own, other in ((i, j), (j, i)):
         for row, chosen in enumerate((votes.agrees, ~votes.agrees)):
-            used = chosen & body[other]
+            used = chosen & consensus[other]
             counts[row] += np.bincount(own[used], weights=votes.weights[used], minlength=n)
     good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
     spoken = heard > 0.0
@@ -212,8 +214,8 @@ def _shares(votes: _Votes, body: BoolArray, num_cameras: int) -> FloatArray:
     return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
 
 
-def main_body(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:
-    """Return the largest body of nodes that greedy additive edge contraction finds, (n,).
+def find_consensus(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:
+    """Return the largest set of nodes that greedy additive edge contraction finds, (n,).
 
     Args:
         num_nodes: n.
@@ -234,7 +236,7 @@ def main_body(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray
         members[kept] += members[gone]
         members[gone] = []
         _contract(ties, kept, gone, queue)
-    largest = max(members, key=lambda body: (len(body), -min(body, default=0)))
+    largest = max(members, key=lambda member: (len(member), -min(member, default=0)))
     chosen: BoolArray = np.zeros(num_nodes, dtype=np.bool_)
     chosen[largest] = True
     return chosen

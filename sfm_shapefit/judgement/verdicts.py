@@ -29,13 +29,13 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import LooseGroup, condition
-from sfm_shapefit.judgement.group_uncertainty import propagate_bodies
+from sfm_shapefit.judgement.group_uncertainty import propagate_groups
 from sfm_shapefit.judgement.trust import Evidence, judge_cameras
 from sfm_shapefit.judgement.uncertainty import propagate
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.solver.rigs import largest_tied
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.viewgraph import ViewGraph
 
 _OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
@@ -111,7 +111,7 @@ def assess(
     covariance: FloatArray | None = None,
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
-    bodies: Bodies | None = None,
+    groups: RigidGroups | None = None,
     held: int | None = None,
     unheld: IntArray | None = None,
     factor_memory: int = 2000,
@@ -126,20 +126,20 @@ def assess(
         evidence: support of the pairs, and pairs that have no direction because their matches contradict the
             given rotations; unknown if None.
         num_cameras: k, the first so many nodes are cameras and the others points; all if None.
-        bodies: the rigid bodies of the nodes, each pair between two of them; every node is its own if None.
-        held: the body that stays where it is; the mean of the cameras does if None.
+        groups: the rigid groups of the nodes, each pair between two of them; every node is its own if None.
+        held: the group that stays where it is; the mean of the cameras does if None.
         unheld: nodes that stand where they do for want of anything better, such as those that the finish put
             back: their standard deviations are infinite, and they hold no others; none if None.
-        factor_memory: MB that the factor for standard deviations may take; of bodies it is small.
+        factor_memory: MB that the factor for standard deviations may take; of groups it is small.
     """
     freedom = graph.dimension - 1
-    k = graph.num_cameras if num_cameras is None else num_cameras
+    k = graph.num_nodes if num_cameras is None else num_cameras
     own = np.zeros((graph.num_edges, freedom, freedom)) if covariance is None else np.nan_to_num(covariance)
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
-    num_bodies = graph.num_cameras if bodies is None else bodies.num_bodies
-    num_unknowns = graph.dimension * (num_bodies - 1) - (1 if bodies is None else 0)
+    num_groups = graph.num_nodes if groups is None else groups.num_groups
+    num_unknowns = graph.dimension * (num_groups - 1) - (1 if groups is None else 0)
     excess, inliers = _excess(residuals, own, behind, num_unknowns)
     information = np.linalg.inv(own + excess**2 * np.eye(freedom))
 
@@ -152,14 +152,14 @@ def assess(
     errors = None if evidence is None else evidence.errors
     sampled = None if errors is None else _Sampled(errors, excess, scale)
     separately = partial(_propagated, factor_memory * 1_000_000)
-    propagated = separately if bodies is None else partial(_propagated_over, bodies, held)
+    propagated = separately if groups is None else partial(_propagated_over, groups, held)
     holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
     covariances, leverages = propagated(graph, locations, holding, information, k, sampled)
     leverages[inliers & ~holding] = np.nan
     covariances = scale**2 * covariances
     sigmas = _standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k, unheld)
-    rigid = None if bodies is None else bodies.body_of
+    rigid = None if groups is None else groups.group_of
     judged = judge_cameras(
         graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
     )
@@ -302,7 +302,7 @@ def _propagated(
         covariances = _unheld(locations)
         leverages = np.where(inliers, np.nan, 0.0)
         used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
-        rows = used[parallel_rigid_pieces(graph.num_cameras, graph.edges[used], graph.dimension) == 0]
+        rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
         held, edges = np.unique(graph.edges[rows], return_inverse=True)
         cameras = int(np.sum(held < num_cameras))
         if cameras < _SMALLEST_RIGID:
@@ -337,7 +337,7 @@ def _extent(locations: FloatArray) -> float:
 
 
 def _propagated_over(
-    bodies: Bodies,
+    groups: RigidGroups,
     held: int | None,
     graph: ViewGraph,
     locations: FloatArray,
@@ -346,25 +346,25 @@ def _propagated_over(
     num_cameras: int,
     sampled: _Sampled | None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances (n, d, d) and the leverages (m,) of rigid bodies, their scale held.
+    """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale held.
 
-    Only the bodies that the inlier pairs tie at these locations have any: those around the one that is held,
+    Only the groups that the inlier pairs tie at these locations have any: those around the one that is held,
     or most cameras.
     """
     covariances = _unheld(locations)
     leverages = np.where(inliers, np.nan, 0.0)
-    cameras = np.bincount(bodies.body_of[:num_cameras], minlength=bodies.num_bodies)
-    tied = largest_tied(graph.edges[inliers], bodies, cameras, locations, around=held)
-    inside = np.isin(bodies.body_of, tied)
+    cameras = np.bincount(groups.group_of[:num_cameras], minlength=groups.num_groups)
+    tied = largest_tied(graph.edges[inliers], groups, cameras, locations, around=held)
+    inside = np.isin(groups.group_of, tied)
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
         return covariances, leverages
     nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
     share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
     samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
-    part = bodies.restricted_to(nodes)
+    part = groups.restricted_to(nodes)
     try:
-        found = propagate_bodies(
+        found = propagate_groups(
             locations[nodes], edges, information[rows], part, share / share.sum(), samples
         )
     except UnsolvableError:

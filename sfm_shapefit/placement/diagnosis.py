@@ -139,7 +139,7 @@ def diagnose(
         contradicting: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
     options = options or PlacementOptions()
-    n = graph.num_cameras if num_cameras is None else num_cameras
+    n = graph.num_nodes if num_cameras is None else num_cameras
     is_pair = (graph.edges < n).all(axis=1)
     pairs = ViewGraph(n, graph.edges[is_pair], graph.directions[is_pair], graph.weights[is_pair])
     pieces = ordered_pieces(graph, n)
@@ -157,7 +157,7 @@ def diagnose(
     return Diagnosis(
         dimension=graph.dimension,
         num_cameras=n,
-        num_points=graph.num_cameras - n,
+        num_points=graph.num_nodes - n,
         num_pairs=pairs.num_edges,
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
         pieces=_piece_diagnoses(graph, pieces, n),
@@ -197,7 +197,7 @@ def _piece_diagnoses(
     """Return the pieces of three cameras or more."""
     return tuple(
         PieceDiagnosis(
-            num_cameras=int(np.sum(piece.cameras < num_cameras)),
+            num_cameras=int(np.sum(piece.nodes < num_cameras)),
             hinges=tuple(_name(graph, k) for k in piece.hinges.tolist() if k < num_cameras),
         )
         for piece in pieces[: count_large(pieces, num_cameras)]
@@ -216,7 +216,7 @@ def _weak_cameras(
         contradicted: (m,) pairs that are wrong by their triangles; they hold nothing.
         against: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
-    n = graph.num_cameras
+    n = graph.num_nodes
     ends = graph.edges[piece.edges]
     wrong = contradicted[piece.edges]
     is_pair = (ends < num_cameras).all(axis=1)
@@ -226,9 +226,9 @@ def _weak_cameras(
     spread = direction_spread(n, ends[~wrong], graph.directions[piece.edges[~wrong]])
     num_against = np.bincount(against.ravel(), minlength=n)
     weak = []
-    for camera in piece.cameras[piece.cameras < num_cameras].tolist():
+    for camera in piece.nodes[piece.nodes < num_cameras].tolist():
         reasons = []
-        if num_ties[camera] <= FEW_PAIRS and len(piece.cameras) >= _SMALLEST_CHECKED:
+        if num_ties[camera] <= FEW_PAIRS and len(piece.nodes) >= _SMALLEST_CHECKED:
             reasons.append("two pairs or fewer hold it")
         if num_wrong[camera] > _CONTRADICTED_SHARE * num_pairs[camera]:
             reasons.append(
@@ -294,7 +294,7 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
 def _in_triangle(graph: ViewGraph) -> BoolArray:
     """Return which pairs (m,) have a common neighbour."""
     i, j = graph.edges.T
-    n = graph.num_cameras
+    n = graph.num_nodes
     half = coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
     adjacency = half + half.T
     found: BoolArray = np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0

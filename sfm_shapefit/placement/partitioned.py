@@ -107,8 +107,8 @@ def choose_pieces(graph: ViewGraph, options: PlacementOptions) -> IntArray | Non
         return None  # another answer is wanted
     if isinstance(plan_refinement(graph, options.factor_memory * 1_000_000), SymbolicFactor):
         return None
-    count = max(_LEAST_PIECES, -(-graph.num_cameras // _CAMERAS_PER_PIECE))
-    part_of = partition(adjacency(graph.num_cameras, graph.edges), count)
+    count = max(_LEAST_PIECES, -(-graph.num_nodes // _CAMERAS_PER_PIECE))
+    part_of = partition(adjacency(graph.num_nodes, graph.edges), count)
     cut = np.mean(part_of[graph.edges[:, 0]] != part_of[graph.edges[:, 1]])
     return None if cut > _LARGEST_CUT else part_of
 
@@ -206,7 +206,7 @@ def _overlap(graph: ViewGraph, inside: BoolArray) -> IntArray:
     """Return the neighbours of a part with most pairs into it, ties by number."""
     i, j = graph.edges.T
     outward = np.concatenate([j[inside[i] & ~inside[j]], i[inside[j] & ~inside[i]]])
-    links = np.bincount(outward, minlength=graph.num_cameras)
+    links = np.bincount(outward, minlength=graph.num_nodes)
     most = max(round(_OVERLAP * float(np.sum(inside))), _LEAST_SHARED)
     order = np.argsort(-links, kind="stable")[:most]
     return np.asarray(order[links[order] >= _LEAST_LINKS], dtype=np.int64)
@@ -216,8 +216,8 @@ def _overlap(graph: ViewGraph, inside: BoolArray) -> IntArray:
 def solve_piece(task: PieceTask) -> list[PieceSolution]:
     """Return the rigid bodies of a piece, most cameras first, solved, certified and refined each."""
     found = []
-    for body in sorted(rigid_pieces(task.graph), key=lambda body: -len(body.cameras)):
-        if len(body.cameras) < _LEAST_SHARED:
+    for body in sorted(rigid_pieces(task.graph), key=lambda body: -len(body.nodes)):
+        if len(body.nodes) < _LEAST_SHARED:
             break
         solution = _solve_body(task, body)
         if solution is not None:
@@ -257,7 +257,7 @@ def merge(graph: ViewGraph, pieces: tuple[PieceSolution, ...]) -> tuple[FloatArr
     offsets = [np.median(scales[q] * b - scales[p] * a, axis=0) for p, q, a, b in ties]
     shifts = _potentials(len(pieces), pairs, np.array(offsets).reshape(len(ties), graph.dimension))
 
-    total, count = np.zeros((graph.num_cameras, graph.dimension)), np.zeros(graph.num_cameras)
+    total, count = np.zeros((graph.num_nodes, graph.dimension)), np.zeros(graph.num_nodes)
     for p in sorted(joined):
         total[pieces[p].cameras] += scales[p] * pieces[p].locations + shifts[p]
         count[pieces[p].cameras] += 1.0

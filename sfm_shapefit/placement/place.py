@@ -22,7 +22,7 @@ from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import Finish, finish
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -61,15 +61,15 @@ class Placement:
     """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
     history: tuple[IterationInfo, ...] = ()
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
-    bodies: Bodies | None = None
-    """The rigid bodies of all nodes of the graph, if nodes do not move one by one."""
+    groups: RigidGroups | None = None
+    """The rigid groups of all nodes of the graph, if nodes do not move one by one."""
     unit: float | None = None
-    """Length of the unit of the offsets inside rigid bodies, in the solver's units; None without bodies."""
+    """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
 
     @property
     def nodes(self) -> IntArray:
         """The nodes of the graph that are placed, cameras first, ascending."""
-        return self.pieces[self.piece].cameras
+        return self.pieces[self.piece].nodes
 
     @property
     def cameras(self) -> IntArray:
@@ -133,12 +133,12 @@ def place(
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
     """
     options = options or PlacementOptions()
-    num_cameras = graph.num_cameras if num_cameras is None else num_cameras
+    num_cameras = graph.num_nodes if num_cameras is None else num_cameras
     dropped = _dropped_edges(graph, options.filter, num_cameras)
     considered = _without(graph, dropped)
     edge_of = np.setdiff1d(np.arange(graph.num_edges), dropped)
     pieces = [
-        RigidPiece(piece.cameras, edge_of[piece.edges], piece.hinges)
+        RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges)
         for piece in ordered_pieces(considered, num_cameras)
     ]
     refuse_without_triangle(considered, pieces, num_cameras)
@@ -191,23 +191,23 @@ def _without(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
         return graph
     kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
     return ViewGraph(
-        graph.num_cameras, graph.edges[kept], graph.directions[kept], graph.weights[kept], graph.names
+        graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept], graph.names
     )
 
 
 def ordered_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
     """Return the rigid pieces, most cameras first; nodes from `num_cameras` on are points."""
-    return sorted(rigid_pieces(graph), key=lambda piece: -int(np.sum(piece.cameras < num_cameras)))
+    return sorted(rigid_pieces(graph), key=lambda piece: -int(np.sum(piece.nodes < num_cameras)))
 
 
 def count_large(pieces: list[RigidPiece], num_cameras: int) -> int:
     """Return how many of the pieces, most cameras first, have three cameras or more."""
-    return sum(int(np.sum(piece.cameras < num_cameras)) >= SMALLEST_PIECE for piece in pieces)
+    return sum(int(np.sum(piece.nodes < num_cameras)) >= SMALLEST_PIECE for piece in pieces)
 
 
 def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_cameras: int) -> None:
     """Raise UnsolvableError if a graph of many cameras has no three that are rigid."""
-    if not pieces or np.sum(pieces[0].cameras < num_cameras) < min(SMALLEST_PIECE, num_cameras):
+    if not pieces or np.sum(pieces[0].nodes < num_cameras) < min(SMALLEST_PIECE, num_cameras):
         raise UnsolvableError(
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
             "match more pairs, above all pairs that close triangles"
@@ -231,11 +231,11 @@ def _place_piece(
     `parts` are the edges that the filter left out, and the pieces of the others.
     """
     dropped, pieces = parts
-    nodes, edges = pieces[k].cameras, pieces[k].edges
+    nodes, edges = pieces[k].nodes, pieces[k].edges
     piece, _ = graph.restricted_to(edges)
     known = None if covariance is None else covariance[edges]
     classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
-    heard = evidence and evidence.restricted_to(edges, nodes, graph.num_cameras)
+    heard = evidence and evidence.restricted_to(edges, nodes, graph.num_nodes)
     history: list[IterationInfo] = []
 
     def watch(info: IterationInfo) -> bool | None:

@@ -39,7 +39,7 @@ def pulled(
     levels = np.radians(np.array(placement.finish.levels_deg))
     moved = refine_anchored(piece, start, Metric(known, classes), levels, anchors)
     locations = (moved - gauge.similarity.translation) / gauge.similarity.scale
-    heard = evidence.restricted_to(edges, nodes, placement.graph.num_cameras)
+    heard = evidence.restricted_to(edges, nodes, placement.graph.num_nodes)
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
     return (
         replace(

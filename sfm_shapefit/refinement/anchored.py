@@ -66,7 +66,7 @@ class _Problem:
     """The joint cost and its normal equations; the last node is the origin."""
 
     def __init__(self, terms: AngularTerms, anchors: Anchors) -> None:
-        n = terms.graph.num_cameras
+        n = terms.graph.num_nodes
         links = np.stack([anchors.nodes, np.full(len(anchors.nodes), n)], axis=1)
         self.terms, self.anchors, self.num_nodes = terms, anchors, n + 1
         self.edges = np.concatenate([terms.graph.edges, links])

@@ -61,7 +61,7 @@ _MAX_BYTES = 2_000_000_000
 
 
 class NormalFactor(Protocol):
-    """What solves the normal equations of a step: a factor of the Laplacian, or of that over bodies."""
+    """What solves the normal equations of a step: a factor of the Laplacian, or of that over groups."""
 
     def refactor(self, weights: FloatArray, /) -> None:
         """Factor the matrix of edge blocks (m, d, d), or raise UnsolvableError."""
@@ -99,7 +99,7 @@ def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFa
     Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
     few steps. On long chains they need many, but there a factor is little work.
     """
-    neighbours = adjacency(graph.num_cameras, graph.edges)
+    neighbours = adjacency(graph.num_nodes, graph.edges)
     tree = best_order(neighbours)
     if tree.flops * graph.dimension**3 > _MAX_FLOPS:
         return IterativeNormal(graph)
@@ -120,8 +120,8 @@ def refine_angles(
         graph: a connected view graph.
         start: (n, d) locations; their scale does not matter.
         metric: covariance and class of each pair.
-        plan: what `plan_refinement` says; or memory for a factor, such as that over bodies, in which case
-            locations are and stay those of the bodies.
+        plan: what `plan_refinement` says; or memory for a factor, such as that over groups, in which case
+            locations are and stay those of the groups.
         rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
             as low as these, and where it clearly cannot.
 
@@ -218,7 +218,7 @@ def residual_levels(
     """
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
-    unknowns = graph.dimension * (graph.num_cameras - 1) - 1
+    unknowns = graph.dimension * (graph.num_nodes - 1) - 1
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
     median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # of a residual of unit variance per axis
     chords = _chords(graph, _unit(locations))
@@ -267,7 +267,7 @@ def _step(
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
     before = _cost(graph, information, t, steep)
     blocks, damped, gradient = _linearised(graph, information, t, steep)
-    right = -adjoint(gradient, graph.edges, graph.num_cameras)
+    right = -adjoint(gradient, graph.edges, graph.num_nodes)
     while damping <= _MOST_DAMPING:
         try:
             factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(graph.dimension))

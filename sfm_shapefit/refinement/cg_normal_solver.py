@@ -22,7 +22,7 @@ class IterativeNormal:
 
     def __init__(self, graph: ViewGraph) -> None:
         self._edges = graph.edges
-        self._neighbours = adjacency(graph.num_cameras, graph.edges)
+        self._neighbours = adjacency(graph.num_nodes, graph.edges)
         self._blocks: FloatArray = np.zeros((0, graph.dimension, graph.dimension))
         self._preconditioner: Preconditioner | None = None
 

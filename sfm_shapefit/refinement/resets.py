@@ -47,7 +47,7 @@ def strays(
         agreeing: (m,) pairs that fit the refined locations.
         noise_rad: (m,) standard deviation of each direction, per axis.
     """
-    found: BoolArray = np.zeros(graph.num_cameras, dtype=np.bool_)
+    found: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
     reach = _REACH
     while (far := left_scene(start, refined, reach)).any():
         found |= _unheld(graph, refined, far, agreeing, noise_rad)
@@ -72,7 +72,7 @@ def _unheld(
     """Return those of the far nodes, (n,), whose group the others do not hold where it is."""
     is_far = far[graph.edges]
     i, j = graph.edges[is_far.all(axis=1) & agreeing].T
-    adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_cameras, graph.num_cameras))
+    adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_nodes, graph.num_nodes))
     count, group = connected_components(adjacency, directed=False)
     ends = group[graph.edges]
     leaving = (ends[:, 0] != ends[:, 1])[:, None] & is_far

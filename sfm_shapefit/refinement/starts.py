@@ -28,8 +28,8 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import put_back, strays
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
-from sfm_shapefit.solver.rigs import ReducedFactor, lud_over_bodies
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs import ReducedFactor, lud_over_groups
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -124,7 +124,7 @@ def finish(
     options: PlacementOptions,
     covariance: FloatArray | None = None,
     classes: IntArray | None = None,
-    bodies: Bodies | None = None,
+    groups: RigidGroups | None = None,
 ) -> Finish:
     """Return the locations to keep for a solved view graph.
 
@@ -135,15 +135,15 @@ def finish(
         covariance: (m, d - 1, d - 1) of each direction in `tangent_bases(graph.directions)`, rad^2; NaN where
             unknown, None where all are.
         classes: (m,) 0 for pairs of cameras, 1 for directions to points; None: all 0.
-        bodies: the rigid bodies that the nodes belong to; then every pair joins two of them, and the
+        groups: the rigid groups that the nodes belong to; then every pair joins two of them, and the
             locations are theirs.
     """
     classes = np.zeros(graph.num_edges, dtype=np.int64) if classes is None else classes
     metric = Metric(covariance, classes)
     if solved.status is Status.NOT_SOLVED:
         return _as_located(graph, solved, metric)
-    lud, second = _second_start(graph, classes, options.threads, bodies)
-    plan = _plan(graph, bodies, options.factor_memory * 1_000_000) if options.refines else None
+    lud, second = _second_start(graph, classes, options.threads, groups)
+    plan = _plan(graph, groups, options.factor_memory * 1_000_000) if options.refines else None
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
     candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
@@ -176,24 +176,26 @@ def finish(
     )
 
 
-def _plan(graph: ViewGraph, bodies: Bodies | None, max_bytes: int) -> SymbolicFactor | NormalFactor | None:
+def _plan(
+    graph: ViewGraph, groups: RigidGroups | None, max_bytes: int
+) -> SymbolicFactor | NormalFactor | None:
     """Return what the refinement solves its steps with, or None if its factor would be too large."""
-    if bodies is None:
+    if groups is None:
         return plan_refinement(graph, max_bytes)
-    return ReducedFactor(graph.edges, bodies.normalised())
+    return ReducedFactor(graph.edges, groups.normalised())
 
 
 def _second_start(
-    graph: ViewGraph, classes: IntArray, threads: int, bodies: Bodies | None
+    graph: ViewGraph, classes: IntArray, threads: int, groups: RigidGroups | None
 ) -> tuple[LudResult | None, FloatArray | None]:
-    """Return LUD's solution, which bodies have none of, and its locations."""
-    if bodies is None:
+    """Return LUD's solution, which groups have none of, and its locations."""
+    if groups is None:
         lud = _lud_start(graph, classes, threads) if has_second_start(graph) else None
         return lud, None if lud is None else lud.locations
     metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
     found = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
-        locations = lud_over_bodies(_weighted(graph, classes, point_weight), bodies)
+        locations = lud_over_groups(_weighted(graph, classes, point_weight), groups)
         if locations is not None and projected_length(graph, locations) > 0.0:
             found.append((robust_cost(graph, locations, metric, opening), locations))
     return None, min(found, key=lambda pair: pair[0])[1] if found else None
@@ -202,7 +204,7 @@ def _second_start(
 def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
     """Return the graph with the weights that directions to points have in LUD."""
     weights = np.where(classes > 0, point_weight, 1.0) * graph.weights
-    return ViewGraph(graph.num_cameras, graph.edges, graph.directions, weights)
+    return ViewGraph(graph.num_nodes, graph.edges, graph.directions, weights)
 
 
 def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:
@@ -253,7 +255,7 @@ def _alone(graph: ViewGraph, start: Start, metric: Metric, locations: FloatArray
 
 def has_second_start(graph: ViewGraph) -> bool:
     """Return whether a graph is small enough for LUD beside ShapeFit, and large enough to need it."""
-    return graph.num_edges <= _LUD_PAIRS and graph.num_cameras > 2
+    return graph.num_edges <= _LUD_PAIRS and graph.num_nodes > 2
 
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
@@ -303,9 +305,9 @@ def _refined(
     if plan is None:
         return _unrefined(name, locations)
     refined = refine_angles(graph, locations, metric, plan, rival)
-    alone = np.ones(graph.num_cameras, dtype=np.bool_)
+    alone = np.ones(graph.num_nodes, dtype=np.bool_)
     if isinstance(plan, ReducedFactor):
-        alone = np.bincount(plan.bodies.body_of)[plan.bodies.body_of] == 1
+        alone = np.bincount(plan.groups.group_of)[plan.groups.group_of] == 1
     refined, nodes = _without_strays(graph, home, refined, metric, alone)
     if projected_length(graph, refined.locations) <= 0.0:
         return _unrefined(name, locations)
@@ -317,7 +319,7 @@ def _without_strays(
 ) -> tuple[AngularResult, IntArray]:
     """Return a refinement whose strays are put back, and these nodes; all of the home, if that fits better.
 
-    Only nodes that are a body of their own, `alone`, can be put back one by one.
+    Only nodes that are a group of their own, `alone`, can be put back one by one.
     """
     levels = refined.levels_rad
     agreeing = agreeing_pairs(graph, refined.locations, metric, levels)

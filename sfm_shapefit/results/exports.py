@@ -23,7 +23,7 @@ def agreeing_onedsfm(found: GraphResult) -> dict[str, str]:
         raise InputError(
             f"1DSfM's files are of three dimensions, the graph of {graph.dimension}; leave them out"
         )
-    n = graph.num_cameras
+    n = graph.num_nodes
     agreeing = placement.edges[placement.pairs[placement.assessment.inliers[placement.pairs]]]
     geometries, rotations = found.geometries, found.rotations
     if geometries is None or rotations is None:

@@ -61,7 +61,7 @@ def own_camera_rows(
     """Return the rows of the cameras of the piece that is solved; arguments as of `camera_rows`."""
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
-    degrees = np.bincount(inside.ravel(), minlength=graph.num_cameras)
+    degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
     sigmas = scale * (assessment.sigmas if axes is None else _turned_sigmas(assessment.covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
@@ -117,8 +117,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
             weight=float(graph.weights[edge]),
         )
         if edge not in judged:
-            inner = placement.bodies is not None and bool(
-                placement.bodies.body_of[i] == placement.bodies.body_of[j]
+            inner = placement.groups is not None and bool(
+                placement.groups.group_of[i] == placement.groups.group_of[j]
             )
             elsewhere = _FILTERED if edge in dropped else _OUTSIDE
             rows.append(replace(row, reason=_INNER if inner else elsewhere))
@@ -154,7 +154,7 @@ def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> 
         hinges = piece.hinges[piece.hinges < placement.num_cameras]
         rows.append(
             PieceRow(
-                num_cameras=int(np.sum(piece.cameras < placement.num_cameras)),
+                num_cameras=int(np.sum(piece.nodes < placement.num_cameras)),
                 scale=scale,
                 hinges=[name_of(placement.graph, hinge) for hinge in hinges.tolist()],
                 folder=folder_of(k) if k in facts else "",
@@ -203,9 +203,9 @@ def _with_folders(reasons: dict[int, str], further: Sequence[Placement]) -> dict
 
 def _home_pieces(placement: Placement) -> list[int | None]:
     """Return the first piece of three cameras or more that holds each camera, or the largest."""
-    homes: list[int | None] = [None] * placement.graph.num_cameras
+    homes: list[int | None] = [None] * placement.graph.num_nodes
     large = max(count_large(placement.pieces, placement.num_cameras), 1)
     for k in reversed(range(large)):
-        for camera in placement.pieces[k].cameras.tolist():
+        for camera in placement.pieces[k].nodes.tolist():
             homes[camera] = k
     return homes

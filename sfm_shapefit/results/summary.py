@@ -48,7 +48,7 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
-        "bodies": _bodies_summary(found),
+        "rigid_groups": _groups_summary(found),
         "pieces": [asdict(row) for row in _pieces_of(found)],
         "solve": solve_summary(found.solve),
         "finish": _finish_summary(placement.finish),
@@ -68,7 +68,7 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "inputs": {"graph": str(found.path), "directions": found.statement},
         "options": asdict(found.options),
         "dimension": placement.graph.dimension,
-        "num_images": placement.graph.num_cameras,
+        "num_images": placement.graph.num_nodes,
         "num_placed": len(placement.cameras),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
@@ -91,19 +91,19 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
     }
 
 
-def _bodies_summary(found: LocateResult) -> dict[str, int] | None:
+def _groups_summary(found: LocateResult) -> dict[str, int] | None:
     """Return what moved together: frames of rigs, and fixed cameras; None where each camera moves by
     itself."""
     placement = found.placement
-    if placement.bodies is None:
+    if placement.groups is None:
         return None
-    cameras = placement.bodies.body_of[: placement.num_cameras]
+    cameras = placement.groups.group_of[: placement.num_cameras]
     pairs = placement.graph.edges[: placement.num_pairs]
     return {
-        "num_bodies": len(np.unique(cameras)),
+        "num_groups": len(np.unique(cameras)),
         "num_placed": len(np.unique(cameras[placement.cameras[found.kept]])),
         "num_fixed": 0 if found.fixed is None else int(np.sum(found.fixed)),
-        "num_inner_pairs": int(np.sum(~placement.bodies.joins(pairs))),
+        "num_inner_pairs": int(np.sum(~placement.groups.joins(pairs))),
     }
 
 

@@ -38,7 +38,7 @@ class CameraRow:
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
-    """How far it is to be trusted, in [0, 1]: the share of its matches with the main body of cameras that
+    """How far it is to be trusted, in [0, 1]: the share of its matches with the consensus of cameras that
     agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
     `judgement.trust`."""
     sigma: tuple[float, ...] = ()

@@ -9,13 +9,13 @@ them, and n cameras are rigid if d n - (d + 1) independent copies join them. So 
 and blind to noise; whether a rigid graph is well conditioned is another question.
 
 Maximal rigid sets ("pieces") partition the *pairs*; two pieces share at most one camera, a hinge.
-They are found by combining rigid sets ("bodies", at first the single pairs):
+They are found by combining rigid sets ("sets", at first the single pairs):
 
 1. The three pairs of a triangle unite: 3 (d - 1) >= 3 d - (d + 1), for every d >= 2.
-2. Two bodies that share two cameras unite, and so do three bodies that meet two by two in three
-   different cameras (the triangle again). A body grows by both rules in time linear in what it touches.
+2. Two sets that share two cameras unite, and so do three sets that meet two by two in three
+   different cameras (the triangle again). A set grows by both rules in time linear in what it touches.
 3. What is left goes to the (d, d + 1) pebble game (Lee and Streinu 2008, "Pebble game algorithms
-   and sparse graphs"), where each body is replaced by a frame on the cameras it shares with others.
+   and sparse graphs"), where each set is replaced by a frame on the cameras it shares with others.
 
 Step 3 decides everything that is open, so steps 1 and 2 need not be exhaustive, only right. The game
 is played on the first few shared cameras, then on twice as many, and so on until all take part: a

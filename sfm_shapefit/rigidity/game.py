@@ -1,4 +1,4 @@
-"""Step 3: the pebble game on the frames of the bodies.
+"""Step 3: the pebble game on the frames of the sets.
 
 Every camera has d pebbles, each free or covering a copy of a link that leaves the camera. A copy is
 independent of those placed before if d + 2 pebbles can be brought to its two ends; pebbles travel by
@@ -17,27 +17,27 @@ _GAME_WORK = 20  # cameras marked before a game is contracted and restarted, as 
 
 
 class Game(NamedTuple):
-    """Bodies as frames: a multigraph on the cameras they share, or on the first few of these."""
+    """Sets as frames: a multigraph on the cameras they share, or on the first few of these."""
 
-    num_cameras: int
+    num_nodes: int
     ends: IntArray
     """(k, 2) renumbered cameras of each link of a frame."""
     copies: IntArray
     """(k,) how many copies of an edge the link stands for."""
     owner: IntArray
-    """(k,) the body that the link belongs to."""
-    num_bodies: int
+    """(k,) the set that the link belongs to."""
+    num_sets: int
     is_whole: bool
     """Whether all shared cameras take part."""
 
 
-def contract(num_cameras: int, edges: IntArray, body: IntArray, part: int, dimension: int) -> Game:
-    """Return the frames of all bodies on the first `part` cameras that are shared by bodies."""
-    num_bodies = int(body.max(initial=-1)) + 1
-    start, cameras, back_start, _ = incidence(num_cameras, edges, body, num_bodies)
+def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimension: int) -> Game:
+    """Return the frames of all sets on the first `part` cameras that are shared by sets."""
+    num_sets = int(set_of.max(initial=-1)) + 1
+    start, cameras, back_start, _ = incidence(num_nodes, edges, set_of, num_sets)
     is_shared = np.diff(back_start) >= 2
     number = np.where(is_shared, np.cumsum(is_shared) - 1, part)
-    owner = np.repeat(np.arange(num_bodies), np.diff(start))
+    owner = np.repeat(np.arange(num_sets), np.diff(start))
     kept = number[cameras] < part
     owner, member = owner[kept], number[cameras[kept]]
     order = np.lexsort((member, owner))
@@ -56,53 +56,53 @@ def contract(num_cameras: int, edges: IntArray, body: IntArray, part: int, dimen
     owner = np.concatenate([owner[from_first], owner[from_second]])
     by_last_camera = np.argsort(ends.max(axis=1, initial=0), kind="stable")
     return Game(
-        num_cameras=min(part, int(is_shared.sum())),
+        num_nodes=min(part, int(is_shared.sum())),
         ends=ends[by_last_camera].astype(np.int64),
         copies=copies[by_last_camera].astype(np.int64),
         owner=owner[by_last_camera].astype(np.int64),
-        num_bodies=num_bodies,
+        num_sets=num_sets,
         is_whole=bool(is_shared.sum() <= part),
     )
 
 
 def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
-    """Play a game and unite bodies by what it shows.
+    """Play a game and unite sets by what it shows.
 
     Returns:
-        The rigid set that each body lies in, (number of bodies,), compact; and whether these sets are
-        all that there are. If not, two bodies at least were united, and the game has to be played again.
+        The rigid set that each set lies in, (number of sets,), compact; and whether these sets are
+        all that there are. If not, two sets at least were united, and the game has to be played again.
     """
-    start, link_of = _links_at(game.num_cameras, game.ends)
+    start, link_of = _links_at(game.num_nodes, game.ends)
     board = _Board(
-        target=np.full((game.num_cameras, dimension), -1, dtype=np.int64),
-        free=np.full(game.num_cameras, dimension, dtype=np.int64),
+        target=np.full((game.num_nodes, dimension), -1, dtype=np.int64),
+        free=np.full(game.num_nodes, dimension, dtype=np.int64),
         start=start,
         link_of=link_of,
         ends=game.ends,
-        seen=np.zeros(game.num_cameras, dtype=np.int64),
-        came_from=np.zeros(game.num_cameras, dtype=np.int64),
-        came_by=np.zeros(game.num_cameras, dtype=np.int64),
-        queue=np.zeros(game.num_cameras, dtype=np.int64),
-        inside=np.zeros(game.num_cameras, dtype=np.int64),
-        escapes=np.zeros(game.num_cameras, dtype=np.int64),
-        members=np.zeros(game.num_cameras, dtype=np.int64),
+        seen=np.zeros(game.num_nodes, dtype=np.int64),
+        came_from=np.zeros(game.num_nodes, dtype=np.int64),
+        came_by=np.zeros(game.num_nodes, dtype=np.int64),
+        queue=np.zeros(game.num_nodes, dtype=np.int64),
+        inside=np.zeros(game.num_nodes, dtype=np.int64),
+        escapes=np.zeros(game.num_nodes, dtype=np.int64),
+        members=np.zeros(game.num_nodes, dtype=np.int64),
         clock=np.zeros(2, dtype=np.int64),
     )
-    mark = _place_links(board, game.copies, _GAME_WORK * game.num_cameras)
+    mark = _place_links(board, game.copies, _GAME_WORK * game.num_nodes)
     if board.free.sum() == dimension + 1:  # the whole is one rigid set
-        united = np.arange(game.num_bodies)
+        united = np.arange(game.num_sets)
         united[game.owner] = game.owner.min()
         return compact(united), True
     if (mark >= 0).any():
-        return compact(_bodies_by_marks(board, game.owner, game.num_bodies, mark)), False
-    return compact(_bodies_by_search(board, game.owner, game.num_bodies)), True
+        return compact(_sets_by_marks(board, game.owner, game.num_sets, mark)), False
+    return compact(_sets_by_search(board, game.owner, game.num_sets)), True
 
 
-def _links_at(num_cameras: int, ends: IntArray) -> tuple[IntArray, IntArray]:
+def _links_at(num_nodes: int, ends: IntArray) -> tuple[IntArray, IntArray]:
     """Return the links at each camera as a (start, links) list."""
     order = np.argsort(ends.ravel(), kind="stable")
-    start = np.zeros(num_cameras + 1, dtype=np.int64)
-    start[1:] = np.cumsum(np.bincount(ends.ravel(), minlength=num_cameras))
+    start = np.zeros(num_nodes + 1, dtype=np.int64)
+    start[1:] = np.cumsum(np.bincount(ends.ravel(), minlength=num_nodes))
     return start, (order // 2).astype(np.int64)
 
 
@@ -288,23 +288,23 @@ def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
 
 
 @kernel()
-def _bodies_by_marks(board: _Board, owner: IntArray, num_bodies: int, mark: IntArray) -> IntArray:
-    """Return a root body for each body: bodies with two cameras of the same mark have the same."""
-    parent = np.arange(num_bodies)
+def _sets_by_marks(board: _Board, owner: IntArray, num_sets: int, mark: IntArray) -> IntArray:
+    """Return a root set for each set: sets with two cameras of the same mark have the same."""
+    parent = np.arange(num_sets)
     for k in range(len(owner)):
         u, v = board.ends[k, 0], board.ends[k, 1]
         if mark[u] >= 0 and mark[u] == mark[v]:
             unite(parent, owner[k], owner[mark[u]])
-    for b in range(num_bodies):
+    for b in range(num_sets):
         parent[b] = find_root(parent, b)
     return parent
 
 
 @kernel()
-def _bodies_by_search(board: _Board, owner: IntArray, num_bodies: int) -> IntArray:
-    """Return a root body for each body after a full game: bodies in the same rigid set have the same."""
-    parent = np.arange(num_bodies)
-    done = np.zeros(num_bodies, np.bool_)
+def _sets_by_search(board: _Board, owner: IntArray, num_sets: int) -> IntArray:
+    """Return a root set for each set after a full game: sets in the same rigid set have the same."""
+    parent = np.arange(num_sets)
+    done = np.zeros(num_sets, np.bool_)
     for k in range(len(owner)):
         if done[owner[k]]:
             continue
@@ -318,6 +318,6 @@ def _bodies_by_search(board: _Board, owner: IntArray, num_bodies: int) -> IntArr
                 if board.inside[w] == board.clock[1]:
                     done[owner[link]] = True
                     unite(parent, owner[k], owner[link])
-    for b in range(num_bodies):
+    for b in range(num_sets):
         parent[b] = find_root(parent, b)
     return parent

@@ -1,6 +1,6 @@
-"""Steps 1 and 2: rigid bodies by triangles, and by growth over the cameras that bodies share.
+"""Steps 1 and 2: rigid sets by triangles, and by growth over the cameras that sets share.
 
-Bodies are sets of pairs. They are told apart by a label per pair; while they unite, by a forest in which
+Rigid sets are sets of pairs. They are told apart by a label per pair; while they unite, by a forest in which
 each set is a tree and its smallest member the root.
 """
 
@@ -12,7 +12,7 @@ from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import kernel
 
 _GROWTH_ROUNDS = 4  # a later round rarely unites anything; the pebble game is exact anyway
-_GROWTH_WORK = 30  # cameras looked at while growing, as a multiple of all (body, camera) incidences
+_GROWTH_WORK = 30  # cameras looked at while growing, as a multiple of all (set, camera) incidences
 
 
 def compact(label: IntArray) -> IntArray:
@@ -43,19 +43,19 @@ def unite(parent: IntArray, a: int, b: int) -> None:
 
 
 @kernel()
-def triangle_bodies(num_cameras: int, edges: IntArray) -> IntArray:
+def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
     """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same.
 
     Each pair is directed to its end of higher degree, which leaves at most sqrt(2 m) pairs at any
     camera, and each triangle is met once, at its lowest end.
     """
     m = len(edges)
-    degree = np.zeros(num_cameras, np.int64)
+    degree = np.zeros(num_nodes, np.int64)
     for e in range(m):
         degree[edges[e, 0]] += 1
         degree[edges[e, 1]] += 1
     tail = np.empty(m, np.int64)
-    start = np.zeros(num_cameras + 1, np.int64)
+    start = np.zeros(num_nodes + 1, np.int64)
     for e in range(m):
         i, j = edges[e, 0], edges[e, 1]
         tail[e] = i if (degree[i], i) < (degree[j], j) else j
@@ -71,9 +71,9 @@ def triangle_bodies(num_cameras: int, edges: IntArray) -> IntArray:
         head_of[slot] = edges[e, 0] + edges[e, 1] - tail[e]
 
     parent = np.arange(m)
-    seen_from = np.full(num_cameras, -1, np.int64)
-    seen_edge = np.empty(num_cameras, np.int64)
-    for a in range(num_cameras):
+    seen_from = np.full(num_nodes, -1, np.int64)
+    seen_edge = np.empty(num_nodes, np.int64)
+    for a in range(num_nodes):
         for s in range(start[a], start[a + 1]):
             seen_from[head_of[s]] = a
             seen_edge[head_of[s]] = edge_of[s]
@@ -91,26 +91,26 @@ def triangle_bodies(num_cameras: int, edges: IntArray) -> IntArray:
 
 @kernel()
 def incidence(
-    num_cameras: int, edges: IntArray, body: IntArray, num_bodies: int
+    num_nodes: int, edges: IntArray, set_of: IntArray, num_sets: int
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Return which cameras each body has, and which bodies each camera, as two (start, items) lists."""
+    """Return which cameras each set has, and which sets each camera, as two (start, items) lists."""
     m = len(edges)
-    edge_start = np.zeros(num_bodies + 1, np.int64)
+    edge_start = np.zeros(num_sets + 1, np.int64)
     for e in range(m):
-        edge_start[body[e] + 1] += 1
+        edge_start[set_of[e] + 1] += 1
     edge_start = np.cumsum(edge_start)
     fill = edge_start[:-1].copy()
     edge_of = np.empty(m, np.int64)
     for e in range(m):
-        edge_of[fill[body[e]]] = e
-        fill[body[e]] += 1
+        edge_of[fill[set_of[e]]] = e
+        fill[set_of[e]] += 1
 
-    start = np.zeros(num_bodies + 1, np.int64)
+    start = np.zeros(num_sets + 1, np.int64)
     cameras = np.empty(2 * m, np.int64)
-    back_start = np.zeros(num_cameras + 1, np.int64)
-    last = np.full(num_cameras, -1, np.int64)
+    back_start = np.zeros(num_nodes + 1, np.int64)
+    last = np.full(num_nodes, -1, np.int64)
     count = 0
-    for b in range(num_bodies):
+    for b in range(num_sets):
         for s in range(edge_start[b], edge_start[b + 1]):
             for side in range(2):
                 camera = edges[edge_of[s], side]
@@ -122,68 +122,68 @@ def incidence(
         start[b + 1] = count
     back_start = np.cumsum(back_start)
     fill = back_start[:-1].copy()
-    bodies = np.empty(count, np.int64)
-    for b in range(num_bodies):
+    rigid_sets = np.empty(count, np.int64)
+    for b in range(num_sets):
         for s in range(start[b], start[b + 1]):
-            bodies[fill[cameras[s]]] = b
+            rigid_sets[fill[cameras[s]]] = b
             fill[cameras[s]] += 1
-    return start, cameras[:count].copy(), back_start, bodies
+    return start, cameras[:count].copy(), back_start, rigid_sets
 
 
-def grown(num_cameras: int, edges: IntArray, body: IntArray) -> IntArray:
-    """Return body labels after growing every body of at least 3 cameras, largest first (step 2)."""
+def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
+    """Return set labels after growing every set of at least 3 cameras, largest first (step 2)."""
     for _ in range(_GROWTH_ROUNDS):
-        num_bodies = int(body.max(initial=-1)) + 1
-        start, cameras, back_start, bodies = incidence(num_cameras, edges, body, num_bodies)
+        num_sets = int(set_of.max(initial=-1)) + 1
+        start, cameras, back_start, rigid_sets = incidence(num_nodes, edges, set_of, num_sets)
         growth = _Growth(
             start=start,
             cameras=cameras,
             back_start=back_start,
-            bodies=bodies,
-            parent=np.arange(num_bodies),
-            taken=np.full(num_bodies, -1),
-            met=np.full(num_bodies, -1),
-            inside=np.full(num_cameras, -1),
-            reached=np.full(num_cameras, -1),
-            reached_by=np.full(num_cameras, -1),
-            reached_at=np.full(num_cameras, -1),
-            queue=np.full(num_cameras, -1),
+            rigid_sets=rigid_sets,
+            parent=np.arange(num_sets),
+            taken=np.full(num_sets, -1),
+            met=np.full(num_sets, -1),
+            inside=np.full(num_nodes, -1),
+            reached=np.full(num_nodes, -1),
+            reached_by=np.full(num_nodes, -1),
+            reached_at=np.full(num_nodes, -1),
+            queue=np.full(num_nodes, -1),
         )
         size = np.diff(start)
         seeds = np.argsort(-size, kind="stable")[: int((size >= 3).sum())].astype(np.int64)
         _grow(growth, seeds, _GROWTH_WORK * len(cameras))
-        if (growth.parent == np.arange(num_bodies)).all():
+        if (growth.parent == np.arange(num_sets)).all():
             break
-        body = compact(growth.parent[body])
-    return body
+        set_of = compact(growth.parent[set_of])
+    return set_of
 
 
 class _Growth(NamedTuple):
-    """State of growing bodies; a mark is valid where it equals the seed that grows."""
+    """State of growing sets; a mark is valid where it equals the seed that grows."""
 
     start: IntArray
     cameras: IntArray
     back_start: IntArray
-    bodies: IntArray
-    """Cameras of each body, bodies at each camera."""
+    rigid_sets: IntArray
+    """Cameras of each set, sets at each camera."""
     parent: IntArray
-    """(number of bodies,) which bodies were united."""
+    """(number of sets,) which sets were united."""
     taken: IntArray
     met: IntArray
-    """(number of bodies,) marks: part of the seed; shares a camera with it."""
+    """(number of sets,) marks: part of the seed; shares a camera with it."""
     inside: IntArray
     reached: IntArray
-    """(n,) marks: camera of the seed; camera of a body that shares one with the seed, ..."""
+    """(n,) marks: camera of the seed; camera of a set that shares one with the seed, ..."""
     reached_by: IntArray
     reached_at: IntArray
-    """(n,) ... the first such body, and the camera that it shares."""
+    """(n,) ... the first such set, and the camera that it shares."""
     queue: IntArray
     """The seed's cameras, in the order of joining."""
 
 
 @kernel()
 def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
-    """Let each seed absorb what step 2 allows; leave a root body for each body in `parent`."""
+    """Let each seed absorb what step 2 allows; leave a root set for each set in `parent`."""
     for seed in seeds:
         if growth.parent[seed] == seed and growth.taken[seed] < 0 and max_work >= 0:
             max_work -= _grow_seed(growth, seed)
@@ -193,10 +193,10 @@ def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
 
 @kernel()
 def _grow_seed(growth: _Growth, seed: int) -> int:
-    """Absorb each body that meets the seed's cameras a second time; return the work done.
+    """Absorb each set that meets the seed's cameras a second time; return the work done.
 
-    A body larger than what has been grown so far is not searched for cameras that it shares with
-    others, which bounds the work of small seeds beside large bodies.
+    A set larger than what has been grow_sets so far is not searched for cameras that it shares with
+    others, which bounds the work of small seeds beside large sets.
     """
     work = 0
     tail = _absorb(growth, seed, seed, 0)
@@ -205,7 +205,7 @@ def _grow_seed(growth: _Growth, seed: int) -> int:
         camera = growth.queue[head]
         head += 1
         for s in range(growth.back_start[camera], growth.back_start[camera + 1]):
-            b = growth.bodies[s]
+            b = growth.rigid_sets[s]
             work += 1
             if growth.taken[b] == seed:
                 continue
@@ -221,10 +221,10 @@ def _grow_seed(growth: _Growth, seed: int) -> int:
 
 @kernel()
 def _reach_out(growth: _Growth, seed: int, b: int, camera: int, tail: int) -> int:
-    """Mark the cameras of a body that meets the seed at `camera`; absorb it if that closes a triangle.
+    """Mark the cameras of a set that meets the seed at `camera`; absorb it if that closes a triangle.
 
-    The triangle is the seed, this body, and one that meets the seed elsewhere and this body outside.
-    Two bodies that meet the seed at the same camera, and each other outside, share two cameras.
+    The triangle is the seed, this set, and one that meets the seed elsewhere and this set outside.
+    Two sets that meet the seed at the same camera, and each other outside, share two cameras.
     """
     for s in range(growth.start[b], growth.start[b + 1]):
         other = growth.cameras[s]
@@ -244,7 +244,7 @@ def _reach_out(growth: _Growth, seed: int, b: int, camera: int, tail: int) -> in
 
 @kernel()
 def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
-    """Unite a body with the seed and queue the cameras that it brings; return the queue's new tail."""
+    """Unite a set with the seed and queue the cameras that it brings; return the queue's new tail."""
     if growth.taken[eaten] == seed:
         return tail
     growth.taken[eaten] = seed

@@ -9,7 +9,7 @@ from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.rigidity.game import contract, play
-from sfm_shapefit.rigidity.growth import compact, grown, incidence, triangle_bodies
+from sfm_shapefit.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.viewgraph import ViewGraph
 
 _FIRST_GAME_CAMERAS = 500  # a pebble game of this size takes milliseconds
@@ -18,26 +18,26 @@ _FEW_LINKS = 6  # per camera: twice what rigidity needs in space, and mostly eno
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RigidPiece:
-    """A maximal set of pairs whose cameras are determined up to one translation and one scale."""
+    """A maximal set of pairs whose nodes are determined up to one translation and one scale."""
 
-    cameras: IntArray
-    """Its cameras, ascending, at least 2."""
+    nodes: IntArray
+    """Its nodes, ascending, at least 2."""
     edges: IntArray
     """Indices of its pairs in the graph's `edges`, ascending."""
     hinges: IntArray
-    """Those of its cameras that also belong to another piece of at least 3 cameras, ascending."""
+    """Those of its nodes that also belong to another piece of at least 3 cameras, ascending."""
 
 
-def parallel_rigid_pieces(num_cameras: int, edges: IntArray, dimension: int) -> IntArray:
+def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return the rigid piece of each pair, for positions in general position.
 
-    The contraction is exact: a motion of the whole is one translation and scale per body, equal where
-    bodies share a camera. A frame on the b shared cameras w_0, w_1, ... of a body (d - 1 copies of
+    The contraction is exact: a motion of the whole is one translation and scale per set, equal where
+    sets share a camera. A frame on the b shared cameras w_0, w_1, ... of a set (d - 1 copies of
     each w_0 w_k, one of each w_1 w_k, k > 1) admits the same motions there: it has d b - (d + 1)
     copies, and it is independent, since each w_k adds d copies, at most d - 1 of them to one camera.
 
     Args:
-        num_cameras: n.
+        num_nodes: n.
         edges: (m, 2) camera indices in [0, n), no self-loops.
         dimension: d >= 2.
 
@@ -49,63 +49,63 @@ def parallel_rigid_pieces(num_cameras: int, edges: IntArray, dimension: int) -> 
     Raises:
         InputError: if an edge is a self-loop or out of range, or `dimension` is below 2.
     """
-    edges = _checked_edges(num_cameras, edges, dimension)
-    body = compact(triangle_bodies(num_cameras, edges))
-    body = grown(num_cameras, edges, body)
+    edges = _checked_edges(num_nodes, edges, dimension)
+    set_of = compact(triangle_sets(num_nodes, edges))
+    set_of = grow_sets(num_nodes, edges, set_of)
     part = _FIRST_GAME_CAMERAS
     while True:
-        game = contract(num_cameras, edges, body, part, dimension)
+        game = contract(num_nodes, edges, set_of, part, dimension)
         united, is_settled = play(game, dimension)
-        body = united[body]
+        set_of = united[set_of]
         if is_settled and game.is_whole:
-            return _ranked(num_cameras, edges, body)
-        if body.max() + 1 < game.num_bodies:
-            body = grown(num_cameras, edges, body)
+            return _ranked(num_nodes, edges, set_of)
+        if set_of.max() + 1 < game.num_sets:
+            set_of = grow_sets(num_nodes, edges, set_of)
         if is_settled:
             part *= 2
 
 
-def is_parallel_rigid(num_cameras: int, edges: IntArray, dimension: int) -> bool:
+def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     """Return whether the pairs fix all n cameras up to one translation and one scale, generically.
 
     A single camera without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
     """
-    checked = _checked_edges(num_cameras, edges, dimension)
-    if len(checked) and _grows_from_first_pair(num_cameras, checked):
+    checked = _checked_edges(num_nodes, edges, dimension)
+    if len(checked) and _grows_from_first_pair(num_nodes, checked):
         return True
-    few = checked[_among_first_links(num_cameras, checked, _FEW_LINKS)]
-    if 2 * len(few) <= len(checked) and _is_one_piece(num_cameras, few, dimension):
+    few = checked[_among_first_links(num_nodes, checked, _FEW_LINKS)]
+    if 2 * len(few) <= len(checked) and _is_one_piece(num_nodes, few, dimension):
         return True  # more pairs only hold the cameras faster; the search takes memory by the pair
-    return _is_one_piece(num_cameras, checked, dimension)
+    return _is_one_piece(num_nodes, checked, dimension)
 
 
-def _is_one_piece(num_cameras: int, edges: IntArray, dimension: int) -> bool:
+def _is_one_piece(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     """Return whether the checked pairs are one rigid piece, and touch every camera."""
-    label = parallel_rigid_pieces(num_cameras, edges, dimension)
+    label = parallel_rigid_pieces(num_nodes, edges, dimension)
     if len(label) == 0:
-        return num_cameras == 1
-    return bool(label.max() == 0) and len(np.unique(edges)) == num_cameras
+        return num_nodes == 1
+    return bool(label.max() == 0) and len(np.unique(edges)) == num_nodes
 
 
 def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
     """Return the parallel-rigid pieces of a view graph, largest first; single pairs are pieces too."""
-    label = parallel_rigid_pieces(graph.num_cameras, graph.edges, graph.dimension)
+    label = parallel_rigid_pieces(graph.num_nodes, graph.edges, graph.dimension)
     if len(label) == 0:
         return []
     num_pieces = int(label.max()) + 1
-    start, cameras, _, _ = incidence(graph.num_cameras, graph.edges, label, num_pieces)
+    start, cameras, _, _ = incidence(graph.num_nodes, graph.edges, label, num_pieces)
     owner = np.repeat(np.arange(num_pieces), np.diff(start))
     cameras = cameras[np.lexsort((cameras, owner))]
 
     is_large = np.diff(start)[owner] >= 3
-    large_at = np.bincount(cameras[is_large], minlength=graph.num_cameras)
+    large_at = np.bincount(cameras[is_large], minlength=graph.num_nodes)
     is_hinge = large_at[cameras] - is_large > 0
 
     edge_order = np.argsort(label, kind="stable").astype(np.int64)
     edge_start = np.searchsorted(label[edge_order], np.arange(num_pieces + 1))
     return [
         RigidPiece(
-            cameras=frozen(cameras[start[k] : start[k + 1]]),
+            nodes=frozen(cameras[start[k] : start[k + 1]]),
             edges=frozen(edge_order[edge_start[k] : edge_start[k + 1]]),
             hinges=frozen(cameras[start[k] : start[k + 1]][is_hinge[start[k] : start[k + 1]]]),
         )
@@ -114,15 +114,15 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
 
 
 @kernel()
-def _grows_from_first_pair(num_cameras: int, edges: IntArray) -> bool:
+def _grows_from_first_pair(num_nodes: int, edges: IntArray) -> bool:
     """Return whether the first pair grows to all cameras by cameras that are joined to two of its own.
 
     Sufficient for rigidity, and linear in the pairs: each such camera has 2 (d - 1) >= d new copies of edges.
     """
-    start, neighbour = _adjacency(num_cameras, edges)
-    links = np.zeros(num_cameras, dtype=np.int64)
-    last = np.full(num_cameras, -1)  # the member that linked last: a pair given twice is one link
-    members = np.empty(num_cameras, dtype=np.int64)
+    start, neighbour = _adjacency(num_nodes, edges)
+    links = np.zeros(num_nodes, dtype=np.int64)
+    last = np.full(num_nodes, -1)  # the member that linked last: a pair given twice is one link
+    members = np.empty(num_nodes, dtype=np.int64)
     members[0], members[1] = edges[0, 0], edges[0, 1]
     links[members[0]] = links[members[1]] = 2
     size, done = 2, 0
@@ -136,13 +136,13 @@ def _grows_from_first_pair(num_cameras: int, edges: IntArray) -> bool:
                 members[size] = other
                 size += 1
             last[other] = camera
-    return bool(size == num_cameras)
+    return bool(size == num_nodes)
 
 
 @kernel()
-def _among_first_links(num_cameras: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
+def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
     """Return which pairs are among the first `few` kept at one of their cameras, at least, (m,)."""
-    kept = np.zeros(num_cameras, dtype=np.int64)
+    kept = np.zeros(num_nodes, dtype=np.int64)
     is_kept = np.zeros(len(edges), dtype=np.bool_)
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
@@ -154,13 +154,13 @@ def _among_first_links(num_cameras: int, edges: IntArray, few: int) -> npt.NDArr
 
 
 @kernel()
-def _adjacency(num_cameras: int, edges: IntArray) -> tuple[IntArray, IntArray]:
+def _adjacency(num_nodes: int, edges: IntArray) -> tuple[IntArray, IntArray]:
     """Return the neighbours of each camera, one camera after the other, and where each begins, (n + 1,)."""
-    start = np.zeros(num_cameras + 2, dtype=np.int64)
+    start = np.zeros(num_nodes + 2, dtype=np.int64)
     for e in range(len(edges)):
         start[edges[e, 0] + 2] += 1
         start[edges[e, 1] + 2] += 1
-    for camera in range(num_cameras):
+    for camera in range(num_nodes):
         start[camera + 2] += start[camera + 1]
     neighbour = np.empty(2 * len(edges), dtype=np.int64)
     for e in range(len(edges)):
@@ -171,42 +171,42 @@ def _adjacency(num_cameras: int, edges: IntArray) -> tuple[IntArray, IntArray]:
     return start[:-1], neighbour
 
 
-def _checked_edges(num_cameras: int, edges: IntArray, dimension: int) -> IntArray:
+def _checked_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
     checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    index = _first_bad_edge(num_cameras, checked)
+    index = _first_bad_edge(num_nodes, checked)
     if index < len(checked):
         raise InputError(
             f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different cameras "
-            f"of 0..{num_cameras - 1}"
+            f"of 0..{num_nodes - 1}"
         )
     return checked
 
 
 @kernel()
-def _first_bad_edge(num_cameras: int, edges: IntArray) -> int:
+def _first_bad_edge(num_nodes: int, edges: IntArray) -> int:
     """Return the first pair that leaves the cameras or joins one with itself; the number of pairs if none."""
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
-        if i == j or min(i, j) < 0 or max(i, j) >= num_cameras:
+        if i == j or min(i, j) < 0 or max(i, j) >= num_nodes:
             return e
     return len(edges)
 
 
-def _ranked(num_cameras: int, edges: IntArray, body: IntArray) -> IntArray:
+def _ranked(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
     """Renumber final pieces: more cameras, more edges, smaller first, smaller second camera first."""
-    if len(body) == 0:
-        return body
-    num_bodies = int(body.max()) + 1
-    start, cameras, _, _ = incidence(num_cameras, edges, body, num_bodies)
-    num_edges = np.bincount(body, minlength=num_bodies)
+    if len(set_of) == 0:
+        return set_of
+    num_sets = int(set_of.max()) + 1
+    start, cameras, _, _ = incidence(num_nodes, edges, set_of, num_sets)
+    num_edges = np.bincount(set_of, minlength=num_sets)
     smallest = np.minimum.reduceat(cameras, start[:-1])
-    owner = np.repeat(np.arange(num_bodies), np.diff(start))
-    others = np.where(cameras == smallest[owner], num_cameras, cameras)
+    owner = np.repeat(np.arange(num_sets), np.diff(start))
+    others = np.where(cameras == smallest[owner], num_nodes, cameras)
     second = np.minimum.reduceat(others, start[:-1])  # two pieces never share both
     order = np.lexsort((second, smallest, -num_edges, -np.diff(start)))
-    rank = np.empty(num_bodies, dtype=np.int64)
-    rank[order] = np.arange(num_bodies)
-    return np.asarray(rank[body], dtype=np.int64)
+    rank = np.empty(num_sets, dtype=np.int64)
+    rank[order] = np.arange(num_sets)
+    return np.asarray(rank[set_of], dtype=np.int64)

@@ -20,14 +20,14 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
         largest piece". Hinges shared with the largest piece are named if there are any, else all
         hinges of the camera's piece. Without names in the graph, NAME is "camera K".
     """
-    placed = np.zeros(graph.num_cameras, dtype=np.bool_)
+    placed = np.zeros(graph.num_nodes, dtype=np.bool_)
     if pieces:
-        placed[pieces[0].cameras] = True
+        placed[pieces[0].nodes] = True
     degree = graph.degrees()
     component = graph.components()
-    main = component[pieces[0].cameras[0]] if pieces else -1
+    main = component[pieces[0].nodes[0]] if pieces else -1
     neighbour = _a_neighbour(graph)
-    home = _large_piece_of(graph.num_cameras, pieces)
+    home = _large_piece_of(graph.num_nodes, pieces)
 
     reasons: dict[int, str] = {}
     for camera in np.flatnonzero(~placed).tolist():
@@ -50,18 +50,18 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
 
 def _a_neighbour(graph: ViewGraph) -> IntArray:
     """Return one neighbour of each camera (n,), -1 without any: the neighbour where there is one only."""
-    neighbour = np.full(graph.num_cameras, -1, dtype=np.int64)
+    neighbour = np.full(graph.num_nodes, -1, dtype=np.int64)
     neighbour[graph.edges[:, 0]] = graph.edges[:, 1]
     neighbour[graph.edges[:, 1]] = graph.edges[:, 0]
     return neighbour
 
 
-def _large_piece_of(num_cameras: int, pieces: list[RigidPiece]) -> IntArray:
+def _large_piece_of(num_nodes: int, pieces: list[RigidPiece]) -> IntArray:
     """Return the first piece of at least 3 cameras that holds each camera (n,), or -1."""
-    home = np.full(num_cameras, -1, dtype=np.int64)
+    home = np.full(num_nodes, -1, dtype=np.int64)
     for k in reversed(range(len(pieces))):
-        if len(pieces[k].cameras) >= 3:
-            home[pieces[k].cameras] = k
+        if len(pieces[k].nodes) >= 3:
+            home[pieces[k].nodes] = k
     return home
 
 

@@ -169,7 +169,7 @@ def _proved(
     """Make y feasible in place and return what it proves; None if the gap is going to be above `hopeless`."""
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, y)
-    n, d, w = graph.num_cameras, graph.dimension, graph.weights
+    n, d, w = graph.num_nodes, graph.dimension, graph.weights
     c, total, degrees = np.zeros((n, d)), np.zeros((n, d)), np.zeros(n)
     worst = _project(graph.edges, graph.directions, w, y, c, total, degrees)
     degree = float(degrees.max())
@@ -370,7 +370,7 @@ def _preconditioner(
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32
-        neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+        neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
         return approximate_cholesky(neighbours, stiffness, _SEED)
     return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
 
@@ -479,7 +479,7 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
         return None
     v, w = graph.directions, graph.weights
     longest = int(np.argmax(along(differences(t, graph.edges), v)))
-    n, d = graph.num_cameras, graph.dimension
+    n, d = graph.num_nodes, graph.dimension
     share = 2.0 * graph.num_edges / (n * (n - 1.0))
     if n * d <= _SMALL or (n * d <= _LARGEST_DENSE and share >= _DENSE_GRAPH):
         return _is_regular_dense(graph, y, longest)
@@ -497,7 +497,7 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
 
 def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
     """Return whether the conditions of uniqueness have a regular matrix, by a dense factor of it."""
-    n, d = graph.num_cameras, graph.dimension
+    n, d = graph.num_nodes, graph.dimension
     blocks = np.empty((graph.num_edges, d, d))
     _set_conditions(graph.directions, graph.weights, y, longest, blocks)
     diagonal = np.zeros((n, d, d))
@@ -570,7 +570,7 @@ def _least_pivot(
 
 def _checked_objective(graph: ViewGraph, locations: FloatArray, t: FloatArray, dual: FloatArray) -> float:
     """Return the objective at the locations, t when centred, or raise InputError."""
-    shapes = (graph.num_cameras, graph.dimension), graph.directions.shape
+    shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(
             f"locations and dual have shapes {locations.shape} and {dual.shape}; this graph needs "

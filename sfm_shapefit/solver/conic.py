@@ -6,7 +6,7 @@ complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
     minimise    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
-With bodies (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, body 0 grounded.
+With groups (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, group 0 grounded.
 
 The multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow beside a solver made
 for the program, and trusted: every other solver is tested against it.
@@ -23,7 +23,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.solver.program import scale_functional
-from sfm_shapefit.solver.rigs.groups import Bodies, separate
+from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.viewgraph import ViewGraph
 
 _TIGHTEST = 1e-12  # tolerance that double precision can still serve
@@ -32,7 +32,7 @@ _TIGHTER = 1e-3  # the cone solver's tolerance below ours: its gap is relative t
 
 
 def solve_conic(
-    graph: ViewGraph, tol: float, max_iterations: int, bodies: Bodies | None = None
+    graph: ViewGraph, tol: float, max_iterations: int, groups: RigidGroups | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with cvxpy and Clarabel.
 
@@ -40,7 +40,7 @@ def solve_conic(
         graph: a connected, parallel-rigid view graph.
         tol: the certified gap wanted.
         max_iterations: limit of interior-point steps.
-        bodies: of its nodes, where the program is that over bodies; no pair may lie inside one.
+        groups: of its nodes, where the program is that over groups; no pair may lie inside one.
 
     Returns:
         locations (n, d), the approximate dual (m, d), and the number of interior-point steps.
@@ -52,7 +52,7 @@ def solve_conic(
 
     bases = tangent_bases(graph.directions)
     m, d = graph.num_edges, graph.dimension
-    reduction = _reduction(separate(graph.num_cameras, d) if bodies is None else bodies)
+    reduction = _reduction(separate(graph.num_nodes, d) if groups is None else groups)
     matrix = _operator(graph, bases) @ reduction
     c = reduction.T @ scale_functional(graph).ravel()
 
@@ -86,16 +86,16 @@ def _operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
         columns = np.broadcast_to((nodes[:, None] * d + np.arange(d))[:, :, None], (m, d, k))
         parts.append((sign * bases.ravel(), rows.ravel(), columns.ravel()))
     values, row, column = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-    return coo_array((values, (row, column)), shape=(m * k, graph.num_cameras * d)).tocsr()
+    return coo_array((values, (row, column)), shape=(m * k, graph.num_nodes * d)).tocsr()
 
 
-def _reduction(bodies: Bodies) -> csr_array:
-    """Return A without the columns of body 0, which is grounded, and without that of s if it is 0."""
-    n, d = bodies.offsets.shape
+def _reduction(groups: RigidGroups) -> csr_array:
+    """Return A without the columns of group 0, which is grounded, and without that of s if it is 0."""
+    n, d = groups.offsets.shape
     rows = np.arange(n * d)
-    columns = (bodies.body_of[:, None] * d + np.arange(d)).ravel()
-    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, bodies.num_bodies * d)).tocsc()[:, d:]
-    scaled = [csr_array(bodies.offsets.reshape(-1, 1))] if bodies.offsets.any() else []
+    columns = (groups.group_of[:, None] * d + np.arange(d)).ravel()
+    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, groups.num_groups * d)).tocsc()[:, d:]
+    scaled = [csr_array(groups.offsets.reshape(-1, 1))] if groups.offsets.any() else []
     return csr_array(hstack([moving, *scaled]))
 
 

@@ -58,7 +58,7 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
 def scale_functional(graph: ViewGraph) -> FloatArray:
     """Return c = D^T (w v), so that L(T) = <c, T>, shape (n, d)."""
-    total = np.zeros((graph.num_cameras, graph.dimension))
+    total = np.zeros((graph.num_nodes, graph.dimension))
     _add_scale(graph.edges, graph.directions, graph.weights, total)
     return total
 

@@ -151,7 +151,7 @@ def uncertified(
 
 def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
-    unknowns = graph.num_cameras * graph.dimension
+    unknowns = graph.num_nodes * graph.dimension
     asked = options.method != "auto"
     if options.method == "conic":
         return Choice("conic", _run_conic, "asked for")
@@ -160,7 +160,7 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     if unknowns <= _SMALL:
         return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
     dense = Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
-    share = 2.0 * graph.num_edges / (graph.num_cameras * (graph.num_cameras - 1.0))
+    share = 2.0 * graph.num_edges / (graph.num_nodes * (graph.num_nodes - 1.0))
     prediction, flops = None, np.inf
     if unknowns > _LARGEST_DENSE or share < _DENSE_GRAPH:
         prediction = predict_factor(graph)
@@ -234,9 +234,9 @@ class _Watch:
 
 def _refuse_undetermined(graph: ViewGraph) -> None:
     """Raise UnsolvableError where the program has no unique answer whatever the directions say."""
-    if graph.num_cameras < 2 or graph.num_edges == 0:
+    if graph.num_nodes < 2 or graph.num_edges == 0:
         raise UnsolvableError("the graph has no pair of cameras; nothing can be placed")
-    if not is_parallel_rigid(graph.num_cameras, graph.edges, graph.dimension):
+    if not is_parallel_rigid(graph.num_nodes, graph.edges, graph.dimension):
         components = int(graph.components().max()) + 1
         if components > 1:
             raise UnsolvableError(

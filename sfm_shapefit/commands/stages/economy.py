@@ -27,7 +27,7 @@ def known_workload(
         num_pairs=len(directions.pairs),
         num_matches=int(directions.num_matches.sum()),
         num_edges=joint.graph.num_edges,
-        num_nodes=joint.graph.num_cameras,
+        num_nodes=joint.graph.num_nodes,
         num_sampled=joint.graph.num_edges if samples_errors(source, directions) else 0,
         has_points=joint.num_points > 0,
         factor_entries=entries,
@@ -57,7 +57,7 @@ def _factor(graph: ViewGraph, max_bytes: int) -> tuple[int, float]:
     """Return the blocks of a graph's factor with its stack, and its flops; 0 where it would be too large."""
     if graph.num_edges == 0 or predict_factor(graph).tree is None:
         return 0, 0.0
-    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     plan = plan_factorisation(neighbours, np.ascontiguousarray(graph.edges), best_order(neighbours))
     if plan.num_bytes(graph.dimension, np.float64) > max_bytes:
         return 0, 0.0

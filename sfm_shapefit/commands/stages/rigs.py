@@ -1,7 +1,7 @@
-"""Rigs and fixed cameras in `locate`: which images form rigid bodies, and how these are placed.
+"""Rigs and fixed cameras in `locate`: which images form rigid groups, and how these are placed.
 
-The frames of a model with rigs are bodies with metric offsets. Cameras that are fixed stand where the input
-has them: two or more are one body, whose offsets are their centres; of a single one only the origin can be
+The frames of a model with rigs are groups with metric offsets. Cameras that are fixed stand where the input
+has them: two or more are one group, whose offsets are their centres; of a single one only the origin can be
 taken.
 """
 
@@ -23,9 +23,9 @@ from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.placement.rigs import is_scaled, place_bodies
+from sfm_shapefit.placement.rigs import is_scaled, place_groups
 from sfm_shapefit.solver.rigs import largest_tied
-from sfm_shapefit.solver.rigs.groups import Bodies, separate
+from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 
 _COINCIDENT = 1e-9  # extent of the fixed centres, of their distance from the origin, that counts as none
 
@@ -35,10 +35,10 @@ class Rigid(NamedTuple):
 
     fixed: BoolArray
     """(n,) images that stay exactly where the input has them."""
-    bodies: Bodies | None
-    """The images in bodies; None where each moves by itself."""
+    groups: RigidGroups | None
+    """The images in groups; None where each moves by itself."""
     held: int | None
-    """The body of the fixed images."""
+    """The group of the fixed images."""
 
 
 def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
@@ -76,28 +76,28 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
         raise InputError(
             "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
         )
-    bodies = model.bodies if model.has_rigs else separate(model.num_images, 3)
+    groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
-        return Rigid(fixed, bodies, None)
+        return Rigid(fixed, groups, None)
     centers = model.centers[fixed]
     extent = float(np.ptp(centers, axis=0).max())
     if count > 1 and extent <= _COINCIDENT * max(1.0, float(np.abs(centers).max())) and not model.has_rigs:
         raise InputError(
             f"the {count} fixed cameras stand at one place in the input; fix others, whose positions it has"
         )
-    return Rigid(fixed, bodies.with_fixed(fixed, model.centers), 0)
+    return Rigid(fixed, groups.with_fixed(fixed, model.centers), 0)
 
 
 def rigs_statement(model: PosedModel, joint: JointGraph) -> str:
     """Say how many frames a model has, and how many of them the pairs tie to one another."""
     if not model.has_rigs:
         return "none: every image is a frame of its own"
-    bodies = model.bodies.with_separate(joint.num_points)
-    frames = f"{model.bodies.num_bodies} frames of {model.num_images} images"
-    if not is_scaled(bodies, joint.graph.edges):
+    groups = model.groups.with_separate(joint.num_points)
+    frames = f"{model.groups.num_groups} frames of {model.num_images} images"
+    if not is_scaled(groups, joint.graph.edges):
         return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
-    sizes = np.bincount(bodies.body_of[: model.num_images], minlength=bodies.num_bodies)
-    tied = int(np.sum(sizes[largest_tied(joint.graph.edges, bodies, sizes)] > 0))
+    sizes = np.bincount(groups.group_of[: model.num_images], minlength=groups.num_groups)
+    tied = int(np.sum(sizes[largest_tied(joint.graph.edges, groups, sizes)] > 0))
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
@@ -109,34 +109,34 @@ def placed(
     clock: Clock,
     executor: Executor | None = None,
 ) -> Placement:
-    """Place the view graph, over bodies where there are any.
+    """Place the view graph, over groups where there are any.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
-    take part with bodies only if they are wanted always, or if cameras hang loose without them.
+    take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
-    if rigid.bodies is None:
+    if rigid.groups is None:
         settings, k = options.for_placement(), joint.num_cameras
         return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration, executor)
     first = None
     if options.points != "always":
         try:
-            first = _placed_bodies(*_without_points(joint, evidence), rigid, options)
+            first = _placed_groups(*_without_points(joint, evidence), rigid, options)
         except UnsolvableError:
             if joint.num_points == 0:
                 raise
     if joint.num_points == 0 or (first is not None and not first.assessment.loose_groups):
         assert first is not None or options.points == "always"
-        return first or _placed_bodies(joint, evidence, rigid, options)
-    second = _placed_bodies(joint, evidence, rigid, options)
+        return first or _placed_groups(joint, evidence, rigid, options)
+    second = _placed_groups(joint, evidence, rigid, options)
     return second if first is None or _num_held(second) > _num_held(first) else first
 
 
-def _placed_bodies(joint: JointGraph, evidence: Evidence, rigid: Rigid, options: LocateOptions) -> Placement:
-    """Place bodies, and points that each are one."""
-    assert rigid.bodies is not None
-    return place_bodies(
+def _placed_groups(joint: JointGraph, evidence: Evidence, rigid: Rigid, options: LocateOptions) -> Placement:
+    """Place groups, and points that each are one."""
+    assert rigid.groups is not None
+    return place_groups(
         joint.graph,
-        rigid.bodies.with_separate(joint.num_points),
+        rigid.groups.with_separate(joint.num_points),
         options.for_placement(),
         joint.covariance,
         evidence,
@@ -149,7 +149,7 @@ def _without_points(joint: JointGraph, evidence: Evidence) -> tuple[JointGraph, 
     """Return the pairs of cameras alone; they stand before the rays."""
     k = joint.num_cameras
     rows = np.flatnonzero((joint.graph.edges < k).all(axis=1))
-    return without_points(joint), evidence.restricted_to(rows, np.arange(k), joint.graph.num_cameras)
+    return without_points(joint), evidence.restricted_to(rows, np.arange(k), joint.graph.num_nodes)
 
 
 def _num_held(placement: Placement) -> int:
@@ -161,14 +161,14 @@ def _num_held(placement: Placement) -> int:
 def rigid_gauge(
     model: PosedModel, placement: Placement, rigid: Rigid, kept: BoolArray, otherwise: Callable[[], Gauge]
 ) -> Gauge:
-    """Return scale and origin of the output where bodies or a fixed camera decide them.
+    """Return scale and origin of the output where groups or a fixed camera decide them.
 
     Args:
         model: the input.
         placement: its solution.
         rigid: what of it is rigid.
         kept: which of the placement's cameras are in the output.
-        otherwise: chooses where no body knows the scale; a single fixed camera then moves only the origin.
+        otherwise: chooses where no group knows the scale; a single fixed camera then moves only the origin.
 
     Raises:
         UnsolvableError: if the only fixed image is not placed.

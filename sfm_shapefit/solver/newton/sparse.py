@@ -85,7 +85,7 @@ def solve_newton_sparse(
     """
     problem, iterate, model, step = allocate(graph)
     if plan is None:
-        neighbours = adjacency(graph.num_cameras, graph.edges)
+        neighbours = adjacency(graph.num_nodes, graph.edges)
         plan = plan_factorisation(neighbours, graph.edges, tree or best_order(neighbours))
     factor = allocate_factor(plan, graph.dimension)
     if start is None:

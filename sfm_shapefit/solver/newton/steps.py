@@ -117,7 +117,7 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
     Raises:
         UnsolvableError: if c is 0 up to rounding.
     """
-    n, m, d = graph.num_cameras, graph.num_edges, graph.dimension
+    n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
 
     def nodes() -> FloatArray:
         return np.empty((n, d))

@@ -1,4 +1,4 @@
-"""From locations of bodies and any dual to a rigorous bound; see the package for the derivation.
+"""From locations of groups and any dual to a rigorous bound; see the package for the derivation.
 
 Uniqueness is judged as in `solver.certificate`: whatever is optimal satisfies linear conditions, and if the
 reduced matrix of these is regular with one pair pinned, nothing else does.
@@ -10,11 +10,11 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.solver.certificate import Certificate
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor, System, factor_pinned
 from sfm_shapefit.viewgraph import ViewGraph
 
-_OFF_BODIES = 1e-9  # distance of locations from those of rigid bodies, of their extent, that is rounding
+_OFF_GROUPS = 1e-9  # distance of locations from those of rigid groups, of their extent, that is rounding
 _EXACT = 1e-12  # an equality residual that needs no repair
 _REPAIRS = 4  # each shrinks the equality residual to the rounding of the previous one
 _RESIDUAL_FLOOR = 0.1  # least residual, of the mean one, that the metric of the repair takes seriously
@@ -22,37 +22,42 @@ _STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
 _REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
 
 
-def certify_bodies(
-    graph: ViewGraph, bodies: Bodies, locations: FloatArray, dual: FloatArray, *, uniqueness: bool = False
+def certify_groups(
+    graph: ViewGraph,
+    groups: RigidGroups,
+    locations: FloatArray,
+    dual: FloatArray,
+    *,
+    uniqueness: bool = False,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
     Args:
-        graph: a view graph whose pairs connect the bodies; those inside a body take no part.
-        bodies: of its nodes.
-        locations: (n, d) in any scale, with L(T) > 0 and the bodies' offsets in one common scale.
+        graph: a view graph whose pairs connect the groups; those inside a group take no part.
+        groups: of its nodes.
+        locations: (n, d) in any scale, with L(T) > 0 and the groups' offsets in one common scale.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         uniqueness: also examine whether the optimum is unique.
 
     Returns:
-        The certificate; its `equality_residual` is the largest violation at a body, or in the equation
-        for the scale with offsets of root mean square 1, relative to the largest weighted degree of a body.
+        The certificate; its `equality_residual` is the largest violation at a group, or in the equation
+        for the scale with offsets of root mean square 1, relative to the largest weighted degree of a group.
 
     Raises:
         InputError: if an array has the wrong shape or is not finite, the locations have L(T) <= 0, or they
-            are not those of rigid bodies.
-        UnsolvableError: if the dual must be repaired and the bodies hang loose.
+            are not those of rigid groups.
+        UnsolvableError: if the dual must be repaired and the groups hang loose.
     """
-    outer = bodies.joins(graph.edges)
-    _refuse(graph, bodies, locations, dual)
+    outer = groups.joins(graph.edges)
+    _refuse(graph, groups, locations, dual)
     edges, v, w = graph.edges[outer], graph.directions[outer], graph.weights[outer]
-    between = ViewGraph(graph.num_cameras, edges, v, w)
+    between = ViewGraph(graph.num_nodes, edges, v, w)
     value = objective(between, locations - locations.mean(axis=0))
     if not value < np.inf:
         raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
-    unit = bodies.normalised()
+    unit = groups.normalised()
     c = unit.reduce(scale_functional(between))
-    ends = unit.body_of[edges]
+    ends = unit.group_of[edges]
     degree = float(np.bincount(ends.ravel(), weights=np.repeat(w, 2)).max())
 
     y = across(np.ascontiguousarray(dual[outer]), v)
@@ -73,45 +78,45 @@ def certify_bodies(
     )
 
 
-def _refuse(graph: ViewGraph, bodies: Bodies, locations: FloatArray, dual: FloatArray) -> None:
+def _refuse(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, dual: FloatArray) -> None:
     """Raise InputError for what cannot be certified."""
-    shapes = (graph.num_cameras, graph.dimension), graph.directions.shape
-    if locations.shape != shapes[0] or dual.shape != shapes[1] or bodies.offsets.shape != shapes[0]:
+    shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
+    if locations.shape != shapes[0] or dual.shape != shapes[1] or groups.offsets.shape != shapes[0]:
         raise InputError(
             f"locations, dual and offsets have shapes {locations.shape}, {dual.shape} and "
-            f"{bodies.offsets.shape}; this graph needs {shapes[0]}, {shapes[1]} and {shapes[0]}"
+            f"{groups.offsets.shape}; this graph needs {shapes[0]}, {shapes[1]} and {shapes[0]}"
         )
     if not (np.isfinite(locations).all() and np.isfinite(dual).all()):
         raise InputError("locations and dual must be finite to be certified")
-    if not bodies.joins(graph.edges).any():
-        raise InputError("no pair joins two bodies, so there is nothing to certify")
-    apart = bodies.fit(locations)[1]
-    if apart > _OFF_BODIES * float(np.abs(locations).max()):
-        raise InputError(f"the locations are not those of rigid bodies: a node is {apart:.1e} off its body")
+    if not groups.joins(graph.edges).any():
+        raise InputError("no pair joins two groups, so there is nothing to certify")
+    apart = groups.fit(locations)[1]
+    if apart > _OFF_GROUPS * float(np.abs(locations).max()):
+        raise InputError(f"the locations are not those of rigid groups: a node is {apart:.1e} off its group")
 
 
 def _largest(violation: FloatArray, dimension: int) -> float:
-    """Return the largest norm of a reduced vector at a body, or its size for the scale."""
-    at_bodies = np.linalg.norm(violation[:-1].reshape(-1, dimension), axis=1)
-    return float(max(at_bodies.max(), abs(violation[-1])))
+    """Return the largest norm of a reduced vector at a group, or its size for the scale."""
+    at_groups = np.linalg.norm(violation[:-1].reshape(-1, dimension), axis=1)
+    return float(max(at_groups.max(), abs(violation[-1])))
 
 
 def _balanced(
-    graph: ViewGraph, bodies: Bodies, locations: FloatArray, y: FloatArray, c: FloatArray, allowed: float
+    graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray, c: FloatArray, allowed: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return the dual moved to A^T D^T y = lambda A^T c, and A^T D^T y."""
-    n, d = graph.num_cameras, graph.dimension
-    total = bodies.reduce(adjoint(y, graph.edges, n))
+    n, d = graph.num_nodes, graph.dimension
+    total = groups.reduce(adjoint(y, graph.edges, n))
     multiplier = float(total @ c / (c @ c))
     if _largest(total - multiplier * c, d) <= allowed:
         return y, total
     stiffness = _stiffness(graph, locations)
-    system = _projected_system(graph, bodies, locations, stiffness, c)
+    system = _projected_system(graph, groups, locations, stiffness, c)
     for _ in range(_REPAIRS):
         multiplier, h = system.balance(total)
-        moved = across(differences(bodies.expand(h), graph.edges), graph.directions)
+        moved = across(differences(groups.expand(h), graph.edges), graph.directions)
         y = across(y - stiffness[:, None] * moved, graph.directions)
-        total = bodies.reduce(adjoint(y, graph.edges, n))
+        total = groups.reduce(adjoint(y, graph.edges, n))
         if _largest(total - multiplier * c, d) <= allowed:
             break
     return y, total
@@ -127,7 +132,7 @@ def _stiffness(graph: ViewGraph, locations: FloatArray) -> FloatArray:
 
 
 def _projected_system(
-    graph: ViewGraph, bodies: Bodies, locations: FloatArray, stiffness: FloatArray, c: FloatArray
+    graph: ViewGraph, groups: RigidGroups, locations: FloatArray, stiffness: FloatArray, c: FloatArray
 ) -> System:
     """Factor A^T D^T S P D A with its longest pair pinned."""
     v = graph.directions
@@ -136,13 +141,13 @@ def _projected_system(
     tau = float(np.mean(stiffness))
     blocks[longest] += tau * np.outer(v[longest], v[longest])
     i, j = graph.edges[longest].tolist()
-    system = factor_pinned(ReducedFactor(graph.edges, bodies), blocks, c, ((i, j), v[longest]), tau)
+    system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, ((i, j), v[longest]), tau)
     if system is None:
-        raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the bodies")
+        raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
     return system
 
 
-def _is_unique(graph: ViewGraph, bodies: Bodies, locations: FloatArray, y: FloatArray) -> bool:
+def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray) -> bool:
     """Return whether the feasible dual excludes other optima, up to translation and scale."""
     v, w = graph.directions, graph.weights
     norms = np.linalg.norm(y, axis=1)
@@ -152,7 +157,7 @@ def _is_unique(graph: ViewGraph, bodies: Bodies, locations: FloatArray, y: Float
     blocks = w[:, None, None] * conditions
     longest = int(np.argmax(along(differences(locations, graph.edges), v)))
     blocks[longest] += w[longest] * np.outer(v[longest], v[longest])
-    factor = ReducedFactor(graph.edges, bodies)
+    factor = ReducedFactor(graph.edges, groups)
     try:
         factor.refactor(blocks)
     except UnsolvableError:

@@ -1,18 +1,18 @@
-"""Rigid bodies of cameras: rigs, whose frames are the unknowns, and cameras that must stay where they are.
+"""Rigid groups of cameras: rigs, whose frames are the unknowns, and cameras that must stay where they are.
 
-Camera k belongs to body b(k) and stands at a known offset from its body's centre, in world axes and in one
-unit that all bodies share:
+Camera k belongs to group b(k) and stands at a known offset from its group's centre, in world axes and in one
+unit that all groups share:
 
     t_k = f_b(k) + s o_k
 
-Unknown are the centres f_b of the bodies and s, the length of that unit in the scale of t. So t = A x is
+Unknown are the centres f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
 linear in x = (f, s), and dividing by s gives the centres in the unit of the offsets.
 
-    rig            a frame is a body; o_k = R_frame^T (centre of the sensor in the rig), metric
-    fixed cameras  all of them are one body; o_k = their given centres
-    other camera   a body of its own; o_k = 0
+    rig            a frame is a group; o_k = R_frame^T (centre of the sensor in the rig), metric
+    fixed cameras  all of them are one group; o_k = their given centres
+    other camera   a group of its own; o_k = 0
 
-Rotations are known throughout, so a body only moves, it does not turn.
+Rotations are known throughout, so a group only moves, it does not turn.
 """
 
 from dataclasses import dataclass
@@ -22,24 +22,24 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
 
-_COINCIDENT = 1e-12  # offset from its body's other cameras, of the largest one, that counts as none
+_COINCIDENT = 1e-12  # offset from its group's other cameras, of the largest one, that counts as none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Bodies:
-    """Which body each node of a graph belongs to, and where it stands in it."""
+class RigidGroups:
+    """Which group each node of a graph belongs to, and where it stands in it."""
 
-    body_of: IntArray
-    """(n,) the body of each node, 0..B-1, none of them empty."""
+    group_of: IntArray
+    """(n,) the group of each node, 0..B-1, none of them empty."""
     offsets: FloatArray
-    """(n, d) o_k, world axes; all bodies in one unit."""
+    """(n, d) o_k, world axes; all groups in one unit."""
 
     def __post_init__(self) -> None:
-        labels = np.array(self.body_of, dtype=np.int64)
+        labels = np.array(self.group_of, dtype=np.int64)
         offsets = np.array(self.offsets, dtype=np.float64)
         if labels.ndim != 1 or offsets.ndim != 2 or len(labels) != len(offsets):
             raise InputError(
-                f"bodies have {labels.shape} labels and {offsets.shape} offsets; give one row per node"
+                f"groups have {labels.shape} labels and {offsets.shape} offsets; give one row per node"
             )
         if not np.isfinite(offsets).all():
             raise InputError(
@@ -47,113 +47,113 @@ class Bodies:
             )
         present = np.unique(labels)
         if not np.array_equal(present, np.arange(len(present))):
-            raise InputError("bodies must be numbered 0, 1, ... without gaps")
-        object.__setattr__(self, "body_of", frozen(labels))
+            raise InputError("groups must be numbered 0, 1, ... without gaps")
+        object.__setattr__(self, "group_of", frozen(labels))
         object.__setattr__(self, "offsets", frozen(offsets))
 
     @property
     def num_nodes(self) -> int:
         """Number of nodes, n."""
-        return len(self.body_of)
+        return len(self.group_of)
 
     @property
-    def num_bodies(self) -> int:
-        """Number of bodies, B."""
-        return int(self.body_of.max(initial=-1) + 1)
+    def num_groups(self) -> int:
+        """Number of groups, B."""
+        return int(self.group_of.max(initial=-1) + 1)
 
     @property
     def num_unknowns(self) -> int:
         """Length of x, B d + 1."""
-        return int(self.num_bodies * self.offsets.shape[1] + 1)
+        return int(self.num_groups * self.offsets.shape[1] + 1)
 
     def expand(self, x: FloatArray) -> FloatArray:
         """Return A x, the locations (n, d) for x = (f, s)."""
         centres = x[:-1].reshape(-1, self.offsets.shape[1])
-        return np.asarray(centres[self.body_of] + x[-1] * self.offsets)
+        return np.asarray(centres[self.group_of] + x[-1] * self.offsets)
 
     def reduce(self, g: FloatArray) -> FloatArray:
-        """Return A^T g for g (n, d): its sum over each body, and its inner product with the offsets."""
+        """Return A^T g for g (n, d): its sum over each group, and its inner product with the offsets."""
         sums = np.stack(
-            [np.bincount(self.body_of, column, minlength=self.num_bodies) for column in g.T], axis=1
+            [np.bincount(self.group_of, column, minlength=self.num_groups) for column in g.T], axis=1
         )
         return np.append(sums.ravel(), np.vdot(g, self.offsets))
 
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
         """Return the x whose A x is nearest to locations (n, d), and its largest distance from them.
 
-        s is 0 if every body stands at a single point.
+        s is 0 if every group stands at a single point.
         """
         centred = self.centred()
         spread = float(np.sum(centred.offsets**2))
-        sums = np.zeros((self.num_bodies, locations.shape[1]))
-        np.add.at(sums, self.body_of, locations)
-        sizes = np.bincount(self.body_of)[:, None]
+        sums = np.zeros((self.num_groups, locations.shape[1]))
+        np.add.at(sums, self.group_of, locations)
+        sizes = np.bincount(self.group_of)[:, None]
         s = float(np.vdot(centred.offsets, locations)) / spread if spread > 0.0 else 0.0
         means = np.zeros_like(sums)
-        np.add.at(means, self.body_of, self.offsets)
+        np.add.at(means, self.group_of, self.offsets)
         x = np.append(((sums - s * means) / sizes).ravel(), s)
         apart = np.linalg.norm(self.expand(x) - locations, axis=1)
         return x, float(apart.max(initial=0.0))
 
-    def centred(self) -> "Bodies":
-        """Return the same bodies with the mean offset of each at 0, and what is rounding exactly 0."""
-        sums = np.zeros((self.num_bodies, self.offsets.shape[1]))
-        np.add.at(sums, self.body_of, self.offsets)
-        moved = self.offsets - (sums / np.bincount(self.body_of)[:, None])[self.body_of]
+    def centred(self) -> "RigidGroups":
+        """Return the same groups with the mean offset of each at 0, and what is rounding exactly 0."""
+        sums = np.zeros((self.num_groups, self.offsets.shape[1]))
+        np.add.at(sums, self.group_of, self.offsets)
+        moved = self.offsets - (sums / np.bincount(self.group_of)[:, None])[self.group_of]
         sizes = np.linalg.norm(moved, axis=1)
         largest = float(np.abs(self.offsets).max(initial=0.0))
         moved[sizes <= _COINCIDENT * largest] = 0.0
-        return Bodies(body_of=self.body_of, offsets=moved)
+        return RigidGroups(group_of=self.group_of, offsets=moved)
 
-    def normalised(self) -> "Bodies":
-        """Return the same bodies centred, in a unit in which offsets have root mean square 1 unless all are
+    def normalised(self) -> "RigidGroups":
+        """Return the same groups centred, in a unit in which offsets have root mean square 1 unless all are
         0."""
         centred = self.centred()
         moved = np.linalg.norm(centred.offsets, axis=1)
         size = float(np.sqrt(np.mean(moved[moved > 0.0] ** 2))) if moved.any() else 1.0
-        return Bodies(body_of=self.body_of, offsets=centred.offsets / size)
+        return RigidGroups(group_of=self.group_of, offsets=centred.offsets / size)
 
-    def restricted_to(self, nodes: IntArray) -> "Bodies":
-        """Return the bodies of some nodes, renumbered in the same order."""
-        _, labels = np.unique(self.body_of[nodes], return_inverse=True)
-        return Bodies(body_of=labels.ravel(), offsets=self.offsets[nodes])
+    def restricted_to(self, nodes: IntArray) -> "RigidGroups":
+        """Return the groups of some nodes, renumbered in the same order."""
+        _, labels = np.unique(self.group_of[nodes], return_inverse=True)
+        return RigidGroups(group_of=labels.ravel(), offsets=self.offsets[nodes])
 
     def joins(self, edges: IntArray) -> BoolArray:
-        """Return which edges (m, 2) join two bodies; those inside one say nothing of any unknown."""
-        ends = self.body_of[edges]
+        """Return which edges (m, 2) join two groups; those inside one say nothing of any unknown."""
+        ends = self.group_of[edges]
         return np.asarray(ends[:, 0] != ends[:, 1])
 
-    def with_separate(self, count: int) -> "Bodies":
-        """Return the bodies with so many further nodes, such as 3D points, each a body of its own."""
-        labels = self.num_bodies + np.arange(count)
-        return Bodies(
-            body_of=np.concatenate([self.body_of, labels]),
+    def with_separate(self, count: int) -> "RigidGroups":
+        """Return the groups with so many further nodes, such as 3D points, each a group of its own."""
+        labels = self.num_groups + np.arange(count)
+        return RigidGroups(
+            group_of=np.concatenate([self.group_of, labels]),
             offsets=np.concatenate([self.offsets, np.zeros((count, self.offsets.shape[1]))]),
         )
 
-    def with_fixed(self, fixed: BoolArray, centers: FloatArray) -> "Bodies":
-        """Return the bodies with all of those that hold a fixed node joined to one, the first.
+    def with_fixed(self, fixed: BoolArray, centers: FloatArray) -> "RigidGroups":
+        """Return the groups with all of those that hold a fixed node joined to one, the first.
 
         Args:
             fixed: (n,) the nodes that keep their centres relative to each other.
-            centers: (n, d) in the unit of the offsets; those of nodes that share no body with a fixed one
+            centers: (n, d) in the unit of the offsets; those of nodes that share no group with a fixed one
                 are not read.
         """
-        whole = np.zeros(self.num_bodies, dtype=np.bool_)
-        whole[self.body_of[fixed]] = True
-        members = whole[self.body_of]
+        whole = np.zeros(self.num_groups, dtype=np.bool_)
+        whole[self.group_of[fixed]] = True
+        members = whole[self.group_of]
         if not members.any():
             return self
         offsets = self.offsets.copy()
         origin = centers[members].mean(axis=0)
-        anchors = np.zeros((self.num_bodies, offsets.shape[1]))
-        first = np.flatnonzero(fixed)[::-1]  # the first fixed node of each body says where it stands
-        anchors[self.body_of[first]] = centers[first] - self.offsets[first]
-        offsets[members] += anchors[self.body_of[members]] - origin
-        _, labels = np.unique(np.where(members, -1, self.body_of), return_inverse=True)
-        return Bodies(body_of=labels.ravel(), offsets=offsets)
+        anchors = np.zeros((self.num_groups, offsets.shape[1]))
+        first = np.flatnonzero(fixed)[::-1]  # the first fixed node of each group says where it stands
+        anchors[self.group_of[first]] = centers[first] - self.offsets[first]
+        offsets[members] += anchors[self.group_of[members]] - origin
+        _, labels = np.unique(np.where(members, -1, self.group_of), return_inverse=True)
+        return RigidGroups(group_of=labels.ravel(), offsets=offsets)
 
 
-def separate(num_nodes: int, dimension: int) -> Bodies:
-    """Return so many nodes, each a body of its own."""
-    return Bodies(body_of=np.arange(num_nodes), offsets=np.zeros((num_nodes, dimension)))
+def separate(num_nodes: int, dimension: int) -> RigidGroups:
+    """Return so many nodes, each a group of its own."""
+    return RigidGroups(group_of=np.arange(num_nodes), offsets=np.zeros((num_nodes, dimension)))

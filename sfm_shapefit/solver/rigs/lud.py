@@ -1,4 +1,4 @@
-"""LUD over bodies: the convex start that does not collapse on long chains, see `solver.splitting.lud`.
+"""LUD over groups: the convex start that does not collapse on long chains, see `solver.splitting.lud`.
 
     minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1,  t = A x
 
@@ -18,7 +18,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.program import adjoint, along, differences
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -28,24 +28,24 @@ _RELAXATION = 1.6
 _STEPS = 150
 
 
-def lud_over_bodies(graph: ViewGraph, bodies: Bodies, steps: int = _STEPS) -> FloatArray | None:
+def lud_over_groups(graph: ViewGraph, groups: RigidGroups, steps: int = _STEPS) -> FloatArray | None:
     """Return LUD's locations (n, d), centred, after some steps; None if the system breaks down.
 
     Args:
-        graph: connected over the bodies; every pair joins two of them.
-        bodies: of its nodes.
+        graph: connected over the groups; every pair joins two of them.
+        groups: of its nodes.
         steps: of the splitting.
     """
     edges, v, w = graph.edges, graph.directions, graph.weights
-    factor = ReducedFactor(edges, bodies.normalised())
+    factor = ReducedFactor(edges, groups.normalised())
     try:
         factor.refactor(w[:, None, None] * np.eye(graph.dimension))
     except UnsolvableError:
         return None
     z, u = _LEAST_LENGTH * v, np.zeros_like(v)
-    t = np.zeros((graph.num_cameras, graph.dimension))
+    t = np.zeros((graph.num_nodes, graph.dimension))
     for _ in range(steps):
-        t = factor.solve(adjoint(w[:, None] * (z - u), edges, graph.num_cameras))
+        t = factor.solve(adjoint(w[:, None] * (z - u), edges, graph.num_nodes))
         relaxed = _RELAXATION * differences(t, edges) + (1.0 - _RELAXATION) * z
         z = _towards_rays(relaxed + u, v)
         u = u + relaxed - z

@@ -1,6 +1,6 @@
-"""Primal-dual Newton steps over bodies: the steps of `newton`, with the matrix and the balance reduced by A.
+"""Primal-dual Newton steps over groups: the steps of `newton`, with the matrix and the balance reduced by A.
 
-A step of the bodies is a step of their nodes, dT = A dx, and everything per pair (residuals, the
+A step of the groups is a step of their nodes, dT = A dx, and everything per pair (residuals, the
 linearisation, the dual y+, the two step lengths) is that of `newton.steps`. Only the equations for the step
 differ:
 
@@ -42,8 +42,8 @@ from sfm_shapefit.solver.newton.steps import (
 )
 from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
 from sfm_shapefit.solver.program import along, differences, normalized_locations, projected_length
-from sfm_shapefit.solver.rigs.certificate import certify_bodies
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.certificate import certify_groups
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor, System, factor_pinned
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -54,36 +54,36 @@ _CANCEL = 1e-12  # size of A^T c, of the sum of weights, that is rounding
 
 
 @one_blas_thread()
-def solve_bodies(graph: ViewGraph, bodies: Bodies, options: SolverOptions | None = None) -> SolverResult:
-    """Solve ShapeFit over bodies, with a certificate.
+def solve_groups(graph: ViewGraph, groups: RigidGroups, options: SolverOptions | None = None) -> SolverResult:
+    """Solve ShapeFit over groups, with a certificate.
 
     Args:
-        graph: a view graph; pairs inside a body take no part.
-        bodies: of its nodes, tied to one another by the pairs between them (`largest_tied`).
+        graph: a view graph; pairs inside a group take no part.
+        groups: of its nodes, tied to one another by the pairs between them (`largest_tied`).
         options: `tol` and `max_iterations` are read; there is one method.
 
     Returns:
-        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a body. The equality
-        that holds for it is the balance per body and that for the scale; `equality_residual` is its largest
+        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group. The equality
+        that holds for it is the balance per group and that for the scale; `equality_residual` is its largest
         violation.
 
     Raises:
-        UnsolvableError: if no pair joins two bodies, or the pairs do not determine the bodies.
+        UnsolvableError: if no pair joins two groups, or the pairs do not determine the groups.
     """
     options = options or SolverOptions()
     begin = time.perf_counter()
-    outer = bodies.joins(graph.edges)
+    outer = groups.joins(graph.edges)
     if not outer.any():
-        raise UnsolvableError("no pair joins two bodies, so that nothing can be placed")
-    between = ViewGraph(graph.num_cameras, graph.edges[outer], graph.directions[outer], graph.weights[outer])
+        raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
+    between = ViewGraph(graph.num_nodes, graph.edges[outer], graph.directions[outer], graph.weights[outer])
     limit = options.max_iterations or _MAX_ITERATIONS
-    locations, dual, iterations = _solve(between, bodies.normalised(), options.tol, limit)
+    locations, dual, iterations = _solve(between, groups.normalised(), options.tol, limit)
     if not (np.isfinite(locations).all() and projected_length(between, locations) > 0.0):
         raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
     locations = normalized_locations(between, locations)
     every = np.zeros_like(graph.directions)
     every[outer] = dual
-    certificate = certify_bodies(graph, bodies, locations, every, uniqueness=options.uniqueness)
+    certificate = certify_groups(graph, groups, locations, every, uniqueness=options.uniqueness)
     converged = certificate.gap <= options.tol and certificate.equality_residual <= _LARGEST_RESIDUAL
     unfinished = Status.MAX_ITERATIONS if iterations >= limit else Status.INACCURATE
     return SolverResult(
@@ -97,22 +97,22 @@ def solve_bodies(graph: ViewGraph, bodies: Bodies, options: SolverOptions | None
         iterations=iterations,
         seconds=time.perf_counter() - begin,
         method="newton",
-        method_reason=f"{graph.num_cameras} nodes in {bodies.num_bodies} bodies",
+        method_reason=f"{graph.num_nodes} nodes in {groups.num_groups} groups",
     )
 
 
 def _solve(
-    graph: ViewGraph, bodies: Bodies, tol: float, max_iterations: int
+    graph: ViewGraph, groups: RigidGroups, tol: float, max_iterations: int
 ) -> tuple[FloatArray, FloatArray, int]:
     """Return locations, dual, and the number of factorisations."""
     problem, iterate, model, step = allocate(graph)
-    if not np.linalg.norm(bodies.reduce(problem.c)) > _CANCEL * problem.kappa:
-        raise UnsolvableError("the directions cancel at every body, so no scale can be fixed")
-    factor = ReducedFactor(graph.edges, bodies)
+    if not np.linalg.norm(groups.reduce(problem.c)) > _CANCEL * problem.kappa:
+        raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
+    factor = ReducedFactor(graph.edges, groups)
     system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
-    start = None if system is None else system.solve(np.zeros(bodies.num_unknowns), 1.0)[1]
-    if start is None or not start_from(problem, bodies.expand(start), iterate):
-        raise UnsolvableError("the directions do not determine the bodies; check which of them hang free")
+    start = None if system is None else system.solve(np.zeros(groups.num_unknowns), 1.0)[1]
+    if start is None or not start_from(problem, groups.expand(start), iterate):
+        raise UnsolvableError("the directions do not determine the groups; check which of them hang free")
     progress = measured(problem, iterate)
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -166,20 +166,20 @@ def _propose(
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
-    bodies, c = system.factor.bodies, system.rows[0]
+    groups, c = system.factor.groups, system.rows[0]
     allowed = allowed_violation(problem, gap)
     set_gradient(problem, iterate, model, mu, step)
     drift = problem.kappa - dot(problem.c, iterate.t)
-    multiplier, dx = system.solve(-bodies.reduce(step.nodes), drift)
-    extend_step(problem, model, bodies.expand(dx), step)
+    multiplier, dx = system.solve(-groups.reduce(step.nodes), drift)
+    extend_step(problem, model, groups.expand(dx), step)
     for _ in range(REFINEMENTS):
-        violation = multiplier * c - bodies.reduce(step.nodes)
+        violation = multiplier * c - groups.reduce(step.nodes)
         if np.abs(violation).max() <= allowed:
             return multiplier, True
         shift, dx = system.solve(violation, drift - dot(problem.c, step.t))
         multiplier += shift
-        extend_step(problem, model, bodies.expand(dx), step)
-    return multiplier, bool(np.abs(multiplier * c - bodies.reduce(step.nodes)).max() <= allowed)
+        extend_step(problem, model, groups.expand(dx), step)
+    return multiplier, bool(np.abs(multiplier * c - groups.reduce(step.nodes)).max() <= allowed)
 
 
 def _factorise(problem: Problem, model: Model, factor: ReducedFactor, pinned: int) -> System | None:
@@ -189,7 +189,7 @@ def _factorise(problem: Problem, model: Model, factor: ReducedFactor, pinned: in
     scale = problem.w * model.inverse
     stiffness = float(np.mean(scale))
     across = problem.basis @ model.s @ problem.basis.transpose(0, 2, 1)
-    c = factor.bodies.reduce(problem.c)
+    c = factor.groups.reduce(problem.c)
     for ridge in _RIDGES:
         blocks = across + (ridge * scale)[:, None, None] * np.eye(len(v))
         blocks[pinned] += stiffness * np.outer(v, v)

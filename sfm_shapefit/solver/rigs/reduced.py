@@ -1,13 +1,13 @@
-"""The normal matrix of bodies, A^T D^T S D A, factored: a block Laplacian with one dense row for the scale.
+"""The normal matrix of groups, A^T D^T S D A, factored: a block Laplacian with one dense row for the scale.
 
 Over x = (f, s) the matrix of edge blocks S_e is
 
-    [ K    h   ]     K    the Laplacian of S_e on the graph of bodies, repeated pairs added up
-    [ h^T  eta ]     h    at each body the sum of its signed S_e (o_i - o_j)
+    [ K    h   ]     K    the Laplacian of S_e on the graph of groups, repeated pairs added up
+    [ h^T  eta ]     h    at each group the sum of its signed S_e (o_i - o_j)
                      eta  sum_e (o_i - o_j)^T S_e (o_i - o_j)
 
-K is factored in d x d blocks, sparse as the graph of bodies is; what remains for s is the Schur complement
-eta - h^T K^-1 h. Translations are taken away by grounding one body.
+K is factored in d x d blocks, sparse as the graph of groups is; what remains for s is the Schur complement
+eta - h^T K^-1 h. Translations are taken away by grounding one group.
 
 Along the solution itself the matrix tends to singular, whatever the data. `System` therefore works with the
 matrix of S_e + tau v v^T for one pinned pair and takes that term away again, exactly, as `newton.sparse`
@@ -21,31 +21,31 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor, analyse
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 
-_LEAST_SCHUR = 1e-13  # of eta: what is left of s when all bodies may move, below which it is rounding
+_LEAST_SCHUR = 1e-13  # of eta: what is left of s when all groups may move, below which it is rounding
 
 
 class ReducedFactor:
     """Memory for the factor of A^T D^T S D A; `refactor` overwrites it, `solve` reads it.
 
     It answers in locations, A (A^T D^T S D A)^-1 A^T g, so that whatever works with a Laplacian of cameras
-    works with bodies.
+    works with groups.
     """
 
-    def __init__(self, edges: IntArray, bodies: Bodies) -> None:
+    def __init__(self, edges: IntArray, groups: RigidGroups) -> None:
         """Plan the factorisation.
 
         Args:
-            edges: (m, 2) pairs of nodes, each of two different bodies, which they connect.
-            bodies: of the nodes; offsets best centred.
+            edges: (m, 2) pairs of nodes, each of two different groups, which they connect.
+            groups: of the nodes; offsets best centred.
         """
-        self.bodies = bodies
-        self._ends = np.ascontiguousarray(bodies.body_of[edges])
-        self._offsets = bodies.offsets[edges[:, 0]] - bodies.offsets[edges[:, 1]]
+        self.groups = groups
+        self._ends = np.ascontiguousarray(groups.group_of[edges])
+        self._offsets = groups.offsets[edges[:, 0]] - groups.offsets[edges[:, 1]]
         self._metric = bool(self._offsets.any())
-        dimension = bodies.offsets.shape[1]
-        self.factor: CholeskyFactor = allocate_factor(analyse(bodies.num_bodies, self._ends), dimension)
+        dimension = groups.offsets.shape[1]
+        self.factor: CholeskyFactor = allocate_factor(analyse(groups.num_groups, self._ends), dimension)
         self.smallest_pivot = 0.0
         """Least pivot relative to its diagonal entry, that of s included; see `refactor`."""
 
@@ -58,7 +58,7 @@ class ReducedFactor:
         self.factor.refactor(blocks)
         self.smallest_pivot = self.factor.smallest_pivot
         bent = np.einsum("eab,eb->ea", blocks, self._offsets)
-        self._row = self._at_bodies(bent)
+        self._row = self._at_groups(bent)
         eta = float(np.vdot(bent, self._offsets))
         if not self._metric:
             self._column, self._schur = np.zeros_like(self._row), np.inf
@@ -66,7 +66,7 @@ class ReducedFactor:
         self._column = self.factor.solve(self._row)
         self._schur = eta - float(np.vdot(self._row, self._column))
         if not self._schur > _LEAST_SCHUR * eta:
-            raise UnsolvableError("the offsets inside the bodies do not determine a scale")
+            raise UnsolvableError("the offsets inside the groups do not determine a scale")
         self.smallest_pivot = min(self.smallest_pivot, self._schur / eta)
 
     def solve_reduced(self, right: FloatArray) -> FloatArray:
@@ -77,11 +77,11 @@ class ReducedFactor:
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return A x for the x of the right-hand side A^T right, both (n, d)."""
-        return self.bodies.expand(self.solve_reduced(self.bodies.reduce(right)))
+        return self.groups.expand(self.solve_reduced(self.groups.reduce(right)))
 
-    def _at_bodies(self, values: FloatArray) -> FloatArray:
-        """Return the sum of the signed values (m, d) at each body, (B, d)."""
-        count, ends = self.bodies.num_bodies, self._ends
+    def _at_groups(self, values: FloatArray) -> FloatArray:
+        """Return the sum of the signed values (m, d) at each group, (B, d)."""
+        count, ends = self.groups.num_groups, self._ends
         sums = [
             np.bincount(ends[:, 0], column, minlength=count)
             - np.bincount(ends[:, 1], column, minlength=count)
@@ -133,9 +133,9 @@ def factor_pinned(
         stiffness: tau.
     """
     (i, j), v = pin
-    at_nodes = np.zeros((factor.bodies.num_nodes, len(v)))
+    at_nodes = np.zeros((factor.groups.num_nodes, len(v)))
     at_nodes[i], at_nodes[j] = v, -v
-    q = factor.bodies.reduce(at_nodes)
+    q = factor.groups.reduce(at_nodes)
     try:
         factor.refactor(blocks)
     except UnsolvableError:

@@ -1,15 +1,15 @@
-"""Which bodies the pairs tie to one another once the scale s is known, and which hang free.
+"""Which groups the pairs tie to one another once the scale s is known, and which hang free.
 
 With s held, x moves along f alone, and a motion that no pair notices is a null vector of K, the Laplacian of
-the bodies with blocks P_e = I - u_e u_e^T, u_e the directions of the baselines. Two bodies are tied if every
-null vector moves both alike: an equivalence relation, whose classes are the sets of bodies that keep their
-places relative to one another. If all bodies are in one class, s and f are determined up to translation and
+the groups with blocks P_e = I - u_e u_e^T, u_e the directions of the baselines. Two groups are tied if every
+null vector moves both alike: an equivalence relation, whose classes are the sets of groups that keep their
+places relative to one another. If all groups are in one class, s and f are determined up to translation and
 one common factor: a null vector that changes s is the solution itself, plus one that does not.
 
 Random null vectors tell the classes with probability 1: z <- (K + eps N)^-1 eps N z with N the plain
 Laplacian tends to the projection of z on the null space. That is a sparse solve or a few, at any size.
 
-Whether pairs tie bodies in general is asked at random positions with the given offsets, for a body's offsets
+Whether pairs tie groups in general is asked at random positions with the given offsets, for a group's offsets
 are part of the problem and not general; whether they do at a solution, at its baselines.
 """
 
@@ -21,49 +21,49 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import Bodies
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 
 _EPSILON = 1e-10
 _STEPS = 4
 _PROBES = 3
-_ALIKE = 1e-3  # of the unit normal draws: null vectors that move two bodies so alike move both the same
+_ALIKE = 1e-3  # of the unit normal draws: null vectors that move two groups so alike move both the same
 _SEED = 0
 
 
 def largest_tied(
     edges: IntArray,
-    bodies: Bodies,
+    groups: RigidGroups,
     sizes: IntArray,
     locations: FloatArray | None = None,
     around: int | None = None,
 ) -> IntArray:
-    """Return the largest set of bodies, ascending, that the pairs tie to one another if s is known.
+    """Return the largest set of groups, ascending, that the pairs tie to one another if s is known.
 
     Args:
-        edges: (m, 2) pairs of nodes; those inside a body are ignored.
-        bodies: of the nodes.
-        sizes: (B,) what counts of each body, such as its number of cameras; sets are compared by their sum.
-        locations: (n, d) where they are asked about; random positions with the bodies' offsets if None.
-        around: a body; then the set that holds it, whatever its size.
+        edges: (m, 2) pairs of nodes; those inside a group are ignored.
+        groups: of the nodes.
+        sizes: (B,) what counts of each group, such as its number of cameras; sets are compared by their sum.
+        locations: (n, d) where they are asked about; random positions with the groups' offsets if None.
+        around: a group; then the set that holds it, whatever its size.
 
     Returns:
-        (k,) bodies; a single one if no pair ties any two.
+        (k,) groups; a single one if no pair ties any two.
     """
-    used = edges[bodies.joins(edges)]
+    used = edges[groups.joins(edges)]
     if locations is None:
-        locations = general_positions(bodies)
+        locations = general_positions(groups)
     if around is not None:  # outweighs all others together
-        sizes = np.where(np.arange(bodies.num_bodies) == around, sizes.sum() + 1, sizes)
+        sizes = np.where(np.arange(groups.num_groups) == around, sizes.sum() + 1, sizes)
     best = np.array([int(np.argmax(sizes))])
-    ends = bodies.body_of[used]
-    for members in _components(ends, bodies.num_bodies):
+    ends = groups.group_of[used]
+    for members in _components(ends, groups.num_groups):
         if len(members) < 2 or sizes[members].sum() <= sizes[best].sum():
             continue
         inside = np.isin(ends[:, 0], members)
         nodes, renumbered = np.unique(used[inside], return_inverse=True)
-        part = bodies.restricted_to(nodes)
-        names = np.unique(bodies.body_of[nodes])
+        part = groups.restricted_to(nodes)
+        names = np.unique(groups.group_of[nodes])
         motions = _null_motions(renumbered.reshape(-1, 2), part, locations[nodes])
         tied = names[_largest_alike(motions, sizes[names])]
         if sizes[tied].sum() > sizes[best].sum():
@@ -71,38 +71,38 @@ def largest_tied(
     return best
 
 
-def general_positions(bodies: Bodies) -> FloatArray:
-    """Return random locations of the bodies, at distances comparable to the size of their offsets."""
-    unit = bodies.normalised()
+def general_positions(groups: RigidGroups) -> FloatArray:
+    """Return random locations of the groups, at distances comparable to the size of their offsets."""
+    unit = groups.normalised()
     x = np.random.default_rng(_SEED).standard_normal(unit.num_unknowns)
     x[-1] = 1.0
     return unit.expand(x)
 
 
 def _components(ends: IntArray, count: int) -> list[IntArray]:
-    """Return the connected components of the graph of bodies."""
+    """Return the connected components of the graph of groups."""
     links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
     labels = connected_components(links, directed=False)[1]
     order = np.argsort(labels, kind="stable")
     return np.split(order.astype(np.int64), np.cumsum(np.bincount(labels))[:-1])
 
 
-def _null_motions(edges: IntArray, bodies: Bodies, locations: FloatArray) -> FloatArray:
-    """Return random null vectors of K for connected bodies, (B, d * probes), up to a translation each."""
+def _null_motions(edges: IntArray, groups: RigidGroups, locations: FloatArray) -> FloatArray:
+    """Return random null vectors of K for connected groups, (B, d * probes), up to a translation each."""
     d = locations.shape[1]
-    still = Bodies(body_of=bodies.body_of, offsets=np.zeros_like(locations))
+    still = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(locations))
     u = normalized(differences(locations, edges))  # NaN where two nodes coincide, which says nothing
     blocks = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :])
     factor = ReducedFactor(edges, still)
     try:
         factor.refactor(blocks + _EPSILON * np.eye(d))
     except UnsolvableError:  # regular but for rounding: nothing can be told apart
-        return np.arange(bodies.num_bodies, dtype=np.float64)[:, None]
+        return np.arange(groups.num_groups, dtype=np.float64)[:, None]
     rng = np.random.default_rng(_SEED)
-    ends = bodies.body_of[edges]
+    ends = groups.group_of[edges]
     motions = []
     for _ in range(_PROBES):
-        z = rng.standard_normal((bodies.num_bodies, d))
+        z = rng.standard_normal((groups.num_groups, d))
         for _ in range(_STEPS):
             pull = np.zeros_like(z)
             np.add.at(pull, ends[:, 0], z[ends[:, 0]] - z[ends[:, 1]])

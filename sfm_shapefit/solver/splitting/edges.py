@@ -57,13 +57,13 @@ class EdgeData:
 
 def edge_data(graph: ViewGraph, least: float) -> EdgeData:
     """Return the edges of a graph, sorted and cut into chunks; shared with the graph if sorted already."""
-    keys = graph.edges[:, 0] * graph.num_cameras + graph.edges[:, 1]
+    keys = graph.edges[:, 0] * graph.num_nodes + graph.edges[:, 1]
     is_sorted = bool((keys[:-1] <= keys[1:]).all())
     order = slice(None) if is_sorted else frozen(np.argsort(keys, kind="stable"))
     m = graph.num_edges
     chunks = _CHUNKS if m >= _EDGES_WORTH_A_THREAD else 1
     return EdgeData(
-        num_nodes=graph.num_cameras,
+        num_nodes=graph.num_nodes,
         ends=graph.edges if is_sorted else frozen(graph.edges[order]),
         directions=graph.directions if is_sorted else frozen(graph.directions[order]),
         weights=graph.weights if is_sorted else frozen(graph.weights[order]),

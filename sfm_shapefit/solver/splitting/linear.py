@@ -112,12 +112,12 @@ def predict_factor(graph: ViewGraph, coordinates: FloatArray | None = None) -> P
     factor would take longer than it saves; some of them may have better separators than their levels, but
     approximate Cholesky serves them as well.
     """
-    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
-    if graph.num_cameras >= _LARGE:
+    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    if graph.num_nodes >= _LARGE:
         operator = LaplacianOperator(neighbours, graph.weights, Workers(1))
         if _diagonal_suffices(operator, JacobiPreconditioner(operator.diagonal())):
             return Prediction(None)
-    if graph.num_cameras >= _HUGE:
+    if graph.num_nodes >= _HUGE:
         rough_flops = 4.0 * (0.75 * widest_level(neighbours)) ** 3  # as on boxes of 1e4 and 1e5 cameras
         if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
             return Prediction(None)
@@ -144,7 +144,7 @@ def laplacian_factor(
         threads: of the factor; its answers do not depend on it.
     """
     tree = (predict_factor(graph, coordinates) if prediction is None else prediction).tree
-    neighbours = adjacency(graph.num_cameras, np.ascontiguousarray(graph.edges))
+    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
         return IterativeSolver(neighbours, threads)
     if tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes:

@@ -112,7 +112,7 @@ def solve_lud(
 
 def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner) -> tuple[float, float]:
     """Return the value of the feasible dual point nearest to `dual`, and its equality residual."""
-    v, w, n = graph.directions, graph.weights, graph.num_cameras
+    v, w, n = graph.directions, graph.weights, graph.num_nodes
     bound_active = along(dual, v) < -1e-6 * w
     for _ in range(_REPAIRS):
         y = _balanced(graph, dual, bound_active, precondition)
@@ -135,7 +135,7 @@ def _balanced(
     graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner
 ) -> FloatArray:
     """Return the dual moved to D^T y = 0, by all directions on `free` edges and across v on the others."""
-    edges, v, n = graph.edges, graph.directions, graph.num_cameras
+    edges, v, n = graph.edges, graph.directions, graph.num_nodes
 
     def allowed(z: FloatArray) -> FloatArray:
         return np.where(free[:, None], z, across(z, v))
