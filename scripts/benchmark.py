@@ -16,6 +16,7 @@ def subcommands() -> dict[str, ModuleType]:
     subcommands need, such as pycolmap, would count as memory of what is measured.
     """
     from benchmarks import (
+        answers,
         coherent,
         directions,
         endtoend,
@@ -51,6 +52,7 @@ def subcommands() -> dict[str, ModuleType]:
         "endtoend": endtoend,
         "forecast": forecasts,
         "partitioned": partitioned,
+        "answers": answers,
     }
 
 

@@ -16,6 +16,10 @@
     peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
     graph_peers.py    ... on bare graphs
     real_peers.py     ... on real scenes
+    answers.py   subcommand `answers`: what every command answers, recorded and compared
+    answer_cases.py       ... the cases
+    answer_inputs.py      ... what they are given
+    answer_differences.py    ... how two recordings differ
 
 A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.
 """
