@@ -83,7 +83,7 @@ def test_graphs_have_the_corruption_asked_for(random_graph, graph_of, street_gra
         assert len(graph_of(family, 60, q=0.1).locations) == 60
     with pytest.raises(ValueError, match="family must be one of ring"):
         graph_of("torus", 60)
-    assert street_graph(10).num_nodes == 10
+    assert street_graph(10).num_cameras == 10
 
 
 def moved(model: pycolmap.Reconstruction, meters: float) -> pycolmap.Reconstruction:

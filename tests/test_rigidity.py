@@ -343,17 +343,17 @@ def test_a_pair_given_twice_counts_once():
 def test_pieces_list_their_cameras_edges_and_hinges():
     edges = [*complete([0, 1, 2, 3]), *complete([3, 4, 5]), (5, 6)]
     first, second, pendant = rigid_pieces(graph_of(8, edges))
-    assert first.cameras.tolist() == [0, 1, 2, 3]
+    assert first.nodes.tolist() == [0, 1, 2, 3]
     assert first.edges.tolist() == [0, 1, 2, 3, 4, 5]
     assert first.hinges.tolist() == [3]
-    assert second.cameras.tolist() == [3, 4, 5]
+    assert second.nodes.tolist() == [3, 4, 5]
     assert second.edges.tolist() == [6, 7, 8]
     assert second.hinges.tolist() == [3]  # 5 is shared with a single pair only
-    assert pendant.cameras.tolist() == [5, 6]
+    assert pendant.nodes.tolist() == [5, 6]
     assert pendant.edges.tolist() == [9]
     assert pendant.hinges.tolist() == [5]
     with pytest.raises(ValueError, match="read-only"):
-        first.cameras[0] = 9
+        first.nodes[0] = 9
 
 
 def test_the_summary_follows_the_dimension_of_the_graph():
@@ -464,7 +464,7 @@ def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
     seen, place = [], rigidity.game._place_links
     monkeypatch.setattr(rigidity.game, "_place_links", lambda *given: seen.append(place(*given)) or seen[-1])
     game = rigidity.game.Game(
-        num_cameras=4,
+        num_nodes=4,
         ends=ends,
         copies=np.ones(6, np.int64),
         owner=np.arange(6),

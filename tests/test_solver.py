@@ -364,7 +364,7 @@ def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
 )
 def test_the_table_of_choices(method, n, share, flops, run, reason, monkeypatch):
     pairs = int(np.ceil(share * n * (n - 1) / 2))
-    graph = SimpleNamespace(num_cameras=n, dimension=3, num_edges=pairs)
+    graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=pairs)
     monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops))
     choice = solving.choose_method(graph, SolverOptions(method=method))
     assert getattr(choice.run, "func", choice.run).__name__ == run

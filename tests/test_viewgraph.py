@@ -74,8 +74,8 @@ def test_a_graph_is_a_value_that_neither_its_user_nor_its_inputs_can_change():
         ((2, [(0, 1)], [X, Y]), r"directions have shape \(2, 3\) for 1 edges"),
         ((2, [(0, 1)], [[1.0]]), r"directions have shape \(1, 1\)"),
         ((2, [(0, 1)], [X], None, ["a"]), "the graph has 2 cameras but 1 names"),
-        ((-1, np.zeros((0, 2), int), np.zeros((0, 3))), "num_cameras must be a whole number >= 0, got -1"),
-        ((2.5, [(0, 1)], [X]), r"num_cameras must be a whole number >= 0, got 2\.5"),
+        ((-1, np.zeros((0, 2), int), np.zeros((0, 3))), "num_nodes must be a whole number >= 0, got -1"),
+        ((2.5, [(0, 1)], [X]), r"num_nodes must be a whole number >= 0, got 2\.5"),
     ],
 )
 def test_bad_input_is_refused_by_name(arguments, message):
