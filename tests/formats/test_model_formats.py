@@ -16,7 +16,6 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from scenes import COURTYARD, RING
 from typer.testing import CliRunner
 
 import sfm_shapefit
@@ -30,6 +29,7 @@ from sfm_shapefit.formats.nerf import nerf_text
 from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
+from tests.scenes import COURTYARD, RING
 
 R = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 CENTERS = np.array([[1.0, 2.0, 3.0], [1.0, 0.0, 3.0]])

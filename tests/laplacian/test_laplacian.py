@@ -32,6 +32,7 @@ from sfm_shapefit.laplacian.operators import (
 )
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
 from tests.graph_families import FAMILIES, random_blocks, random_weights
+from tests.scenes import ROOT
 
 Array = npt.NDArray[np.float64]
 EPS = np.finfo(np.float64).eps
@@ -592,7 +593,6 @@ def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
 CHILD = """
 import json, sys, time
 import numpy as np
-sys.path.insert(0, sys.argv[1])
 from tests.graph_families import geo, random_weights
 from sfm_shapefit.laplacian.cholesky import analyse, factorise
 edges, t = geo(2000, 20.0, 1)
@@ -610,9 +610,9 @@ def run_child(cache: Path, blas_threads: int) -> dict:
     environment = os.environ | {
         "NUMBA_CACHE_DIR": str(cache),
         "OPENBLAS_NUM_THREADS": str(blas_threads),
-        "PYTHONPATH": str(Path(__file__).parents[1]),
+        "PYTHONPATH": str(ROOT),
     }
-    command = [sys.executable, "-c", CHILD, str(Path(__file__).parent)]
+    command = [sys.executable, "-c", CHILD]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
 

@@ -392,7 +392,7 @@ cli.main()
 
 def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):
     command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", "nowhere", str(tmp_path / "out")]
-    root = str(Path(__file__).parents[1])
+    root = str(ROOT)
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": root}
     )

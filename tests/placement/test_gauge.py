@@ -6,7 +6,6 @@ import sqlite3
 import numpy as np
 import pycolmap
 import pytest
-from scenes import RING
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -19,6 +18,7 @@ from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_g
 from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import RING
 
 RING_MODEL = RING / "sparse" / "0"
 TURN = Rotation.from_rotvec([0.4, -1.1, 0.7]).as_matrix()

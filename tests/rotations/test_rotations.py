@@ -1,7 +1,5 @@
 """Refining given rotations on the matches: the residual's derivatives, the minimum, and who may turn."""
 
-import sys
-
 import numpy as np
 import pycolmap
 import pytest
@@ -15,7 +13,7 @@ from sfm_shapefit.results import summary
 from sfm_shapefit.rotations import joint_refinement as epipolar
 from sfm_shapefit.rotations.acceptance import refine_rotations
 from sfm_shapefit.rotations.joint_refinement import RayMatches, State, at_state
-from tests.scenes import COURTYARD, RING, ROOT, real_scene
+from tests.scenes import COURTYARD, RING, real_scene
 
 PIXEL = 1e-3  # angle of a pixel in radians
 N = 10
@@ -263,7 +261,6 @@ def test_relative_poses_are_no_matches_to_refine_on():
 
 def test_averaged_rotations_of_a_real_scene_get_better():
     scene = real_scene("fountain-P11")
-    sys.path.insert(0, str(ROOT / "scripts"))
     from benchmarks.averaging import averaged_model
 
     model = averaged_model(scene / "database.db", scene / "sparse" / "0")

@@ -21,7 +21,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 
 EPS = np.finfo(np.float64).eps
-SHARED = Path(__file__).parents[1].parent / "shared" / "data"
+SHARED = Path(__file__).parents[2].parent / "shared" / "data"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 

@@ -6,7 +6,7 @@ import pytest
 from sfm_shapefit.report.page import write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
 from tests.made_scenes import made_scene
-from tests.test_report_page import HOSTILE
+from tests.report.test_report_page import HOSTILE
 
 HIGHLIGHT = """
     const [line, mark] = document.getElementById('scene').data.slice(-2);

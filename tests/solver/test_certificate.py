@@ -5,7 +5,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from graph_families import FAMILIES
 
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
@@ -20,6 +19,7 @@ from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
 from sfm_shapefit.solver.splitting.split_then_newton import Finish, HybridResult, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.graph_families import FAMILIES
 
 
 def unit(x):

@@ -6,7 +6,6 @@ from contextlib import closing
 
 import numpy as np
 import pytest
-from scenes import COURTYARD, RING, copied, fingerprint
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
@@ -18,6 +17,7 @@ from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_r
 from sfm_shapefit.commands.stages.averaging import averaged
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from tests.scenes import COURTYARD, RING, copied, fingerprint
 
 PAIR = 2147483647
 FAST = {"points": "never", "refine_rotations": False}

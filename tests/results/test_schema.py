@@ -7,11 +7,11 @@ from importlib import resources
 import jsonschema
 import numpy as np
 import pytest
-from scenes import BUNDLED, COURTYARD, RING
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
 from sfm_shapefit.synthetic import box_graph_problem
+from tests.scenes import BUNDLED, COURTYARD, RING
 
 RING_MODEL = RING / "sparse" / "0"
 SCHEMA = json.loads((resources.files("sfm_shapefit") / "schemas" / "output.schema.json").read_text("utf-8"))

@@ -16,8 +16,8 @@ from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene
 from tests.scenes import BUNDLED, real_scene
-from tests.test_onedsfm_format import egs_text, folder_with, rots_text, scene
 
 
 def solve(*arguments, code=0):

@@ -34,7 +34,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.workspace import write_workspace
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 SHAPES = ("ring", "facade", "drive", "cloud", "courtyard")
 
 
