@@ -55,10 +55,16 @@ def kernel(*, exact: bool = False, inline: bool = False) -> Callable[[Kernel], K
     """Compile a function with numba on its first call; the machine code is cached beside the source.
 
     With `inline` the source is copied into every kernel that calls it, and compiled as a part of it.
+
+    Raises:
+        TypeError: if the function closes over a value. What a closure holds is part of the key of the cache,
+            and the key of another kernel changes with every process: nothing would ever be found there.
     """
     fastmath: bool | set[str] = False if exact else _FASTMATH
 
     def decorate(function: Kernel) -> Kernel:
+        if getattr(function, "__closure__", None):
+            raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
         options = {"nogil": True, "error_model": "numpy", "fastmath": fastmath}
         options["inline"] = "always" if inline else "never"
         try:

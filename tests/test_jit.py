@@ -45,6 +45,55 @@ def test_compilations_are_told_once_and_only_where_there_are_any():
     assert told == ["compiling"]
 
 
+def test_a_kernel_that_closes_over_a_value_is_refused():
+    """Its key in the cache on disk would hold that value: for another kernel, one of this process only."""
+    factor = 2
+    with pytest.raises(TypeError, match="closes over a value"):
+
+        @kernel()
+        def scale(x):
+            return factor * x
+
+
+RUN_COMMANDS = """
+import sys
+import numba.core.event as events
+from sfm_shapefit.cli import app
+target, compiled = sys.argv[1], []
+
+class Names(events.Listener):
+    def on_start(self, event):
+        compiled.append(event.data["dispatcher"].py_func.__qualname__)
+    def on_end(self, event):
+        pass
+
+with events.install_listener("numba:compile", Names()):
+    for command in (
+        f"locate data_synthetic/courtyard/sparse/0 {target}/located -q",
+        f"evaluate {target}/located data_synthetic/courtyard/truth",
+        "inspect data_synthetic/courtyard/sparse/0",
+        f"solve data_synthetic/graph40.txt {target}/solved -q",
+        f"solve data_synthetic/graph40.txt {target}/split --method admm -q",
+    ):
+        app(command.split(), standalone_mode=False)
+print("compiled:", *compiled, file=sys.stderr)
+"""
+
+
+def test_a_second_process_compiles_nothing(tmp_path):
+    for process in ("first", "second"):
+        done = subprocess.run(
+            [sys.executable, "-c", RUN_COMMANDS, str(tmp_path / process)],
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=ROOT,
+        )
+        assert done.returncode == 0, done.stderr[-500:]
+    assert done.stderr.splitlines()[-1] == "compiled:"
+
+
 COMPILE = """
 from sfm_shapefit.jit import kernel, on_compilation
 def plus_one(x):

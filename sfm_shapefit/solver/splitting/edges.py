@@ -17,7 +17,7 @@ the order of the chunks: the result does not depend on the number of threads, to
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -53,6 +53,11 @@ class EdgeData:
     """(m,) index of each edge in the graph it came from; slice(None) where the order is the graph's."""
     bounds: tuple[int, ...]
     """Chunk k is the edges bounds[k]:bounds[k + 1]."""
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls loops over it."""
+        return tuple(range(self.directions.shape[1]))
 
 
 def edge_data(graph: ViewGraph, least: float) -> EdgeData:
@@ -103,11 +108,11 @@ class EdgePasses:
         Returns:
             D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
         """
-        data, run = self.data, _step(self.data.directions.shape[1])
+        data, axes = self.data, self.data.axes
 
         def chunk(k: int, first: int, last: int) -> None:
-            run(
-                first, last, data.ends, data.directions, data.weights, data.least,
+            _step(
+                axes, first, last, data.ends, data.directions, data.weights, data.least,
                 rho, relaxation, t, x, x_next, self._sums[k], self._totals[k],
             )  # fmt: skip
 
@@ -117,27 +122,32 @@ class EdgePasses:
 
     def pull(self, x: FloatArray, t: FloatArray, rho: FloatArray) -> FloatArray:
         """Return D^T rho (y - u - D t), (n, d): the right-hand side of the correction of t."""
-        data, run = self.data, _pull(self.data.directions.shape[1])
+        data, axes = self.data, self.data.axes
 
         def chunk(k: int, first: int, last: int) -> None:
-            run(first, last, data.ends, data.directions, data.weights, data.least, rho, t, x, self._sums[k])
-
-        return self._accumulate(chunk)
-
-    def laplacian(self, x: FloatArray, rho: FloatArray) -> FloatArray:
-        """Return D^T rho D x, (n, d)."""
-        run = _laplacian(x.shape[1])
-
-        def chunk(k: int, first: int, last: int) -> None:
-            run(first, last, self.data.ends, rho, x, self._sums[k])
+            _pull(
+                axes,
+                first,
+                last,
+                data.ends,
+                data.directions,
+                data.weights,
+                data.least,
+                rho,
+                t,
+                x,
+                self._sums[k],
+            )
 
         return self._accumulate(chunk)
 
     def dual(self, x: FloatArray, rho: FloatArray) -> FloatArray:
         """Return rho u, (m, d), in the edge order of the passes."""
         out = np.empty_like(x)
-        data, run = self.data, _dual(self.data.directions.shape[1])
-        self.over_chunks(lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, x, out))
+        data, axes = self.data, self.data.axes
+        self.over_chunks(
+            lambda _k, a, b: _dual(axes, a, b, data.directions, data.weights, data.least, rho, x, out)
+        )
         return out
 
     def in_graph_order(self, values: FloatArray) -> FloatArray:
@@ -150,21 +160,23 @@ class EdgePasses:
 
     def residuals(self, t: FloatArray) -> FloatArray:
         """Return ||r(t_i - t_j)|| for every edge, (m,)."""
-        data, run = self.data, _residuals(self.data.directions.shape[1])
+        data, axes = self.data, self.data.axes
         out = np.empty(len(data.ends))
-        self.over_chunks(lambda _k, a, b: run(a, b, data.ends, data.directions, data.least, t, out))
+        self.over_chunks(
+            lambda _k, a, b: _residuals(axes, a, b, data.ends, data.directions, data.least, t, out)
+        )
         return out
 
     def imbalance(
         self, x_before: FloatArray, x: FloatArray, t: FloatArray, rho: FloatArray
     ) -> tuple[float, float]:
         """Return sum rho ||D t - y||^2 and sum rho ||y - y_before||^2: the primal and the dual residual."""
-        data, run = self.data, _imbalance(self.data.directions.shape[1])
+        data, axes = self.data, self.data.axes
         totals = np.zeros((len(data.bounds) - 1, 2))
 
         def chunk(k: int, first: int, last: int) -> None:
-            run(
-                first, last, data.ends, data.directions, data.weights, data.least, rho, t,
+            _imbalance(
+                axes, first, last, data.ends, data.directions, data.weights, data.least, rho, t,
                 x_before, x, totals[k],
             )  # fmt: skip
 
@@ -174,9 +186,11 @@ class EdgePasses:
 
     def change_penalties(self, x: FloatArray, rho: FloatArray, rho_next: FloatArray) -> None:
         """Rewrite x in place so that y and the dual rho u stay what they are under the new penalties."""
-        data, run = self.data, _change_penalties(self.data.directions.shape[1])
+        data, axes = self.data, self.data.axes
         self.over_chunks(
-            lambda _k, a, b: run(a, b, data.directions, data.weights, data.least, rho, rho_next, x)
+            lambda _k, a, b: _change_penalties(
+                axes, a, b, data.directions, data.weights, data.least, rho, rho_next, x
+            )
         )
 
     def _accumulate(self, chunk: Callable[[int, int, int], None]) -> FloatArray:
@@ -198,227 +212,186 @@ class EdgePasses:
         self._workers.run([partial(run, k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)])
 
 
-# The kernels are made per dimension: with d a constant the loops over coordinates unroll.
+@kernel()
+def _clip_factor(axes: Any, x: Any, v: Any, e: int, least: float, radius: float) -> Any:
+    """Return (a, shrink) of an edge: r = x - a v, clip(r) = shrink * r."""
+    d = len(axes)
+    a = 0.0
+    for k in range(d):
+        a += x[e, k] * v[e, k]
+    a = max(a, least)
+    square = 0.0
+    for k in range(d):
+        r = x[e, k] - a * v[e, k]
+        square += r * r
+    return a, radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
 
 
-@cache
-def _clip_factor(d: int) -> Any:
-    """Return f(x, v, e, least, radius) -> (a, shrink): r = x - a v, clip(r) = shrink * r."""
+@kernel()
+def _step(
+    axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+    rho: Any, relaxation: float, t: Any, x: Any, x_next: Any, sums: Any, totals: Any,
+) -> None:  # fmt: skip
+    """Take the proximal step of a chunk; see `EdgePasses.step`."""
+    d = len(axes)
+    block = np.empty((3 * d + 2, _BLOCK))  # one array: several might overlap, for all the compiler knows
+    for begin in range(first, last, _BLOCK):
+        count = min(_BLOCK, last - begin)
+        for b in range(count):
+            e = begin + b
+            i, j = ends[e, 0], ends[e, 1]
+            for k in range(d):
+                block[k, b] = t[i, k] - t[j, k]
+                block[d + k, b] = x[e, k]
+                block[2 * d + k, b] = v[e, k]
+            block[3 * d, b] = w[e]
+            block[3 * d + 1, b] = rho[e]
+        _advance(axes, block, count, least, relaxation, totals)
+        for b in range(count):
+            e = begin + b
+            i, j = ends[e, 0], ends[e, 1]
+            for k in range(d):
+                x_next[e, k] = block[d + k, b]
+                sums[i, k] += block[k, b]
+                sums[j, k] -= block[k, b]
 
-    @kernel()
-    def clip_factor(x: Any, v: Any, e: int, least: float, radius: float) -> Any:
+
+@kernel(inline=True)
+def _advance(axes: Any, block: Any, count: int, least: float, relaxation: float, totals: Any) -> None:
+    """Take the step for edges side by side, coordinate by coordinate, so that it is vectorized.
+
+    The rows of `block` are D t, x, v, w and rho; D t becomes what is pulled, and x what follows it.
+    """
+    d = len(axes)
+    baseline, x, v, w, rho = block[:d], block[d:], block[2 * d :], block[3 * d], block[3 * d + 1]
+    objective, pairing, along, change, interior = 0.0, 0.0, 0.0, 0.0, 0.0
+    for b in range(count):
+        radius = w[b] / rho[b]
         a = 0.0
         for k in range(d):
-            a += x[e, k] * v[e, k]
+            a += x[k, b] * v[k, b]
         a = max(a, least)
         square = 0.0
         for k in range(d):
-            r = x[e, k] - a * v[e, k]
+            r = x[k, b] - a * v[k, b]
             square += r * r
-        return a, radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
-
-    return clip_factor
-
-
-@cache
-def _step(d: int) -> Any:
-    advance = _advance(d)
-
-    @kernel()
-    def step(
-        first: int, last: int, ends: Any, v: Any, w: Any, least: float,
-        rho: Any, relaxation: float, t: Any, x: Any, x_next: Any, sums: Any, totals: Any,
-    ) -> None:  # fmt: skip
-        block = np.empty((3 * d + 2, _BLOCK))  # one array: several might overlap, for all the compiler knows
-        for begin in range(first, last, _BLOCK):
-            count = min(_BLOCK, last - begin)
-            for b in range(count):
-                e = begin + b
-                i, j = ends[e, 0], ends[e, 1]
-                for k in range(d):
-                    block[k, b] = t[i, k] - t[j, k]
-                    block[d + k, b] = x[e, k]
-                    block[2 * d + k, b] = v[e, k]
-                block[3 * d, b] = w[e]
-                block[3 * d + 1, b] = rho[e]
-            advance(block, count, least, relaxation, totals)
-            for b in range(count):
-                e = begin + b
-                i, j = ends[e, 0], ends[e, 1]
-                for k in range(d):
-                    x_next[e, k] = block[d + k, b]
-                    sums[i, k] += block[k, b]
-                    sums[j, k] -= block[k, b]
-
-    return step
-
-
-@cache
-def _advance(d: int) -> Any:
-    @kernel(inline=True)
-    def advance(block: Any, count: int, least: float, relaxation: float, totals: Any) -> None:
-        """Take the step for edges side by side, coordinate by coordinate, so that it is vectorised.
-
-        The rows of `block` are D t, x, v, w and rho; D t becomes what is pulled, and x what follows it.
-        """
-        baseline, x, v, w, rho = block[:d], block[d:], block[2 * d :], block[3 * d], block[3 * d + 1]
-        objective, pairing, along, change, interior = 0.0, 0.0, 0.0, 0.0, 0.0
-        for b in range(count):
-            radius = w[b] / rho[b]
-            a = 0.0
-            for k in range(d):
-                a += x[k, b] * v[k, b]
-            a = max(a, least)
-            square = 0.0
-            for k in range(d):
-                r = x[k, b] - a * v[k, b]
-                square += r * r
-            shrink = radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
-            moved, length = 0.0, 0.0
-            for k in range(d):
-                u = shrink * (x[k, b] - a * v[k, b])
-                g = relaxation * (baseline[k, b] - x[k, b] + u)
-                moved += g * g
-                length += baseline[k, b] * v[k, b]
-                x[k, b] += g
-            a = 0.0
-            for k in range(d):
-                a += x[k, b] * v[k, b]
-            a, length = max(a, least), max(length, least)
-            square, missed = 0.0, 0.0
-            for k in range(d):
-                r = x[k, b] - a * v[k, b]
-                square += r * r
-                r = baseline[k, b] - length * v[k, b]
-                missed += r * r
-            shrink = radius / max(np.sqrt(square), radius)
-            paired, projected = 0.0, 0.0
-            for k in range(d):
-                u = shrink * (x[k, b] - a * v[k, b])
-                paired += u * baseline[k, b]
-                projected += u * v[k, b]
-                baseline[k, b] = rho[b] * (x[k, b] - 2.0 * u - baseline[k, b])
-            objective += w[b] * np.sqrt(missed)
-            pairing += rho[b] * paired
-            along += rho[b] * projected
-            change += rho[b] * moved
-            interior += 1.0 if shrink == 1.0 else 0.0
-        totals[0] += objective
-        totals[1] += pairing
-        totals[2] += along
-        totals[3] += change
-        totals[4] += interior
-
-    return advance
+        shrink = radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
+        moved, length = 0.0, 0.0
+        for k in range(d):
+            u = shrink * (x[k, b] - a * v[k, b])
+            g = relaxation * (baseline[k, b] - x[k, b] + u)
+            moved += g * g
+            length += baseline[k, b] * v[k, b]
+            x[k, b] += g
+        a = 0.0
+        for k in range(d):
+            a += x[k, b] * v[k, b]
+        a, length = max(a, least), max(length, least)
+        square, missed = 0.0, 0.0
+        for k in range(d):
+            r = x[k, b] - a * v[k, b]
+            square += r * r
+            r = baseline[k, b] - length * v[k, b]
+            missed += r * r
+        shrink = radius / max(np.sqrt(square), radius)
+        paired, projected = 0.0, 0.0
+        for k in range(d):
+            u = shrink * (x[k, b] - a * v[k, b])
+            paired += u * baseline[k, b]
+            projected += u * v[k, b]
+            baseline[k, b] = rho[b] * (x[k, b] - 2.0 * u - baseline[k, b])
+        objective += w[b] * np.sqrt(missed)
+        pairing += rho[b] * paired
+        along += rho[b] * projected
+        change += rho[b] * moved
+        interior += 1.0 if shrink == 1.0 else 0.0
+    totals[0] += objective
+    totals[1] += pairing
+    totals[2] += along
+    totals[3] += change
+    totals[4] += interior
 
 
-@cache
-def _pull(d: int) -> Any:
-    clip_factor = _clip_factor(d)
-
-    @kernel()
-    def pull(
-        first: int, last: int, ends: Any, v: Any, w: Any, least: float, rho: Any, t: Any, x: Any, sums: Any
-    ) -> None:
-        for e in range(first, last):
-            i, j = ends[e, 0], ends[e, 1]
-            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
-            for k in range(d):
-                u = shrink * (x[e, k] - a * v[e, k])
-                p = rho[e] * (x[e, k] - 2.0 * u - (t[i, k] - t[j, k]))
-                sums[i, k] += p
-                sums[j, k] -= p
-
-    return pull
-
-
-@cache
-def _laplacian(d: int) -> Any:
-    @kernel()
-    def laplacian(first: int, last: int, ends: Any, rho: Any, x: Any, sums: Any) -> None:
-        for e in range(first, last):
-            i, j = ends[e, 0], ends[e, 1]
-            for k in range(d):
-                p = rho[e] * (x[i, k] - x[j, k])
-                sums[i, k] += p
-                sums[j, k] -= p
-
-    return laplacian
+@kernel()
+def _pull(
+    axes: Any,
+    first: int,
+    last: int,
+    ends: Any,
+    v: Any,
+    w: Any,
+    least: float,
+    rho: Any,
+    t: Any,
+    x: Any,
+    sums: Any,
+) -> None:
+    d = len(axes)
+    for e in range(first, last):
+        i, j = ends[e, 0], ends[e, 1]
+        a, shrink = _clip_factor(axes, x, v, e, least, w[e] / rho[e])
+        for k in range(d):
+            u = shrink * (x[e, k] - a * v[e, k])
+            p = rho[e] * (x[e, k] - 2.0 * u - (t[i, k] - t[j, k]))
+            sums[i, k] += p
+            sums[j, k] -= p
 
 
-@cache
-def _dual(d: int) -> Any:
-    clip_factor = _clip_factor(d)
-
-    @kernel()
-    def dual(first: int, last: int, v: Any, w: Any, least: float, rho: Any, x: Any, out: Any) -> None:
-        for e in range(first, last):
-            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
-            for k in range(d):
-                out[e, k] = rho[e] * shrink * (x[e, k] - a * v[e, k])
-
-    return dual
+@kernel()
+def _dual(axes: Any, first: int, last: int, v: Any, w: Any, least: float, rho: Any, x: Any, out: Any) -> None:
+    d = len(axes)
+    for e in range(first, last):
+        a, shrink = _clip_factor(axes, x, v, e, least, w[e] / rho[e])
+        for k in range(d):
+            out[e, k] = rho[e] * shrink * (x[e, k] - a * v[e, k])
 
 
-@cache
-def _residuals(d: int) -> Any:
-    @kernel()
-    def residuals(first: int, last: int, ends: Any, v: Any, least: float, t: Any, out: Any) -> None:
-        for e in range(first, last):
-            i, j = ends[e, 0], ends[e, 1]
-            a = 0.0
-            for k in range(d):
-                a += (t[i, k] - t[j, k]) * v[e, k]
-            a = max(a, least)
-            square = 0.0
-            for k in range(d):
-                r = t[i, k] - t[j, k] - a * v[e, k]
-                square += r * r
-            out[e] = np.sqrt(square)
-
-    return residuals
+@kernel()
+def _residuals(axes: Any, first: int, last: int, ends: Any, v: Any, least: float, t: Any, out: Any) -> None:
+    d = len(axes)
+    for e in range(first, last):
+        i, j = ends[e, 0], ends[e, 1]
+        a = 0.0
+        for k in range(d):
+            a += (t[i, k] - t[j, k]) * v[e, k]
+        a = max(a, least)
+        square = 0.0
+        for k in range(d):
+            r = t[i, k] - t[j, k] - a * v[e, k]
+            square += r * r
+        out[e] = np.sqrt(square)
 
 
-@cache
-def _imbalance(d: int) -> Any:
-    clip_factor = _clip_factor(d)
-
-    @kernel()
-    def imbalance(
-        first: int, last: int, ends: Any, v: Any, w: Any, least: float,
-        rho: Any, t: Any, x_before: Any, x: Any, totals: Any,
-    ) -> None:  # fmt: skip
-        primal, dual = 0.0, 0.0
-        for e in range(first, last):
-            i, j = ends[e, 0], ends[e, 1]
-            a0, shrink0 = clip_factor(x_before, v, e, least, w[e] / rho[e])
-            a1, shrink1 = clip_factor(x, v, e, least, w[e] / rho[e])
-            p, q = 0.0, 0.0
-            for k in range(d):
-                y0 = x_before[e, k] - shrink0 * (x_before[e, k] - a0 * v[e, k])
-                y1 = x[e, k] - shrink1 * (x[e, k] - a1 * v[e, k])
-                p += (t[i, k] - t[j, k] - y1) ** 2
-                q += (y1 - y0) ** 2
-            primal += rho[e] * p
-            dual += rho[e] * q
-        totals[0] += primal
-        totals[1] += dual
-
-    return imbalance
+@kernel()
+def _imbalance(
+    axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+    rho: Any, t: Any, x_before: Any, x: Any, totals: Any,
+) -> None:  # fmt: skip
+    d = len(axes)
+    primal, dual = 0.0, 0.0
+    for e in range(first, last):
+        i, j = ends[e, 0], ends[e, 1]
+        a0, shrink0 = _clip_factor(axes, x_before, v, e, least, w[e] / rho[e])
+        a1, shrink1 = _clip_factor(axes, x, v, e, least, w[e] / rho[e])
+        p, q = 0.0, 0.0
+        for k in range(d):
+            y0 = x_before[e, k] - shrink0 * (x_before[e, k] - a0 * v[e, k])
+            y1 = x[e, k] - shrink1 * (x[e, k] - a1 * v[e, k])
+            p += (t[i, k] - t[j, k] - y1) ** 2
+            q += (y1 - y0) ** 2
+        primal += rho[e] * p
+        dual += rho[e] * q
+    totals[0] += primal
+    totals[1] += dual
 
 
-@cache
-def _change_penalties(d: int) -> Any:
-    clip_factor = _clip_factor(d)
-
-    @kernel()
-    def change_penalties(
-        first: int, last: int, v: Any, w: Any, least: float, rho: Any, rho_next: Any, x: Any
-    ) -> None:
-        for e in range(first, last):
-            a, shrink = clip_factor(x, v, e, least, w[e] / rho[e])
-            factor = (rho[e] / rho_next[e] - 1.0) * shrink
-            for k in range(d):
-                x[e, k] += factor * (x[e, k] - a * v[e, k])
-
-    return change_penalties
+@kernel()
+def _change_penalties(
+    axes: Any, first: int, last: int, v: Any, w: Any, least: float, rho: Any, rho_next: Any, x: Any
+) -> None:
+    d = len(axes)
+    for e in range(first, last):
+        a, shrink = _clip_factor(axes, x, v, e, least, w[e] / rho[e])
+        factor = (rho[e] / rho_next[e] - 1.0) * shrink
+        for k in range(d):
+            x[e, k] += factor * (x[e, k] - a * v[e, k])
