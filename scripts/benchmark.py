@@ -23,7 +23,6 @@ def subcommands() -> dict[str, ModuleType]:
         families,
         forecasts,
         onedsfm,
-        partitioned,
         peers,
         real,
         rigid,
@@ -51,7 +50,6 @@ def subcommands() -> dict[str, ModuleType]:
         "map": mapping,
         "endtoend": endtoend,
         "forecast": forecasts,
-        "partitioned": partitioned,
         "answers": answers,
     }
 

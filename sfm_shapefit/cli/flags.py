@@ -51,8 +51,7 @@ ExecutorName = Annotated[
     Literal["serial", "processes", "dask"],
     typer.Option(
         "--executor",
-        help="Who measures directions, and solves the pieces of a graph whose factor exceeds "
-        "--factor-memory: this process, so many others as --threads says, or a cluster.",
+        help="Who measures directions: this process, so many others as --threads says, or a cluster.",
     ),
 ]
 Scheduler = Annotated[

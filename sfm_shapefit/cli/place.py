@@ -16,14 +16,12 @@ from sfm_shapefit.cli.console import (
     shown_progress,
 )
 from sfm_shapefit.cli.flags import (
-    ExecutorName,
     Json,
     OutArgument,
     Overwrite,
     Quiet,
     Report,
     Scene,
-    Scheduler,
     one_path,
     options_from,
     takes,
@@ -74,8 +72,6 @@ def solve_command(
         bool,
         typer.Option("--1dsfm", help="Also write 1dsfm/: the pairs that agree, rotations and locations."),
     ] = False,
-    executor: ExecutorName = "serial",
-    scheduler: Scheduler = None,
     overwrite: Overwrite = False,
     report: Report = True,
     scene: Scene = False,
@@ -93,15 +89,11 @@ def solve_command(
         inputs = [path for path in (source, rotations) if path is not None]
         with claimed_output(target, overwrite=overwrite, protect=inputs):
             from sfm_shapefit.commands.place import solve_graph_file
-            from sfm_shapefit.commands.stages.execution import open_executor
             from sfm_shapefit.commands.write import write_graph_result
             from sfm_shapefit.results import graph_summary
 
             catch_termination()
-            with (
-                open_executor(executor, options.threads, scheduler) as workers,
-                shown_progress(not quiet) as progress,
-            ):
+            with shown_progress(not quiet) as progress:
                 found = solve_graph_file(
                     source,
                     options,
@@ -109,7 +101,6 @@ def solve_command(
                     max_rotation_error_deg=max_rotation_error,
                     reverse=reverse,
                     progress=progress,
-                    executor=workers,
                 )
             write_graph_result(
                 found,

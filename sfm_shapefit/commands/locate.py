@@ -60,8 +60,7 @@ def locate(
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
         executor: shares out the pairs of a database among its workers, which must see its file, or a model's
-            own tracks, with the same answer to the bit; and solves a graph in pieces whose factor would be
-            too large for one machine. None: all is done here.
+            own tracks, with the same answer to the bit. None: all is done here.
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
@@ -119,7 +118,7 @@ def locate(
             joint = joint_graph(opened, directions, options)
             source, joint, options = within_memory(opened, directions, joint, options)
             evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = placed(joint, rigid, evidence, options, clock, executor)
+            placement = placed(joint, rigid, evidence, options, clock)
             kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rigid_gauge(
                 model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)

@@ -1,6 +1,5 @@
 """`solve GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
 
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -50,7 +49,6 @@ def solve_graph_file(
     max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
     reverse: bool = False,
     progress: Progress | None = None,
-    executor: Executor | None = None,
 ) -> GraphResult:
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
 
@@ -65,7 +63,6 @@ def solve_graph_file(
             left out, as `locate` leaves them out.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
         progress: called as stages advance.
-        executor: solves a graph in pieces whose factor would be too large for one machine; none if None.
 
     Raises:
         InputError: if a file is malformed; the message names the line.
@@ -91,7 +88,7 @@ def solve_graph_file(
         if reverse:
             graph = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
     with clock("solve"):
-        placement = place(graph, options, on_iteration=clock.iteration, executor=executor)
+        placement = place(graph, options, on_iteration=clock.iteration)
     with clock("further pieces"):
         further = tuple(place_further(placement, options))
     return GraphResult(

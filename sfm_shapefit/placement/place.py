@@ -5,7 +5,6 @@ its own. The largest is the answer; the others are kept apart.
 """
 
 from collections.abc import Iterator
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +16,6 @@ from sfm_shapefit.judgement.second_configuration import Rival, find_rival
 from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
-from sfm_shapefit.placement.partitioned import choose_pieces, place_partitioned
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import Finish, finish
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
@@ -28,7 +26,6 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 SMALLEST_PIECE = 3
 """Cameras; fewer have no shape that is worth a placement of its own."""
-_NOT_IN_PIECES = "not in pieces, which few pairs would hold together: one of them could not be certified"
 _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
@@ -116,7 +113,6 @@ def place(
     evidence: Evidence | None = None,
     num_cameras: int | None = None,
     on_iteration: OnIteration | None = None,
-    executor: Executor | None = None,
 ) -> Placement:
     """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
 
@@ -127,7 +123,6 @@ def place(
         evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
         num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
         on_iteration: called after each iteration of the solve, on graphs where that costs little.
-        executor: solves a graph in pieces whose factor is too large for one machine; see `partitioned`.
 
     Raises:
         UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
@@ -143,7 +138,7 @@ def place(
     ]
     refuse_without_triangle(considered, pieces, num_cameras)
     parts = dropped, pieces
-    return _place_piece(graph, parts, 0, options, covariance, evidence, num_cameras, on_iteration, executor)
+    return _place_piece(graph, parts, 0, options, covariance, evidence, num_cameras, on_iteration)
 
 
 def place_further(
@@ -224,7 +219,6 @@ def _place_piece(
     evidence: Evidence | None,
     num_cameras: int,
     on_iteration: OnIteration | None = None,
-    executor: Executor | None = None,
 ) -> Placement:
     """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`.
 
@@ -242,7 +236,7 @@ def _place_piece(
         history.append(info)
         return None if on_iteration is None else on_iteration(info)
 
-    solved, finished = _solved(piece, options, known, classes, watch, executor)
+    solved, finished = _solved(piece, options, known, classes, watch)
     placed = int(np.sum(nodes < num_cameras))
     memory, back = options.factor_memory, finished.put_back
     assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory=memory)
@@ -267,18 +261,10 @@ def _solved(
     covariance: FloatArray | None,
     classes: IntArray,
     watch: OnIteration,
-    executor: Executor | None,
 ) -> tuple[SolverResult, Finish]:
-    """Solve and finish a rigid graph: in pieces where an executor is there and they serve, else whole."""
-    part_of = None if executor is None else choose_pieces(piece, options)
-    if part_of is not None:
-        joined = place_partitioned(piece, part_of, options, covariance, classes, executor)
-        if joined is not None:
-            return joined.solve, joined.finish
+    """Solve and finish a rigid graph."""
     if options.solves_shapefit:
         solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
     else:
         solved = solve_baseline(piece, options.objective)
-    if part_of is not None:
-        solved = replace(solved, method_reason=f"{solved.method_reason}; {_NOT_IN_PIECES}")
     return solved, finish(piece, solved, options, covariance, classes)

@@ -71,7 +71,7 @@ class Finish:
     locations: FloatArray
     """(n, d) centred, scaled like the solver's."""
     start: str
-    """The program they come from: "ShapeFit", "LUD", the name of a baseline, or "pieces" of a large graph."""
+    """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
     refined: bool
     """Whether they differ from its optimum."""
     reason: str
@@ -211,27 +211,6 @@ def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finis
     """Return a baseline's answer as it is."""
     start = _unrefined(solved.method, solved.locations)
     return _alone(graph, start, metric, solved.locations, "the baseline's own answer, as asked")
-
-
-def finish_merged(
-    graph: ViewGraph,
-    merged: FloatArray,
-    covariance: FloatArray | None,
-    classes: IntArray,
-    plan: SymbolicFactor | NormalFactor,
-    reason: str,
-) -> Finish:
-    """Return the robust finish of the locations (n, d) that merged pieces give, as the only start.
-
-    Args:
-        graph, covariance, classes: as in `finish`.
-        merged: where the refinement starts.
-        plan: what it solves its steps with.
-        reason: why there is one start only.
-    """
-    metric = Metric(covariance, classes)
-    start = _refined("pieces", merged, merged, graph, metric, plan, None)
-    return _alone(graph, start, metric, normalized_locations(graph, start.best), reason)
 
 
 def _alone(graph: ViewGraph, start: Start, metric: Metric, locations: FloatArray, reason: str) -> Finish:

@@ -111,7 +111,7 @@ def _certainty(scene: Scene) -> Iterator[str]:
 
 def _optimum(solve: dict[str, Any]) -> str:
     """Say what the certificate proves."""
-    if solve["status"] in ("not_solved", "in_pieces"):
+    if solve["status"] == "not_solved":
         return f"Nothing certifies these positions as a whole ({solve['method']}: {solve['method_reason']})."
     unique = {
         True: ", and no other placement is as good",

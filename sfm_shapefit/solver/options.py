@@ -23,13 +23,12 @@ class Status(enum.Enum):
     )
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen tol"
     NOT_SOLVED = "another objective was asked for, so ShapeFit was not solved and nothing is certified"
-    IN_PIECES = "solved in overlapping pieces: each has a certificate of its own, the whole has none"
     CANCELLED = "on_iteration cancelled the solve; these are the last iterate and what it proves"
 
     @property
     def has_certificate(self) -> bool:
         """Whether there is a dual that proves anything."""
-        return self not in (Status.NOT_SOLVED, Status.IN_PIECES)
+        return self is not Status.NOT_SOLVED
 
 
 @dataclass(frozen=True, slots=True)

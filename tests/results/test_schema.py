@@ -1,16 +1,13 @@
 """What the commands print with --json keeps to the schema that is shipped."""
 
 import json
-from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 
 import jsonschema
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
-from sfm_shapefit.synthetic import box_graph_problem
 from tests.scenes import BUNDLED, COURTYARD, RING
 
 RING_MODEL = RING / "sparse" / "0"
@@ -55,21 +52,6 @@ def test_a_key_that_is_missing_renamed_or_unknown_breaks_the_schema():
     assert problems({key: value for key, value in facts.items() if key != "extent"}, "evaluate")
     assert problems(facts | {"more": 1}, "evaluate")
     assert problems(facts | {"num_common": "eight"}, "evaluate")
-
-
-def test_a_graph_solved_in_pieces_keeps_to_the_schema_and_says_so(tmp_path, monkeypatch):
-    box = box_graph_problem(600, 24.0, 0.01, 0.2, seed=1)
-    np.savetxt(
-        tmp_path / "graph.txt", np.column_stack([box.edges, box.directions]), "%d %d %.17g %.17g %.17g"
-    )
-    monkeypatch.setattr(
-        "sfm_shapefit.commands.stages.execution.open_executor", lambda *_: ThreadPoolExecutor(1)
-    )  # processes take seconds to start
-    arguments = ("solve", tmp_path / "graph.txt", tmp_path / "out", "--no-report", "--json")
-    facts = printed(*arguments, "--executor", "processes", "--factor-memory", 1)
-    assert problems(facts, "solve_graph") == []
-    assert facts["solve"]["status"] == "in_pieces"
-    assert "4 pieces" in facts["solve"]["method_reason"]
 
 
 def test_a_baseline_keeps_to_the_schema(tmp_path):

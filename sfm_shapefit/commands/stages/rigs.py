@@ -6,7 +6,6 @@ taken.
 """
 
 from collections.abc import Callable
-from concurrent.futures import Executor
 from pathlib import Path
 from typing import NamedTuple
 
@@ -107,7 +106,6 @@ def placed(
     evidence: Evidence,
     options: LocateOptions,
     clock: Clock,
-    executor: Executor | None = None,
 ) -> Placement:
     """Place the view graph, over groups where there are any.
 
@@ -116,7 +114,7 @@ def placed(
     """
     if rigid.groups is None:
         settings, k = options.for_placement(), joint.num_cameras
-        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration, executor)
+        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration)
     first = None
     if options.points != "always":
         try:
