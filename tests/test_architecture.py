@@ -42,6 +42,7 @@ ROOMS = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
 DOORS = {
     "numba": {"jit.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
+    "pymetis": {"laplacian"},
     "distributed": {"commands/stages/execution.py"},
     "cv2": {"synthetic"},
     "trimesh": {"synthetic/surfaces.py", "report/mesh.py"},

@@ -98,7 +98,7 @@ def propagate(
     units = baselines / np.maximum(lengths, _SHORTEST * lengths.max())[:, None]
     across = _across(information, units)
     blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
-    plan = analyse(n, edges, coordinates=locations)
+    plan = analyse(n, edges)
     if plan.num_bytes(d) > max_bytes:
         return None
     factor = _grounded_factor(plan, blocks, units, lengths)

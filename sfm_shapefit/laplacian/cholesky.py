@@ -108,7 +108,6 @@ def analyse(
     num_nodes: int,
     edges: npt.ArrayLike,
     ordering: Ordering | IntArray = "auto",
-    coordinates: FloatArray | None = None,
 ) -> SymbolicFactor:
     """Plan the factorisation of the Laplacians of a graph, whatever their weights, block size and precision.
 
@@ -116,7 +115,6 @@ def analyse(
         num_nodes: n >= 1.
         edges: (m, 2) node indices; repeated edges add up.
         ordering: a method of `ordering.best_order`, or an order of elimination (n,) itself.
-        coordinates: (n, d) approximate positions that help our own dissection.
 
     Returns:
         The plan. `num_nonzeros`, `flops` and `num_bytes` tell what a factorisation would cost. To know that
@@ -127,10 +125,7 @@ def analyse(
     """
     pairs = checked_edges(num_nodes, edges)
     graph = adjacency(num_nodes, pairs)
-    if isinstance(ordering, str):
-        tree = best_order(graph, ordering, coordinates)
-    else:
-        tree = elimination_tree(graph, ordering)
+    tree = best_order(graph, ordering) if isinstance(ordering, str) else elimination_tree(graph, ordering)
     return plan_factorisation(graph, pairs, tree)
 
 

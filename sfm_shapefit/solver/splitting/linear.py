@@ -103,7 +103,7 @@ class Prediction:
         return np.inf if self.tree is None else self.tree.flops
 
 
-def predict_factor(graph: ViewGraph, coordinates: FloatArray | None = None) -> Prediction:
+def predict_factor(graph: ViewGraph) -> Prediction:
     """Return the order of elimination that `laplacian_factor` would use.
 
     A graph on which the diagonal is a good preconditioner has a large spectral gap, so no small separators
@@ -121,13 +121,12 @@ def predict_factor(graph: ViewGraph, coordinates: FloatArray | None = None) -> P
         rough_flops = 4.0 * (0.75 * widest_level(neighbours)) ** 3  # as on boxes of 1e4 and 1e5 cameras
         if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
             return Prediction(None)
-    return Prediction(best_order(neighbours, "auto", coordinates))
+    return Prediction(best_order(neighbours))
 
 
 def laplacian_factor(
     graph: ViewGraph,
     memory_bytes: int = DEFAULT_MEMORY_BYTES,
-    coordinates: FloatArray | None = None,
     *,
     prediction: Prediction | None = None,
     threads: int = 1,
@@ -139,11 +138,10 @@ def laplacian_factor(
     Args:
         graph: a connected view graph.
         memory_bytes: what the factor may take; predicted before anything is allocated.
-        coordinates: (n, k) rough positions that may help to order the nodes.
         prediction: from `predict_factor` on the same graph, if it is there already.
         threads: of the factor; its answers do not depend on it.
     """
-    tree = (predict_factor(graph, coordinates) if prediction is None else prediction).tree
+    tree = (predict_factor(graph) if prediction is None else prediction).tree
     neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
         return IterativeSolver(neighbours, threads)
