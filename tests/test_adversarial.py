@@ -18,13 +18,14 @@ from sfm_shapefit.results import camera_rows, graph_warnings, quality_warnings
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 from tests.scenes import RING, copied
 
 N = 12
 BAD = N - 1
 MIN_TRUST = LocateOptions().min_trust
 CENTERS = np.random.default_rng(1).standard_normal((N, 3))
-ALL = [(i, j) for i in range(N) for j in range(i + 1, N)]
+ALL = all_pairs(N)
 OF_BAD = [k for k, (_, j) in enumerate(ALL) if j == BAD]
 OTHERS = [pair for pair in ALL if BAD not in pair]
 NOISE = [0.0, 1e-3]  # rad per axis

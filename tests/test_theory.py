@@ -14,10 +14,11 @@ from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import random_graph_problem
 from sfm_shapefit.theory import graph_typicality, recovery_conditions, well_distributed
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 
 
 def complete(n):
-    return np.stack(np.triu_indices(n, k=1), axis=1).astype(np.int64)
+    return np.array(all_pairs(n))
 
 
 def across(v, h):
@@ -213,7 +214,7 @@ def test_what_the_theorem_grants_is_recovered_exactly():
     problem = random_graph_problem(25, 1.0, 3, seed=9)
     found = recovery_conditions(problem.locations, problem.edges)
     assert found.guarantees_recovery(0)
-    answer = solve(ViewGraph(25, problem.edges, problem.directions)).locations
+    answer = solve(problem.view_graph).locations
     truth = problem.locations - problem.locations.mean(axis=0)
     error = answer / np.linalg.norm(answer) - truth / np.linalg.norm(truth)
     assert np.linalg.norm(error) < 1e-8

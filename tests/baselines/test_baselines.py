@@ -11,31 +11,22 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import box_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
-
-
-def view_graph(problem):
-    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
-
-
-def error(locations, truth):
-    """The paper's relative error."""
-    a, b = locations - locations.mean(axis=0), truth - truth.mean(axis=0)
-    return np.linalg.norm(a / np.linalg.norm(a) - b / np.linalg.norm(b))
+from tests.problems import shape_error
 
 
 @pytest.mark.parametrize("name", sorted(baselines.LOCATORS))
 @pytest.mark.parametrize("d", [2, 3])
 def test_every_locator_is_exact_on_exact_directions(name, d):
     problem = random_graph_problem(15, 0.7, d, seed=1)
-    found = baselines.LOCATORS[name](view_graph(problem))
+    found = baselines.LOCATORS[name](problem.view_graph)
     # Interior points and splitting stop at 1e-8; positions are off by that times the conditioning.
-    assert error(found, problem.locations) < 1e-5
+    assert shape_error(found, problem.locations) < 1e-5
     assert np.linalg.norm(found) == pytest.approx(1.0)
 
 
 def test_least_squares_minimises_the_sum_of_squared_distances_across():
     problem = random_graph_problem(12, 0.8, 3, sigma=0.1, seed=2)
-    graph = view_graph(problem)
+    graph = problem.view_graph
     rng = np.random.default_rng(0)
 
     def value(t):
@@ -52,22 +43,22 @@ def test_least_squares_minimises_the_sum_of_squared_distances_across():
 def test_the_sparse_eigenvector_is_the_dense_one(monkeypatch):
     from sfm_shapefit.baselines import least_squares
 
-    graph = view_graph(box_graph_problem(60, 12, sigma=0.02, seed=3))
+    graph = box_graph_problem(60, 12, sigma=0.02, seed=3).view_graph
     dense = baselines.locate_least_squares(graph)
     monkeypatch.setattr(least_squares, "_DENSE_UNKNOWNS", 0)
-    assert error(baselines.locate_least_squares(graph), dense) < 1e-6
+    assert shape_error(baselines.locate_least_squares(graph), dense) < 1e-6
 
 
 def test_reweighting_by_length_lowers_the_error_of_noisy_directions():
     problem = random_graph_problem(40, 0.5, 3, sigma=0.05, seed=4)
-    graph = view_graph(problem)
-    plain = error(baselines.locate_least_squares(graph), problem.locations)
-    assert error(baselines.locate_least_squares(graph, 10), problem.locations) < plain
+    graph = problem.view_graph
+    plain = shape_error(baselines.locate_least_squares(graph), problem.locations)
+    assert shape_error(baselines.locate_least_squares(graph, 10), problem.locations) < plain
 
 
 def test_linf_has_no_larger_worst_misfit_than_the_truth():
     problem = random_graph_problem(12, 0.8, 3, sigma=0.05, seed=5)
-    graph = view_graph(problem)
+    graph = problem.view_graph
 
     def worst(t):
         d = differences(t, graph.edges)
@@ -82,7 +73,7 @@ def test_linf_has_no_larger_worst_misfit_than_the_truth():
 @pytest.mark.parametrize("name", sorted(baselines.FILTERS))
 def test_every_filter_drops_most_wrong_pairs_and_few_right_ones(name):
     problem = random_graph_problem(60, 0.5, 3, sigma=0.01, q=0.2, seed=6)
-    kept = baselines.FILTERS[name](view_graph(problem))
+    kept = baselines.FILTERS[name](problem.view_graph)
     assert kept[~problem.corrupted].mean() > 0.9
     assert kept[problem.corrupted].mean() < 0.45
 
@@ -90,7 +81,7 @@ def test_every_filter_drops_most_wrong_pairs_and_few_right_ones(name):
 @pytest.mark.parametrize("scores", [onedsfm_scores, triangle_scores])
 def test_scores_do_not_depend_on_the_orientation_of_pairs(scores):
     problem = random_graph_problem(25, 0.5, 3, sigma=0.05, q=0.2, seed=7)
-    graph = view_graph(problem)
+    graph = problem.view_graph
     turned = np.arange(len(problem.edges)) % 2 == 0
     edges = np.where(turned[:, None], problem.edges[:, ::-1], problem.edges)
     directions = np.where(turned[:, None], -problem.directions, problem.directions)
@@ -104,11 +95,11 @@ def test_scores_do_not_depend_on_the_orientation_of_pairs(scores):
 
 def test_a_filter_composes_with_shapefit():
     problem = random_graph_problem(50, 0.5, 3, sigma=0.02, q=0.4, seed=8)
-    graph = view_graph(problem)
+    graph = problem.view_graph
     kept = baselines.filter_triangles(graph)
     filtered, cameras = graph.restricted_to(np.flatnonzero(kept))
     assert len(cameras) == 50
-    assert error(solve(filtered).locations, problem.locations) < 0.5 * error(
+    assert shape_error(solve(filtered).locations, problem.locations) < 0.5 * shape_error(
         solve(graph).locations, problem.locations
     )
 
@@ -137,4 +128,4 @@ def test_a_pair_in_no_triangle_is_kept():
 
 def test_on_exact_directions_no_axis_contradicts_the_order():
     problem = random_graph_problem(20, 1.0, 3, seed=10)
-    assert onedsfm_scores(view_graph(problem)).max() < 0.05
+    assert onedsfm_scores(problem.view_graph).max() < 0.05

@@ -1,6 +1,5 @@
 """COLMAP's models and databases are read right, refused in one sentence when bad, and never changed."""
 
-import hashlib
 import itertools
 import os
 import shutil
@@ -19,9 +18,9 @@ from sfm_shapefit.colmap.model import read_model, track_matches, world_rays
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
+from tests.scenes import fingerprint, real_scene
 
 EPS = np.finfo(np.float64).eps
-SHARED = Path(__file__).parents[2].parent / "shared" / "data"
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 
@@ -46,12 +45,6 @@ def folder(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
     path.mkdir()
     scene.write_binary(path)
     return path
-
-
-def digest(folder: Path) -> dict[str, str]:
-    """Hash every file below a folder, by name."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
 
 
 IDENTITY_POSE = (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -166,13 +159,13 @@ def test_images_without_a_pose_are_left_out(scene):
 def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
     scene, folder, tmp_path, capfd
 ):
-    before = digest(folder)
+    before = fingerprint(folder)
     copy = pycolmap.Reconstruction(scene)
     for source in (folder, copy):
         list(track_matches(read_model(source), 1))
     (tmp_path / "again").mkdir()
     copy.write_binary(tmp_path / "again")
-    assert digest(folder) == before == digest(tmp_path / "again")
+    assert fingerprint(folder) == before == fingerprint(tmp_path / "again")
     assert capfd.readouterr() == ("", "")
 
 
@@ -904,10 +897,10 @@ def test_a_locked_database_is_refused_in_seconds(scene, tmp_path):
 def test_reading_changes_no_byte_and_leaves_no_file(scene, tmp_path, journal_mode):
     path = write_database(tmp_path / "d.db", scene)
     edited(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
-    before = digest(tmp_path)
+    before = fingerprint(tmp_path)
     matches, _ = read_all(path, read_model(scene))
     assert len(matches) == 15
-    assert digest(tmp_path) == before
+    assert fingerprint(tmp_path) == before
 
 
 def test_rows_that_sit_in_a_wal_file_are_read_and_the_file_is_kept(scene, tmp_path):
@@ -916,14 +909,14 @@ def test_rows_that_sit_in_a_wal_file_are_read_and_the_file_is_kept(scene, tmp_pa
     writer.execute("PRAGMA journal_mode = wal")
     writer.execute("PRAGMA wal_autocheckpoint = 0")
     writer.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id(1, 2),))
-    before = digest(tmp_path)
+    before = fingerprint(tmp_path)
     assert set(before) == {"d.db", "d.db-wal", "d.db-shm"}
 
     matches, _ = read_all(path, read_model(scene))
 
     assert (0, 1) not in matches
     assert len(matches) == 14
-    assert digest(tmp_path) == before
+    assert fingerprint(tmp_path) == before
     writer.close()
 
 
@@ -938,10 +931,10 @@ def test_a_wal_file_left_by_a_crash_is_read_without_its_shm(scene, tmp_path):
     for name in ("d.db", "d.db-wal"):
         shutil.copyfile(work / name, crashed / name)
     writer.close()
-    before = digest(crashed)
+    before = fingerprint(crashed)
 
     assert len(read_all(crashed / "d.db", read_model(scene))[0]) == 14
-    assert digest(crashed) == before
+    assert fingerprint(crashed) == before
 
 
 def test_a_hot_journal_is_rolled_back_in_a_copy_only(scene, tmp_path):
@@ -960,10 +953,10 @@ def test_a_hot_journal_is_rolled_back_in_a_copy_only(scene, tmp_path):
     writer.execute("ROLLBACK")
     writer.close()
     assert (crashed / "d.db").read_bytes() != path.read_bytes()
-    before = digest(crashed)
+    before = fingerprint(crashed)
 
     assert len(read_all(crashed / "d.db", read_model(scene))[0]) == 15
-    assert digest(crashed) == before
+    assert fingerprint(crashed) == before
 
 
 def test_paths_that_mean_something_in_a_uri_are_read(scene, tmp_path):
@@ -990,9 +983,8 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
 # --- a real scene ------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(not (SHARED / "castle-P30").is_dir(), reason="the shared real scenes are not here")
 def test_a_real_scene_is_read_in_well_under_ten_seconds():
-    folder = SHARED / "castle-P30" / "sparse" / "0"
+    folder = real_scene("castle-P30") / "sparse" / "0"
     start = time.perf_counter()
     model = read_model(folder)
     with open_database(find_database(folder), model) as database:

@@ -31,8 +31,9 @@ from sfm_shapefit.colmap.structure import (
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
+from tests.problems import all_pairs
+from tests.scenes import real_scene
 
-SHARED_DATA = Path(__file__).parents[2].parent / "shared" / "data"
 NUM_IMAGES = 8
 RADIUS = 6.0
 
@@ -85,7 +86,7 @@ def ring_model(noise_px=0.0, num_points=120, seed=0, centers=None):
 
 def all_matches(num_points=120, n=NUM_IMAGES):
     """Every keypoint matched between every two images, in two batches."""
-    pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
+    pairs = np.array(all_pairs(n))
     return [batch_of(half, num_points) for half in np.array_split(pairs, 2)]
 
 
@@ -585,9 +586,7 @@ def test_adjustment_options_out_of_range_are_refused_by_name(name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "to_reach_m"), [("fountain-P11", 0.0023), ("castle-P19", 0.0263)])
 def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name, to_reach_m):
-    folder = SHARED_DATA / name
-    if not folder.exists():
-        pytest.skip(f"{folder} is not there")
+    folder = real_scene(name)
     found = locate(folder / "sparse" / "0", options=LocateOptions(bundle_adjust=True)).reconstruction
     truth = pycolmap.Reconstruction(folder / "gt")
     names = [found.image(i).name for i in sorted(found.images)]

@@ -145,7 +145,7 @@ def test_options_that_do_not_fit_the_source_are_refused(tmp_path, arguments, wor
 @pytest.mark.parametrize("objective", ["auto", "shapefit", "lud", "least-squares", "linf"])
 def test_every_objective_writes_the_same_files_and_only_shapefit_is_certified(tmp_path, objective):
     problem = random_graph_problem(14, 0.9, sigma=0.001, seed=5)
-    (tmp_path / "g.txt").write_text(graph_text(ViewGraph(14, problem.edges, problem.directions)))
+    (tmp_path / "g.txt").write_text(graph_text(problem.view_graph))
     solve(tmp_path / "g.txt", tmp_path / "out", "--objective", objective, "--quiet")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     found = centers_of(tmp_path / "out")
@@ -164,7 +164,7 @@ def test_every_objective_writes_the_same_files_and_only_shapefit_is_certified(tm
 
 def corrupted(seed=2):
     problem = random_graph_problem(25, 0.8, sigma=0.002, q=0.2, seed=seed)
-    return problem, ViewGraph(25, problem.edges, problem.directions)
+    return problem, problem.view_graph
 
 
 @pytest.mark.parametrize("name", ["1dsfm", "triangles"])

@@ -17,6 +17,7 @@ from sfm_shapefit.directions import (
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 from tests.scenes import COURTYARD
 
 FOCAL_PX = 1000.0
@@ -341,7 +342,7 @@ def test_weights_make_the_locations_of_uneven_pairs_better():
     for seed in range(5):
         rng = np.random.default_rng(seed)
         truth = rng.standard_normal((20, 3))
-        edges = np.array([(i, j) for i in range(20) for j in range(i + 1, 20)])
+        edges = np.array(all_pairs(20))
         sigmas_deg = np.where(rng.random(len(edges)) < 0.3, 0.03, 1.5)
         noise = np.radians(sigmas_deg)[:, None] * rng.standard_normal((len(edges), 3))
         directions = normalized(normalized(truth[edges[:, 0]] - truth[edges[:, 1]]) + noise)

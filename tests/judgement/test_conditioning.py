@@ -8,6 +8,7 @@ from sfm_shapefit.judgement.conditioning import Looseness
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 
 SIGMA = 0.003  # rad
 
@@ -20,10 +21,6 @@ def judged(t, edges):
     return assess(
         ViewGraph(len(t), edges, v), t, np.tile(SIGMA**2 * np.eye(t.shape[1] - 1), (len(edges), 1, 1))
     )
-
-
-def all_pairs(n):
-    return [(i, j) for i in range(n) for j in range(i + 1, n)]
 
 
 def test_a_well_tied_scene_has_no_loose_group():

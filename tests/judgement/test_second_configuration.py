@@ -11,7 +11,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 
 def judged(problem, inliers=None, level_deg=0.5):
-    graph = ViewGraph(len(problem.locations), problem.edges, problem.directions)
+    graph = problem.view_graph
     inliers = ~problem.corrupted if inliers is None else inliers
     return find_rival(graph, np.arange(graph.num_edges), inliers, level_deg)
 
@@ -55,7 +55,7 @@ def test_a_few_pairs_that_agree_are_no_rival():
 
 def test_directions_to_points_are_not_heard():
     problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.4, seed=5, corruption="self-consistent")
-    graph = ViewGraph(60, problem.edges, problem.directions)
+    graph = problem.view_graph
     assert find_rival(graph, np.flatnonzero(~problem.corrupted), ~problem.corrupted, 0.5) is None
 
 

@@ -9,6 +9,7 @@ from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.judgement.verdicts import Verdict, assess
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 
 SIGMA = 0.01  # rad, per axis
 
@@ -17,7 +18,7 @@ def measured(seed, n=12, sigma=SIGMA):
     """All pairs of n cameras, directions with normal errors of `sigma` per axis."""
     rng = np.random.default_rng(seed)
     t = rng.standard_normal((n, 3))
-    edges = np.array([(i, j) for i in range(n) for j in range(i + 1, n)])
+    edges = np.array(all_pairs(n))
     v = normalized(differences(t, edges))
     errors = sigma * rng.standard_normal((len(edges), 2))
     return t, edges, normalized(v + np.einsum("edk,ek->ed", tangent_bases(v), errors))

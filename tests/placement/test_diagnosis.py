@@ -10,11 +10,9 @@ import sfm_shapefit
 from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
 from sfm_shapefit.cli import app
 from sfm_shapefit.formats import graph_text
-from sfm_shapefit.geometry import normalized
 from sfm_shapefit.placement.diagnosis import diagnose, direction_spread, theory_of
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import (
     box_graph_problem,
     community_graph_problem,
@@ -23,6 +21,7 @@ from sfm_shapefit.synthetic import (
     trajectory_graph_problem,
 )
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs, exact_graph
 from tests.scenes import COURTYARD, RING, copied, fingerprint
 
 FAMILIES = {
@@ -35,23 +34,14 @@ FAMILIES = {
 }
 
 
-def complete(nodes):
-    nodes = list(nodes)
-    return [(i, j) for i in nodes for j in nodes if i < j]
-
-
-def exact(t, edges):
-    return ViewGraph(len(t), edges, normalized(differences(t, np.array(edges))))
-
-
 def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_pieces_hinges_and_components_are_counted_and_named():
     t = np.random.default_rng(0).standard_normal((11, 3))
-    edges = complete(range(5)) + complete((4, 5, 6)) + [(0, 7)] + complete((8, 9, 10))
-    seen = diagnose(exact(t, edges))
+    edges = all_pairs(5) + all_pairs((4, 5, 6)) + [(0, 7)] + all_pairs((8, 9, 10))
+    seen = diagnose(exact_graph(t, edges))
     assert seen.components == (8, 3)
     assert [(piece.num_cameras, piece.hinges) for piece in seen.pieces] == [(5, ("4",)), (3, ("4",)), (3, ())]
     assert seen.left_out["7"] == "pendant: joined by a single pair to camera 0"
@@ -65,28 +55,28 @@ def test_pieces_hinges_and_components_are_counted_and_named():
 def test_the_share_of_wrong_pairs_is_estimated_up_to_a_half(family, sigma):
     for q, off in ((0.0, 0.01), (0.2, 0.03), (0.4, 0.06), (0.5, 0.09)):  # the documented bounds
         problem = FAMILIES[family](sigma=sigma, q=q, seed=3)
-        graph = ViewGraph(len(problem.locations), problem.edges, problem.directions)
+        graph = problem.view_graph
         assert diagnose(graph).corruption.share == pytest.approx(problem.corrupted.mean(), abs=off)
 
 
 def test_only_pairs_in_triangles_say_something_of_corruption():
     t = np.random.default_rng(1).standard_normal((6, 3))
     square = [(0, 1), (1, 2), (2, 3), (0, 3)]
-    assert diagnose(exact(t[:4], square)).corruption.share is None
+    assert diagnose(exact_graph(t[:4], square)).corruption.share is None
     with_triangle = [*square, (3, 4), (3, 5), (4, 5)]
-    corruption = diagnose(exact(t, with_triangle)).corruption
+    corruption = diagnose(exact_graph(t, with_triangle)).corruption
     assert (corruption.num_checked, corruption.share) == (3, 0.0)
 
 
 def test_a_camera_seen_in_one_direction_only_is_weak_and_named_so():
     t = np.random.default_rng(2).standard_normal((10, 3))
     t[9] = [0.0, 0.0, 60.0]
-    (weak,) = diagnose(exact(t, complete(range(10)))).weak
+    (weak,) = diagnose(exact_graph(t, all_pairs(10))).weak
     assert weak.name == "9"
     assert weak.num_pairs == 9
     assert "nearly parallel" in weak.reasons[0]
-    edges = [*complete(range(9)), (0, 9), (1, 9)]
-    (weak,) = diagnose(exact(t, edges)).weak
+    edges = [*all_pairs(9), (0, 9), (1, 9)]
+    (weak,) = diagnose(exact_graph(t, edges)).weak
     assert [reason.split(":")[0] for reason in weak.reasons] == [
         "two pairs or fewer hold it",
         "the directions that hold it are nearly parallel",
@@ -96,7 +86,7 @@ def test_a_camera_seen_in_one_direction_only_is_weak_and_named_so():
 def test_a_wrong_pair_does_not_hide_that_the_others_are_parallel():
     t = np.random.default_rng(2).standard_normal((10, 3))
     t[9] = [0.0, 0.0, 60.0]
-    graph = exact(t, complete(range(10)))
+    graph = exact_graph(t, all_pairs(10))
     v = graph.directions.copy()
     v[(graph.edges == (0, 9)).all(axis=1)] = [1.0, 0.0, 0.0]
     assert [camera.name for camera in diagnose(ViewGraph(10, graph.edges, v)).weak] == ["9"]
@@ -104,7 +94,7 @@ def test_a_wrong_pair_does_not_hide_that_the_others_are_parallel():
 
 def test_a_camera_of_contradicting_matches_is_weak():
     t = np.random.default_rng(3).standard_normal((8, 3))
-    graph = exact(t, [pair for pair in complete(range(8)) if pair not in {(0, 7), (1, 7), (2, 7), (3, 7)}])
+    graph = exact_graph(t, [pair for pair in all_pairs(8) if pair not in {(0, 7), (1, 7), (2, 7), (3, 7)}])
     against = np.array([(0, 7), (1, 7), (2, 7), (3, 7)])
     assert diagnose(graph).weak == ()
     (weak,) = diagnose(graph, contradicting=against).weak
@@ -114,11 +104,11 @@ def test_a_camera_of_contradicting_matches_is_weak():
 
 def test_rays_to_points_hold_a_camera_too():
     t = np.random.default_rng(4).standard_normal((9, 3))
-    edges = complete(range(5)) + [(0, 5), (1, 5)] + [(k, p) for p in (6, 7, 8) for k in (0, 2, 3, 5)]
-    seen = diagnose(exact(t, edges), num_cameras=6)
+    edges = all_pairs(5) + [(0, 5), (1, 5)] + [(k, p) for p in (6, 7, 8) for k in (0, 2, 3, 5)]
+    seen = diagnose(exact_graph(t, edges), num_cameras=6)
     assert (seen.num_cameras, seen.num_points, seen.num_pairs) == (6, 3, 12)
     assert seen.weak == ()
-    assert [camera.name for camera in diagnose(exact(t[:6], edges[:12])).weak] == ["5"]
+    assert [camera.name for camera in diagnose(exact_graph(t[:6], edges[:12])).weak] == ["5"]
 
 
 def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
@@ -130,7 +120,7 @@ def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
 @pytest.mark.parametrize("method", ["auto", "admm"])
 def test_the_plan_is_what_a_placement_does(method):
     problem = random_graph_problem(30, seed=5, sigma=0.01)
-    graph = ViewGraph(30, problem.edges, problem.directions)
+    graph = problem.view_graph
     options = PlacementOptions(method=method, tol=1e-4)
     plan, done = diagnose(graph, options).plan, place(graph, options)
     assert plan.solver == done.solve.method
@@ -141,7 +131,7 @@ def test_the_plan_is_what_a_placement_does(method):
 
 def test_the_plan_says_what_becomes_of_the_starts():
     t = np.random.default_rng(6).standard_normal((5, 3))
-    graph = exact(t, complete(range(5)))
+    graph = exact_graph(t, all_pairs(5))
     said = {
         "better is kept, refined": PlacementOptions(),
         "better is kept, unrefined": PlacementOptions(refine=False),
@@ -150,12 +140,12 @@ def test_the_plan_says_what_becomes_of_the_starts():
     }
     for words, options in said.items():
         assert words in diagnose(graph, options).plan.finish
-    assert "no second start" in diagnose(exact(t[:2], [(0, 1)])).plan.finish
+    assert "no second start" in diagnose(exact_graph(t[:2], [(0, 1)])).plan.finish
 
 
 def test_theory_is_given_in_words_or_left_out_with_the_reason():
     problem = random_graph_problem(12, 1.0, seed=7)
-    graph = ViewGraph(12, problem.edges, problem.directions)
+    graph = problem.view_graph
     found = theory_of(graph, problem.locations)
     assert "less than one pair of 12 cameras" in found.statement
     assert found.conditions.granted_in_space > 0.0
@@ -163,7 +153,7 @@ def test_theory_is_given_in_words_or_left_out_with_the_reason():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("sfm_shapefit.placement.diagnosis.MAX_THEORY_CAMERAS", 11)
         assert theory_of(graph, problem.locations).conditions is None
-    chain = exact(problem.locations, [(k, k + 1) for k in range(11)])
+    chain = exact_graph(problem.locations, [(k, k + 1) for k in range(11)])
     assert "p-typical for no p" in theory_of(chain, problem.locations).statement
 
 
@@ -207,7 +197,7 @@ def test_json_has_the_same_content_and_theory():
 
 def test_a_bare_graph_is_diagnosed_too(tmp_path):
     t = np.random.default_rng(8).standard_normal((6, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact(t, [*complete(range(5)), (0, 5)])))
+    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
     result = run("inspect", tmp_path / "graph.txt", "--theory")
     assert result.exit_code == 0
     assert "5: pendant" in result.stdout
@@ -220,7 +210,7 @@ def test_a_bare_graph_is_diagnosed_too(tmp_path):
 
 def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):
     t = np.random.default_rng(9).standard_normal((5, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact(t, [(k, (k + 1) % 5) for k in range(5)])))
+    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [(k, (k + 1) % 5) for k in range(5)])))
     result = run("inspect", tmp_path / "graph.txt", "--json")
     assert result.exit_code == 4
     facts = json.loads(result.stdout)["diagnosis"]

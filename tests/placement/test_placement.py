@@ -12,13 +12,14 @@ from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 
 
 def two_pieces():
     """Five cameras 0-4 after three cameras 4-6 hinged at 4; the small piece's edges come first."""
     t = np.random.default_rng(0).standard_normal((7, 3))
     small = [(4, 5), (4, 6), (5, 6)]
-    large = [(i, j) for i in range(5) for j in range(i + 1, 5)]
+    large = all_pairs(5)
     edges = np.array(small + large)
     return t, edges, normalized(differences(t, edges))
 
@@ -26,7 +27,7 @@ def two_pieces():
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_every_dimension_is_placed_and_judged(d):
     problem = random_graph_problem(24, 0.9, d=d, sigma=1e-3, q=0.1, seed=d)
-    placement = place(ViewGraph(24, problem.edges, problem.directions))
+    placement = place(problem.view_graph)
     outliers = ~placement.assessment.inliers
     assert outliers[problem.corrupted].all()
     # The solution is a little off where a camera has few good pairs, and then so are one or two of them.
@@ -105,7 +106,7 @@ def test_directions_that_do_not_fit_together_raise_the_alarm():
 
 def test_mostly_contradicting_pairs_raise_the_alarm():
     problem = random_graph_problem(14, 1.0, sigma=1e-4, q=0.0, seed=5)
-    placement = place(ViewGraph(14, problem.edges, problem.directions))
+    placement = place(problem.view_graph)
     judged = dataclasses.replace(placement.assessment, inliers=np.arange(len(problem.edges)) % 3 == 0)
     warnings = list(quality_warnings(dataclasses.replace(placement, assessment=judged)))
     assert any("66% of the pairs contradict the solution" in warning for warning in warnings)
@@ -115,7 +116,7 @@ def test_a_loose_camera_is_named():
     problem = random_graph_problem(12, 1.0, seed=4)
     t = problem.locations.copy()
     t[11] = 2.0 * t[1] - t[0] + [0.0, 0.0, 1e-3]  # behind camera 1 as seen from camera 0: it may slide
-    edges = np.array([(i, j) for i in range(11) for j in range(i + 1, 11)] + [(0, 11), (1, 11)])
+    edges = np.array([*all_pairs(11), (0, 11), (1, 11)])
     noise = 1e-3 * np.random.default_rng(4).standard_normal((len(edges), 3))
     graph = ViewGraph(
         12,

@@ -21,25 +21,10 @@ from sfm_shapefit.synthetic import (
     ring_graph_problem,
     trajectory_graph_problem,
 )
-from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import shape_error
 
 NOISE = {"sigma": 0.01, "q": 0.2, "seed": 0}
 Floats = npt.NDArray[np.float64]
-
-
-def view_graph(problem: GraphProblem) -> ViewGraph:
-    """Return the measurements of a problem."""
-    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
-
-
-def paper_error(locations: Floats, truth: Floats) -> float:
-    """Return the distance of two sets (n, d), each centred and of unit norm (Hand et al. 2015, section 4)."""
-
-    def unit(t: Floats) -> Floats:
-        centred = t - t.mean(axis=0)
-        return np.asarray(centred / np.linalg.norm(centred))
-
-    return float(np.linalg.norm(unit(locations) - unit(truth)))
 
 
 def oracle(problem: GraphProblem, steps: int = 6) -> Floats:
@@ -83,41 +68,41 @@ CHAINS = {
 @pytest.mark.parametrize("family", USUAL)
 def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
     problem = USUAL[family]()
-    placement = place(view_graph(problem))
-    best = paper_error(oracle(problem), problem.locations)
+    placement = place(problem.view_graph)
+    best = shape_error(oracle(problem), problem.locations)
     assert len(placement.cameras) == len(problem.locations)
     assert not placement.finish.collapsed
-    assert paper_error(placement.locations, problem.locations) <= 1.08 * best  # measured 1.02 to 1.04
-    assert paper_error(placement.solve.locations, problem.locations) > 1.5 * best
+    assert shape_error(placement.locations, problem.locations) <= 1.08 * best  # measured 1.02 to 1.04
+    assert shape_error(placement.solve.locations, problem.locations) > 1.5 * best
 
 
 @pytest.mark.parametrize("family", CHAINS)
 def test_chains_on_which_shapefit_collapses_are_placed(family):
     problem = CHAINS[family]()
-    placement = place(view_graph(problem))
+    placement = place(problem.view_graph)
     finish = placement.finish
     assert finish.lud is not None
-    assert paper_error(placement.solve.locations, problem.locations) > 0.3
+    assert shape_error(placement.solve.locations, problem.locations) > 0.3
     assert finish.collapsed
     assert finish.start == "LUD"
-    error = paper_error(placement.locations, problem.locations)
-    assert error <= 1.3 * paper_error(oracle(problem), problem.locations)  # measured 0.95 to 1.13
-    assert error < paper_error(finish.lud.locations, problem.locations)
+    error = shape_error(placement.locations, problem.locations)
+    assert error <= 1.3 * shape_error(oracle(problem), problem.locations)  # measured 0.95 to 1.13
+    assert error < shape_error(finish.lud.locations, problem.locations)
 
 
 def test_strips_flown_back_and_forth_are_placed_with_nearly_a_third_of_wrong_directions():
     problem = lawn_graph_problem(200, 20.0, sigma=0.01, q=0.3, seed=0)
-    placement = place(view_graph(problem))
-    best = paper_error(oracle(problem), problem.locations)
-    assert paper_error(placement.locations, problem.locations) <= 1.08 * best
-    assert paper_error(placement.solve.locations, problem.locations) > 5.0 * best
+    placement = place(problem.view_graph)
+    best = shape_error(oracle(problem), problem.locations)
+    assert shape_error(placement.locations, problem.locations) <= 1.08 * best
+    assert shape_error(placement.solve.locations, problem.locations) > 5.0 * best
 
 
 def test_the_plane_is_as_good_a_space():
     problem = random_graph_problem(60, 0.5, d=2, sigma=0.01, q=0.1, seed=1)
-    placement = place(view_graph(problem))
-    best = paper_error(oracle(problem), problem.locations)
-    assert paper_error(placement.locations, problem.locations) <= 1.15 * best  # fewer equations per unknown
+    placement = place(problem.view_graph)
+    best = shape_error(oracle(problem), problem.locations)
+    assert shape_error(placement.locations, problem.locations) <= 1.15 * best  # fewer equations per unknown
 
 
 def test_the_oracle_is_a_least_squares_fit():

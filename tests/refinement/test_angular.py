@@ -23,6 +23,7 @@ from sfm_shapefit.synthetic import (
     random_graph_problem,
 )
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import shape, shape_error
 
 
 def graph_of(problem: GraphProblem, rows=slice(None)) -> ViewGraph:
@@ -37,15 +38,6 @@ def refined(graph: ViewGraph, start, metric=None):
     plan = plan_refinement(graph)
     assert plan is not None
     return refine_angles(graph, start, metric or one_class(graph), plan)
-
-
-def unit(t):
-    centred = t - t.mean(axis=0)
-    return centred / np.linalg.norm(centred)
-
-
-def error(t, truth) -> float:
-    return float(np.linalg.norm(unit(t) - unit(truth)))
 
 
 def shaken(problem: GraphProblem, share: float, seed: int = 0):
@@ -72,16 +64,16 @@ def isotropic(sigma: float, graph: ViewGraph):
 )
 def test_a_rough_start_ends_as_well_as_knowing_the_right_directions(problem):
     """The oracle has the right directions alone and starts at the truth."""
-    graph, right = graph_of(problem), graph_of(problem, ~problem.corrupted)
-    oracle = error(refined(right, problem.locations).locations, problem.locations)
+    graph, right = problem.view_graph, graph_of(problem, ~problem.corrupted)
+    oracle = shape_error(refined(right, problem.locations).locations, problem.locations)
     found = refined(graph, shaken(problem, 0.05))
-    assert error(found.locations, problem.locations) <= 1.08 * oracle
+    assert shape_error(found.locations, problem.locations) <= 1.08 * oracle
 
 
 def test_the_kernel_costs_little_where_nothing_is_wrong():
     """Against plain least squares, whose optimum is where the gradient of the sum of squares vanishes."""
     problem = random_graph_problem(40, 0.6, sigma=0.03, seed=4)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     t = refined(graph, problem.locations).locations.copy()
     for _ in range(20):  # Gauss-Newton of sum |u - v|^2, by dense algebra
         d = differences(t, graph.edges)
@@ -93,35 +85,35 @@ def test_the_kernel_costs_little_where_nothing_is_wrong():
         jacobian[rows, :, graph.edges[:, 0]] = slope
         jacobian[rows, :, graph.edges[:, 1]] = -slope
         step = np.linalg.lstsq(jacobian.reshape(-1, 120), (graph.directions - u).ravel(), rcond=1e-8)[0]
-        t = unit(t + step.reshape(40, 3))
-    least_squares = error(t, problem.locations)
+        t = shape(t + step.reshape(40, 3))
+    least_squares = shape_error(t, problem.locations)
     # Measured 1.04 over families; Geman-McClure of the same width takes 1.18.
-    assert error(refined(graph, problem.locations).locations, problem.locations) <= 1.08 * least_squares
+    assert shape_error(refined(graph, problem.locations).locations, problem.locations) <= 1.08 * least_squares
 
 
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_exact_directions_with_wrong_ones_among_them_give_the_truth_in_every_dimension(d):
     problem = random_graph_problem(30, 0.9, d=d, q=0.15, seed=d)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     found = refined(graph, shaken(problem, 0.02))
-    assert error(found.locations, problem.locations) < 1e-9
+    assert shape_error(found.locations, problem.locations) < 1e-9
     assert found.levels_rad == pytest.approx(angular._LEAST_LEVEL_RAD)  # it does not fall to the rounding
 
 
 def test_an_exact_start_stays_exact():
     problem = random_graph_problem(30, 0.5, q=0.2, seed=7)
-    found = refined(graph_of(problem), problem.locations)
-    assert error(found.locations, problem.locations) < 1e-12
+    found = refined(problem.view_graph, problem.locations)
+    assert shape_error(found.locations, problem.locations) < 1e-12
 
 
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_the_smallest_graphs_are_refined_too(n, d):
     problem = random_graph_problem(n, 1.0, d=d, sigma=1e-3, seed=1)
-    found = refined(graph_of(problem), problem.locations)
+    found = refined(problem.view_graph, problem.locations)
     assert np.isfinite(found.locations).all()
     assert np.linalg.norm(found.locations) == pytest.approx(1.0)
-    assert error(found.locations, problem.locations) < 0.02
+    assert shape_error(found.locations, problem.locations) < 0.02
 
 
 # --- what never happens ----------------------------------------------------------------------------
@@ -130,7 +122,7 @@ def test_the_smallest_graphs_are_refined_too(n, d):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_cost_is_never_above_the_start_at_the_final_levels(seed):
     problem = random_graph_problem(30, 0.4, sigma=0.1, q=0.5, seed=seed)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     start = np.random.default_rng(seed).standard_normal((30, 3))  # nothing fits
     for t in (start, problem.locations):
         found = refined(graph, t)
@@ -142,11 +134,11 @@ def test_the_cost_is_never_above_the_start_at_the_final_levels(seed):
 
 def test_a_start_is_kept_if_nothing_better_is_found(monkeypatch):
     problem = random_graph_problem(20, 0.6, sigma=0.01, seed=3)
-    graph = graph_of(problem)
-    worse = unit(shaken(problem, 0.5))
+    graph = problem.view_graph
+    worse = shape(shaken(problem, 0.5))
     monkeypatch.setattr(angular, "_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
     found = refined(graph, problem.locations)
-    np.testing.assert_allclose(found.locations, unit(problem.locations), rtol=1e-12)
+    np.testing.assert_allclose(found.locations, shape(problem.locations), rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -156,19 +148,19 @@ def test_a_camera_whose_pairs_are_all_wrong_neither_flies_nor_drags_others_along
     ends = np.flatnonzero((problem.edges == 7).any(axis=1))
     v[ends] = normalized(np.random.default_rng(seed).standard_normal((len(ends), 3)))
     found = refined(ViewGraph(40, problem.edges, v), problem.locations)
-    moved = np.linalg.norm(unit(found.locations) - unit(problem.locations), axis=1)
-    extent = median_spread(unit(problem.locations))
+    moved = np.linalg.norm(shape(found.locations) - shape(problem.locations), axis=1)
+    extent = median_spread(shape(problem.locations))
     assert (
         moved[7] < 2.0 * extent
     )  # within the scene, 2 to 3 extents wide; a camera that flies is at 10 to 1e6
     # The others are as good among themselves as without it: noise of 0.005, about 14 pairs each.
-    assert error(np.delete(found.locations, 7, 0), np.delete(problem.locations, 7, 0)) < 0.005
+    assert shape_error(np.delete(found.locations, 7, 0), np.delete(problem.locations, 7, 0)) < 0.005
 
 
 def test_a_camera_without_any_pull_is_held_where_it_was():
     """Rejected pairs weigh next to nothing; the damping alone must not let their camera go."""
     problem = random_graph_problem(30, 0.8, seed=1)
-    graph, start = graph_of(problem), unit(problem.locations)
+    graph, start = problem.view_graph, shape(problem.locations)
     information = angular._information(graph, None, np.full(graph.num_edges, 1e-4))
     far = start.copy()
     far[3] += [0.3, -0.2, 0.1]
@@ -188,14 +180,14 @@ def test_cameras_at_one_place_do_no_harm():
     v[~np.isfinite(v).all(axis=1)] = [0.0, 0.6, 0.8]
     found = refined(ViewGraph(25, problem.edges, v), t)
     assert np.isfinite(found.locations).all()
-    assert error(found.locations, t) < 1e-2  # the one random direction drives the two a little apart
+    assert shape_error(found.locations, t) < 1e-2  # the one random direction drives the two a little apart
 
 
 @pytest.mark.parametrize("steep", [False, True])
 def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_length(steep):
     problem = random_graph_problem(12, 1.0, sigma=0.02, seed=6)
-    t = unit(problem.locations)
-    graph = graph_of(problem)
+    t = shape(problem.locations)
+    graph = problem.view_graph
     floor = angular._SHORTEST * np.median(np.linalg.norm(differences(t, graph.edges), axis=1))
     t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = angular._information(graph, None, np.full(graph.num_edges, 0.05))
@@ -212,7 +204,7 @@ def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_leng
 
 def test_the_answer_is_the_same_to_the_bit_each_time():
     problem = box_graph_problem(80, 16.0, sigma=0.02, q=0.2, seed=9)
-    graph, start = graph_of(problem), shaken(problem, 0.02)
+    graph, start = problem.view_graph, shaken(problem, 0.02)
     first, second = refined(graph, start), refined(graph, start)
     assert np.array_equal(first.locations, second.locations)
     assert first.cost == second.cost
@@ -241,15 +233,15 @@ def contradicting_pair(sigma_of_right: float, sigma_of_bent: float):
 def test_a_pair_of_small_covariance_wins_over_one_of_large():
     graph, covariance, t, moved = contradicting_pair(1e-3, 0.05)
     found = refined(graph, t, one_class(graph, covariance))
-    assert error(found.locations, t) < 0.1 * error(moved, t)
+    assert shape_error(found.locations, t) < 0.1 * shape_error(moved, t)
     graph, covariance, t, moved = contradicting_pair(0.05, 1e-3)
     found = refined(graph, t, one_class(graph, covariance))
-    assert error(found.locations, moved) < 0.1 * error(moved, t)
+    assert shape_error(found.locations, moved) < 0.1 * shape_error(moved, t)
 
 
 def test_an_unknown_covariance_leaves_the_level_alone_to_speak():
     problem = random_graph_problem(25, 0.6, sigma=0.01, q=0.1, seed=3)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     unknown = np.full((graph.num_edges, 2, 2), np.nan)
     with_nan = refined(graph, problem.locations, one_class(graph, unknown))
     without = refined(graph, problem.locations)
@@ -261,7 +253,7 @@ def test_an_unknown_covariance_leaves_the_level_alone_to_speak():
 
 def test_the_metric_is_the_inverse_of_covariance_and_level():
     problem = random_graph_problem(5, 1.0, seed=1)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     a = np.random.default_rng(0).standard_normal((graph.num_edges, 2, 2))
     covariance = a @ a.transpose(0, 2, 1)
     metric = one_class(graph, covariance)
@@ -288,13 +280,15 @@ def test_each_class_finds_its_own_level():
     # roughly, as the sharp class does most of the fitting.
     assert found.levels_rad == pytest.approx([0.01, 0.001], rel=0.15)
     together = refined(graph, problem.locations)
-    assert error(found.locations, problem.locations) < 0.9 * error(together.locations, problem.locations)
+    assert shape_error(found.locations, problem.locations) < 0.9 * shape_error(
+        together.locations, problem.locations
+    )
 
 
 def test_a_class_that_is_not_fitted_yet_keeps_its_level():
     problem = random_graph_problem(30, 1.0, seed=1)
     noise = np.random.default_rng(0).standard_normal((30, 3))
-    graph = graph_of(problem)
+    graph = problem.view_graph
     levels = residual_levels(graph, noise, one_class(graph), np.array([0.01]))
     assert levels == pytest.approx(0.01)
 
@@ -312,7 +306,7 @@ def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
 
 def test_a_rival_out_of_reach_ends_the_refinement_early():
     problem = random_graph_problem(40, 0.5, sigma=0.02, q=0.2, seed=2)
-    graph, plan = graph_of(problem), plan_refinement(graph_of(problem))
+    graph, plan = problem.view_graph, plan_refinement(problem.view_graph)
     assert plan is not None
     best = refined(graph, problem.locations)
     again = refine_angles(graph, shaken(problem, 0.05), one_class(graph), plan, rival=best.locations)
@@ -330,9 +324,11 @@ def test_the_refinement_improves_the_certified_optimum_on_noisy_data():
         q=0.1,
         seed=4,
     )
-    graph = graph_of(problem)
+    graph = problem.view_graph
     start = solve(graph).locations
-    assert error(refined(graph, start).locations, problem.locations) < 0.8 * error(start, problem.locations)
+    assert shape_error(refined(graph, start).locations, problem.locations) < 0.8 * shape_error(
+        start, problem.locations
+    )
 
 
 # --- symmetries ------------------------------------------------------------------------------------
@@ -340,7 +336,7 @@ def test_the_refinement_improves_the_certified_optimum_on_noisy_data():
 
 def test_the_answer_is_a_stationary_point_of_the_robust_cost():
     problem = random_graph_problem(20, 0.9, sigma=0.02, q=0.15, seed=5)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     found = refined(graph, shaken(problem, 0.05))
     scale = np.abs(found.locations).max()
 
@@ -384,13 +380,13 @@ def test_a_direction_counts_in_its_own_metric():
     unknown = refined(graph, start, Metric(None, classes))
     none_known = refined(graph, start, Metric(np.full_like(covariance, np.nan), classes))
     truth = problem.locations
-    assert error(known.locations, truth) < 0.8 * error(unknown.locations, truth)
+    assert shape_error(known.locations, truth) < 0.8 * shape_error(unknown.locations, truth)
     np.testing.assert_allclose(none_known.locations, unknown.locations, atol=1e-6)
 
 
 def test_origin_scale_and_axes_of_the_start_do_not_matter():
     problem = random_graph_problem(30, 0.6, sigma=0.01, q=0.1, seed=10)
-    graph, start = graph_of(problem), shaken(problem, 0.05)
+    graph, start = problem.view_graph, shaken(problem, 0.05)
     plain = refined(graph, start)
     moved = refined(graph, 1e4 * start + [300.0, -20.0, 7.0])
     np.testing.assert_allclose(moved.locations, plain.locations, atol=1e-7)
@@ -403,7 +399,7 @@ def test_origin_scale_and_axes_of_the_start_do_not_matter():
 
 def test_an_edge_of_weight_two_counts_as_two():
     problem = random_graph_problem(25, 0.5, sigma=0.02, seed=12)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     weights = np.where(np.arange(graph.num_edges) % 3 == 0, 2.0, 1.0)
     heavy = ViewGraph(25, graph.edges, graph.directions, weights)
     levels = np.array([0.01])

@@ -19,22 +19,11 @@ from sfm_shapefit.synthetic import (
     trajectory_graph_problem,
 )
 from sfm_shapefit.viewgraph import ViewGraph
-
-
-def graph_of(problem) -> ViewGraph:
-    return ViewGraph(len(problem.locations), problem.edges, problem.directions)
-
-
-def error(t, truth) -> float:
-    def unit(x):
-        centred = x - x.mean(axis=0)
-        return centred / np.linalg.norm(centred)
-
-    return float(np.linalg.norm(unit(t) - unit(truth)))
+from tests.problems import shape_error
 
 
 def finished(problem, **options):
-    graph, settings = graph_of(problem), PlacementOptions(**options)
+    graph, settings = problem.view_graph, PlacementOptions(**options)
     return finish(graph, solve(graph, settings), settings)
 
 
@@ -53,16 +42,16 @@ def expander():
 
 
 def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
-    graph = graph_of(chain)
+    graph = chain.view_graph
     found = finished(chain)
-    assert error(solve(graph).locations, chain.locations) > 0.3
+    assert shape_error(solve(graph).locations, chain.locations) > 0.3
     assert found.start == "LUD"
     assert found.collapsed
     assert found.disagreement > COLLAPSED
     assert "disagree" in found.reason
     assert found.statement().startswith("LUD, refined in angles")
-    assert error(found.locations, chain.locations) < 0.05
-    assert error(found.locations, chain.locations) < error(found.lud.locations, chain.locations)
+    assert shape_error(found.locations, chain.locations) < 0.05
+    assert shape_error(found.locations, chain.locations) < shape_error(found.lud.locations, chain.locations)
     assert found.costs["LUD"] < found.costs["ShapeFit"]
 
 
@@ -70,12 +59,12 @@ def test_where_both_starts_agree_nothing_is_said_of_a_collapse(expander):
     found = finished(expander)
     assert not found.collapsed
     assert "not by a collapse" in found.reason
-    assert error(found.locations, expander.locations) < 0.02
+    assert shape_error(found.locations, expander.locations) < 0.02
     assert found.costs["LUD"] == pytest.approx(found.costs["ShapeFit"], rel=1e-3)
 
 
 def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_chain(chain):
-    graph = graph_of(chain)
+    graph = chain.view_graph
     options = PlacementOptions(objective="shapefit")
     placement = place(graph, options)
     assert np.array_equal(placement.locations, placement.solve.locations)
@@ -91,7 +80,7 @@ def test_lud_is_taken_whatever_its_fit_if_asked(expander):
     found = finished(expander, objective="lud")
     assert (found.start, found.refined) == ("LUD", True)
     raw = finished(expander, objective="lud", refine=False)
-    assert error(raw.locations, raw.lud.locations) < 1e-12
+    assert shape_error(raw.locations, raw.lud.locations) < 1e-12
     assert not raw.refined
     assert raw.statement() == "LUD, not refined: LUD, as asked"
 
@@ -101,7 +90,7 @@ def test_without_refinement_the_start_that_fits_better_is_kept_as_it_is(chain):
     assert found.start == "LUD"
     assert not found.refined
     assert found.moved == (0.0, 0.0)
-    assert error(found.locations, found.lud.locations) < 1e-12
+    assert shape_error(found.locations, found.lud.locations) < 1e-12
 
 
 def start(name: str) -> Start:
@@ -145,12 +134,15 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noise_free_answers_are_exact_and_not_made_worse(d):
     problem = random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
-    graph = graph_of(problem)
+    graph = problem.view_graph
     certified = solve(graph)
     found = finish(graph, certified, PlacementOptions())
-    assert error(found.locations, problem.locations) < 1e-9
+    assert shape_error(found.locations, problem.locations) < 1e-9
     # Rounding apart: the certified answer is exact to 1e-9 itself, or better.
-    assert error(found.locations, problem.locations) <= error(certified.locations, problem.locations) + 1e-12
+    assert (
+        shape_error(found.locations, problem.locations)
+        <= shape_error(certified.locations, problem.locations) + 1e-12
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
@@ -158,12 +150,12 @@ def test_the_smallest_graphs_are_finished(n):
     problem = random_graph_problem(n, 1.0, sigma=1e-3, seed=2)
     found = finished(problem)
     assert np.isfinite(found.locations).all()
-    assert error(found.locations, problem.locations) < 0.02
+    assert shape_error(found.locations, problem.locations) < 0.02
     assert (found.lud is None) == (n == 2)
 
 
 def test_the_answer_has_the_scale_of_the_solver(expander):
-    graph, found = graph_of(expander), finished(expander)
+    graph, found = expander.view_graph, finished(expander)
     along = np.sum(differences(found.locations, graph.edges) * graph.directions, axis=1)
     assert along.mean() == pytest.approx(1.0)
     np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
@@ -223,12 +215,12 @@ def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
     n = street.num_cameras
     graph = ViewGraph(len(street.locations), street.edges, street.directions)
     joint = place(graph, covariance=street.covariance, num_cameras=n)
-    assert error(joint.locations, street.locations[joint.cameras]) < 0.01
+    assert shape_error(joint.locations, street.locations[joint.cameras]) < 0.01
     pairs = (street.edges < n).all(axis=1)
     bare = place(
         ViewGraph(n, street.edges[pairs], street.directions[pairs]), covariance=street.covariance[pairs]
     )
-    assert error(bare.locations, street.locations[bare.cameras]) > 0.03
+    assert shape_error(bare.locations, street.locations[bare.cameras]) > 0.03
     pair_level, ray_level = joint.finish.levels_deg  # 0.01 / sqrt(3) and 0.001 / sqrt(3) rad, and some excess
     assert pair_level == pytest.approx(0.33, rel=0.5)
     assert ray_level == pytest.approx(0.033, rel=0.5)

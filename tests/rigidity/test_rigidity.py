@@ -14,15 +14,12 @@ from sfm_shapefit.rigidity import (
     rigid_pieces,
 )
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs
 
 DIMENSIONS = (2, 3, 4)
 
 
 # --- graphs -------------------------------------------------------------------------------------
-
-
-def complete(cameras):
-    return list(itertools.combinations(cameras, 2))
 
 
 def cycle(n):
@@ -36,7 +33,7 @@ def ring_of_k4(count):
 
 
 def complete_union(groups):
-    return sorted({tuple(sorted(pair)) for group in groups for pair in complete(group)})
+    return sorted({tuple(sorted(pair)) for group in groups for pair in all_pairs(group)})
 
 
 HINGE = complete_union([[0, 1, 2], [2, 3, 4]])
@@ -52,7 +49,7 @@ NAMED_3D = [
     ("triangle", 3, cycle(3), [3]),
     ("path of three", 3, [(0, 1), (1, 2)], [1, 1]),
     ("two triangles hinged", 5, HINGE, [3, 3]),
-    ("K4 and a pendant", 5, [*complete(range(4)), (1, 4)], [6, 1]),
+    ("K4 and a pendant", 5, [*all_pairs(4), (1, 4)], [6, 1]),
     ("4-cycle", 4, cycle(4), [4]),
     ("5-cycle", 5, cycle(5), [1] * 5),
     ("two K5 sharing one camera", 9, TWO_K5_ONE_SHARED, [10, 10]),
@@ -67,12 +64,12 @@ NAMED_3D = [
     ("ring of 5 K4", 15, ring_of_k4(5), [6] * 5),
     # Two strips of triangles that share cameras 0 and 7; the K5 touches both, but at camera 0 only.
     ("K5 hinged to two strips that share two cameras", 10, HINGED_STRIPS, [10, 10]),
-    ("two components", 8, [*complete(range(4)), *complete(range(4, 7))], [6, 3]),
+    ("two components", 8, [*all_pairs(4), *all_pairs(range(4, 7))], [6, 3]),
 ]
 
 
 def random_graph(rng, n, num_edges):
-    pairs = np.array(complete(range(n)))
+    pairs = np.array(all_pairs(n))
     return pairs[rng.permutation(len(pairs))[: min(num_edges, len(pairs))]]
 
 
@@ -110,7 +107,7 @@ def oracle_pieces(n, edges, dimension, rng):
         equations[e, :, j] = -equations[e, :, i]
     motions = null_space(equations, n * dimension).reshape(n, dimension, -1)
     implied = np.eye(n, dtype=bool)
-    for i, j in complete(range(n)):
+    for i, j in all_pairs(n):
         turned = direction_equations(i, j) @ (motions[i] - motions[j])
         implied[i, j] = implied[j, i] = np.abs(turned).max() < 1e-9
     spanned = [implied[i] & implied[j] for i, j in edges]
@@ -226,7 +223,7 @@ def test_the_shortcuts_change_nothing(dimension, span, monkeypatch):
 
 def random_pairs(rng, n, m):
     """Return m different pairs of n cameras, each in a random order."""
-    pairs = rng.permutation(np.array(complete(range(n))))[:m]
+    pairs = rng.permutation(np.array(all_pairs(n)))[:m]
     return np.where(rng.random((m, 1)) < 0.5, pairs, pairs[:, ::-1])
 
 
@@ -237,7 +234,7 @@ def test_edges_are_joined_by_triangles_exactly_where_a_chain_of_them_leads(seed)
     number = {frozenset(pair): e for e, pair in enumerate(edges.tolist())}
     chain = np.arange(m)
     for triangle in itertools.combinations(range(n), 3):
-        sides = [number.get(frozenset(pair), -1) for pair in complete(triangle)]
+        sides = [number.get(frozenset(pair), -1) for pair in all_pairs(triangle)]
         if min(sides) >= 0:
             chain[np.isin(chain, chain[sides])] = chain[sides].min()
     np.testing.assert_array_equal(chain, rigidity.growth.triangle_sets(n, edges))
@@ -320,7 +317,7 @@ def test_relabelling_the_cameras_keeps_the_partition(dimension):
 
 def test_pieces_are_ordered_by_cameras_then_edges_then_first_cameras():
     square = [(10, 11), (11, 12), (12, 13), (10, 13)]
-    edges = [(8, 9), (7, 9), (6, 7), *complete([0, 1, 2]), (6, 8), *square, *complete([3, 4, 5, 14])]
+    edges = [(8, 9), (7, 9), (6, 7), *all_pairs([0, 1, 2]), (6, 8), *square, *all_pairs([3, 4, 5, 14])]
     pieces = rigid_pieces(graph_of(15, edges))
     assert [piece.nodes.tolist() for piece in pieces] == [
         [3, 4, 5, 14],  # four cameras, six pairs
@@ -341,7 +338,7 @@ def test_a_pair_given_twice_counts_once():
 
 
 def test_pieces_list_their_cameras_edges_and_hinges():
-    edges = [*complete([0, 1, 2, 3]), *complete([3, 4, 5]), (5, 6)]
+    edges = [*all_pairs([0, 1, 2, 3]), *all_pairs([3, 4, 5]), (5, 6)]
     first, second, pendant = rigid_pieces(graph_of(8, edges))
     assert first.nodes.tolist() == [0, 1, 2, 3]
     assert first.edges.tolist() == [0, 1, 2, 3, 4, 5]
@@ -363,13 +360,13 @@ def test_the_summary_follows_the_dimension_of_the_graph():
 
 def test_each_camera_that_is_left_out_has_its_reason():
     edges = [
-        *complete([0, 1, 2, 3, 4]),
-        *complete([4, 5, 6]),  # hinged at 4
-        *complete([6, 7, 8]),  # hinged at 6, itself left out
+        *all_pairs([0, 1, 2, 3, 4]),
+        *all_pairs([4, 5, 6]),  # hinged at 4
+        *all_pairs([6, 7, 8]),  # hinged at 6, itself left out
         (0, 9),  # pendant
         (1, 10), (10, 11), (11, 12), (12, 13), (13, 2),  # a loop that is too long
         (14, 15),  # another component
-        *complete([17, 18, 19]), (17, 3),  # a triangle at the end of a single pair
+        *all_pairs([17, 18, 19]), (17, 3),  # a triangle at the end of a single pair
     ]  # fmt: skip
     graph = graph_of(20, edges)
     reasons = left_out_reasons(graph, rigid_pieces(graph))
@@ -389,7 +386,7 @@ def test_each_camera_that_is_left_out_has_its_reason():
 
 
 def test_reasons_use_the_names_of_the_cameras():
-    edges = [*complete([0, 1, 2, 3]), *complete([3, 4, 5]), (2, 6)]
+    edges = [*all_pairs([0, 1, 2, 3]), *all_pairs([3, 4, 5]), (2, 6)]
     graph = graph_of(7, edges, names=[f"{letter}.jpg" for letter in "abcdefg"])
     reasons = left_out_reasons(graph, rigid_pieces(graph))
     assert reasons[4] == "another rigid piece, hinged at d.jpg"
@@ -397,7 +394,7 @@ def test_reasons_use_the_names_of_the_cameras():
 
 
 def test_a_rigid_graph_leaves_nobody_out_and_an_empty_one_everybody():
-    rigid = graph_of(4, complete(range(4)))
+    rigid = graph_of(4, all_pairs(4))
     assert left_out_reasons(rigid, rigid_pieces(rigid)) == {}
     empty = graph_of(2, [])
     assert rigid_pieces(empty) == []

@@ -13,14 +13,11 @@ from sfm_shapefit.results import summary
 from sfm_shapefit.rotations import joint_refinement as epipolar
 from sfm_shapefit.rotations.acceptance import refine_rotations
 from sfm_shapefit.rotations.joint_refinement import RayMatches, State, at_state
+from tests.problems import all_pairs
 from tests.scenes import COURTYARD, RING, real_scene
 
 PIXEL = 1e-3  # angle of a pixel in radians
 N = 10
-
-
-def all_pairs(n):
-    return np.stack(np.triu_indices(n, k=1), axis=1).astype(np.int64)
 
 
 def turned_scene(errors_deg, pairs=None, noise_px=0.0, matches=60, seed=0):
@@ -30,7 +27,7 @@ def turned_scene(errors_deg, pairs=None, noise_px=0.0, matches=60, seed=0):
     """
     rng = np.random.default_rng(seed)
     n = len(errors_deg)
-    pairs = all_pairs(n) if pairs is None else np.asarray(pairs, dtype=np.int64)
+    pairs = np.asarray(all_pairs(n) if pairs is None else pairs, dtype=np.int64)
     centers = 6.0 * normalized(rng.standard_normal((n, 3)))
     axes = normalized(rng.standard_normal((n, 3)))
     errors = Rotation.from_rotvec(np.radians(errors_deg)[:, None] * axes).as_matrix()
@@ -122,7 +119,7 @@ def test_one_wrong_rotation_among_right_ones_is_mended_alone():
 
 
 def test_a_camera_with_two_pairs_keeps_its_rotation_to_the_bit():
-    pairs = [*all_pairs(N - 1).tolist(), [0, N - 1], [1, N - 1]]
+    pairs = [*all_pairs(N - 1), (0, N - 1), (1, N - 1)]
     matches, centers, _ = turned_scene(np.full(N, 0.4), pairs)
     found = refine_rotations(matches, centers)
     assert not found.updated[-1]
@@ -162,7 +159,7 @@ def test_a_single_pair_turns_no_camera_however_many_matches_it_has():
 
 
 def test_the_sparse_system_has_the_dense_ones_answer(monkeypatch):
-    pairs = [pair for pair in all_pairs(N).tolist() if pair[1] - pair[0] <= 4]
+    pairs = [pair for pair in all_pairs(N) if pair[1] - pair[0] <= 4]
     matches, centers, _ = turned_scene(np.full(N, 0.5), pairs, noise_px=0.3)
     dense = refine_rotations(matches, centers)
     monkeypatch.setattr(epipolar, "_DENSE_UNKNOWNS", 0)

@@ -20,27 +20,18 @@ from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_fact
 from sfm_shapefit.solver.splitting.split_then_newton import Finish, HybridResult, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
+from tests.problems import exact_graph, measure_graph
 
 
-def unit(x):
-    return x / np.linalg.norm(x, axis=1, keepdims=True)
-
-
-def drawn(family, n, degree, *, sigma=0.01, q=0.2, seed=1):
+def draw_family(family, n, degree, *, sigma=0.01, q=0.2, seed=1):
     """A graph of a family with noisy and corrupted directions and uneven weights."""
-    edges, t = FAMILIES[family](n, degree, seed)
-    rng = np.random.default_rng(seed)
-    v = unit(unit(differences(t, edges)) + sigma * unit(rng.normal(size=(len(edges), 3))))
-    corrupted = rng.random(len(edges)) < q
-    v[corrupted] = unit(rng.normal(size=v.shape))[corrupted]
-    return ViewGraph(n, edges, v, rng.uniform(0.5, 2.0, len(edges)))
+    return measure_graph(*FAMILIES[family](n, degree, seed), sigma=sigma, q=q, seed=seed)
 
 
 def complete(n, seed=0):
     """n cameras, all pairs, exact directions."""
     t = np.random.default_rng(seed).normal(size=(n, 3))
-    edges = np.stack(np.triu_indices(n, 1), axis=1)
-    return ViewGraph(n, edges, unit(differences(t, edges))), t
+    return exact_graph(t), t
 
 
 def assert_feasible(graph, certificate):
@@ -74,7 +65,7 @@ def unit_bound(graph, t, dual):
 @pytest.mark.parametrize(("family", "degree"), [("geo", 24), ("comm", 40), ("er", 24)])
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
 def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(family, degree, sigma):
-    graph = drawn(family, 400, degree, sigma=sigma)
+    graph = draw_family(family, 400, degree, sigma=sigma)
     for iterations in (25, 50):
         split = solve_admm(graph, 1e-12, iterations)
         certificate = certify(graph, split.locations, split.dual)
@@ -85,7 +76,7 @@ def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(family
 
 
 def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(monkeypatch):
-    graph = drawn("comm", 400, 40)
+    graph = draw_family("comm", 400, 40)
     split = solve_admm(graph, 1e-12, 100)
     steps = []
 
@@ -131,7 +122,7 @@ def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
 
 
 def test_on_a_collapsing_chain_the_repaired_dual_is_feasible_though_it_proves_little():
-    graph = drawn("seq", 400, 24)
+    graph = draw_family("seq", 400, 24)
     split = solve_admm(graph, 1e-12, 50)
     certificate = certify(graph, split.locations, split.dual)
     assert_feasible(graph, certificate)
@@ -139,7 +130,7 @@ def test_on_a_collapsing_chain_the_repaired_dual_is_feasible_though_it_proves_li
 
 
 def test_on_a_noisy_area_the_gap_is_a_hundredth_of_that_by_the_unit_metric():
-    graph = drawn("geo", 1000, 40)
+    graph = draw_family("geo", 1000, 40)
     split = solve_admm(graph, 1e-5, 200)
     certificate = certify(graph, split.locations, split.dual)
     gap_by_unit = certificate.objective - unit_bound(graph, split.locations, split.dual)
@@ -147,7 +138,7 @@ def test_on_a_noisy_area_the_gap_is_a_hundredth_of_that_by_the_unit_metric():
 
 
 def test_no_spoilt_dual_proves_more_than_the_optimum():
-    graph = drawn("geo", 300, 24)
+    graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
     optimum = objective(graph, t)
     rng = np.random.default_rng(1)
@@ -182,7 +173,7 @@ def test_a_violation_that_is_not_a_number_is_the_largest(row):
 
 
 def test_the_metric_of_wrong_locations_still_proves_a_bound():
-    graph = drawn("geo", 300, 24)
+    graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
     elsewhere = t + 0.3 * np.random.default_rng(2).normal(size=t.shape)
     certificate = certify(graph, elsewhere, y + 1e-4 * np.random.default_rng(3).normal(size=y.shape))
@@ -275,7 +266,7 @@ def test_a_graph_in_two_pieces_is_refused():
 
 
 def test_a_solver_without_fill_serves_as_well():
-    graph = drawn("geo", 600, 24)
+    graph = draw_family("geo", 600, 24)
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
     iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
@@ -286,7 +277,7 @@ def test_a_solver_without_fill_serves_as_well():
 
 
 def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
-    graph = drawn("geo", 300, 16)
+    graph = draw_family("geo", 300, 16)
     split = solve_admm(graph, 1e-4, 200)
     given = split.dual.copy()
     aside = certify(graph, split.locations, split.dual)
@@ -298,7 +289,7 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
 
 
 def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
-    graph = drawn("geo", 300, 16)
+    graph = draw_family("geo", 300, 16)
     neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
     used, new = IterativeSolver(neighbours), IterativeSolver(neighbours)
@@ -311,7 +302,7 @@ def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
 
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
 def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma):
-    graph = drawn("geo", 400, 24, sigma=sigma)
+    graph = draw_family("geo", 400, 24, sigma=sigma)
     split = solve_admm(graph, 1e-7, 400)
     certificate = certify(graph, split.locations, split.dual)
     t, y, warm = solve_newton_sparse(graph, 1e-9, 60, start=(split.locations, certificate.dual))
@@ -323,14 +314,14 @@ def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma)
 @pytest.mark.parametrize(("family", "degree"), [("geo", 24), ("comm", 40), ("er", 24)])
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
 def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
-    graph = drawn(family, 400, degree, sigma=sigma)
+    graph = draw_family(family, 400, degree, sigma=sigma)
     result = solve_hybrid(graph, 1e-8, 2000)
     assert result.finish in (Finish.CERTIFIED, Finish.NEWTON)
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
 def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
-    graph = drawn("seq", 300, 36, q=0.1)
+    graph = draw_family("seq", 300, 36, q=0.1)
     result = solve_hybrid(graph, 1e-8, 2000)
     assert result.finish is Finish.NEWTON
     assert result.factorisations > 0
@@ -342,7 +333,7 @@ def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
-    graph = drawn("geo", 300, 24)
+    graph = draw_family("geo", 300, 24)
     limited = solve_hybrid(graph, 1e-8, 12)
     assert limited.finish is Finish.MAX_ITERATIONS
     assert limited.iterations == 12
@@ -368,7 +359,7 @@ def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatc
 
 
 def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_given_up(monkeypatch):
-    graph = drawn("comm", 1200, 30)
+    graph = draw_family("comm", 1200, 30)
     split = solve_admm(graph, 1e-4, 200)
     whole = certify(graph, split.locations, split.dual)
     within = certificate.certify_within(graph, split.locations, split.dual.copy(), 2.0 * whole.gap)
@@ -392,7 +383,7 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
 def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
     gaps, cheap, stops, begins, finish, monkeypatch
 ):
-    graph = drawn("geo", 60, 12)
+    graph = draw_family("geo", 60, 12)
     factor = laplacian_factor(graph)
     monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", (27.0 if cheap else 26.9) * factor.symbolic.flops)
     begun, left = [], iter(gaps)
@@ -429,7 +420,7 @@ def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
 
 
 def test_the_hybrid_gives_the_same_bits_for_one_and_two_threads():
-    graph = drawn("geo", 1200, 45)  # enough edges that a pass is cut into chunks
+    graph = draw_family("geo", 1200, 45)  # enough edges that a pass is cut into chunks
     one, two = (solve_hybrid(graph, 1e-6, 500, threads=k) for k in (1, 2))
     np.testing.assert_array_equal(one.locations, two.locations)
     np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)

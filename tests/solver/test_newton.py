@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton import dense, solve_newton_dense, solve_newton_sparse, steps
@@ -20,32 +21,10 @@ from sfm_shapefit.solver.program import (
     scale_functional,
 )
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import draw_graph, shape
 
 TOL = 1e-8
 SOLVERS = pytest.mark.parametrize("solver", [solve_newton_dense, solve_newton_sparse])
-
-
-def unit(x):
-    return x / np.linalg.norm(x, axis=1, keepdims=True)
-
-
-def drawn(seed, *, n=16, d=3, p=0.8, q=0.2, sigma=0.0, weighted=False):
-    """A random graph with corrupted and noisy directions, and the true locations."""
-    rng = np.random.default_rng(seed)
-    truth = rng.normal(size=(n, d))
-    i, j = np.triu_indices(n, 1)
-    kept = (rng.random(len(i)) < p) | (j <= i + 2)  # consecutive cameras keep the graph rigid
-    edges = np.stack([i[kept], j[kept]], axis=1)
-    v = unit(unit(differences(truth, edges)) + sigma * unit(rng.normal(size=(len(edges), d))))
-    corrupted = rng.random(len(edges)) < q
-    v[corrupted] = unit(rng.normal(size=v.shape))[corrupted]
-    weights = rng.uniform(0.2, 3.0, len(edges)) if weighted else None
-    return ViewGraph(n, edges, v, weights), truth
-
-
-def shape(t):
-    """Locations with centroid 0 and norm 1."""
-    return (t - t.mean(axis=0)) / np.linalg.norm(t - t.mean(axis=0))
 
 
 def solved(graph, solver=solve_newton_dense, tol=TOL):
@@ -66,7 +45,7 @@ def solved(graph, solver=solve_newton_dense, tol=TOL):
     solver=st.sampled_from([solve_newton_dense, solve_newton_sparse]),
 )
 def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
-    graph, _ = drawn(seed, n=10, d=d, sigma=sigma, q=q, weighted=True)
+    graph, _ = draw_graph(seed, n=10, d=d, sigma=sigma, q=q, weighted=True)
     t, y, _ = solver(graph, 1e-11, 100)
     reference, _, _ = solve_conic(graph, 1e-10, 200)
 
@@ -84,7 +63,7 @@ def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0])
 def test_with_much_noise_the_objective_agrees_with_the_reference(sigma):
-    graph, _ = drawn(61, n=10, sigma=sigma, weighted=True)
+    graph, _ = draw_graph(61, n=10, sigma=sigma, weighted=True)
     t, _ = solved(graph, tol=1e-12)
     reference, _, _ = solve_conic(graph, 1e-10, 200)
     assert objective(graph, t) == pytest.approx(objective(graph, reference), abs=2e-11)
@@ -93,7 +72,7 @@ def test_with_much_noise_the_objective_agrees_with_the_reference(sigma):
 @SOLVERS
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noiseless_graphs_are_recovered_to_rounding(d, solver):
-    graph, truth = drawn(d, n=24, d=d, q=0.15)
+    graph, truth = draw_graph(d, n=24, d=d, q=0.15)
     t, y = solved(graph, solver, 1e-13)  # the error is a small multiple of the gap
     assert objective(graph, t) > 0.05  # the corrupted pairs are really there
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
@@ -102,7 +81,7 @@ def test_noiseless_graphs_are_recovered_to_rounding(d, solver):
 
 @SOLVERS
 def test_exact_directions_give_the_truth_and_a_zero_dual(solver):
-    graph, truth = drawn(7, q=0.0)
+    graph, truth = draw_graph(7, q=0.0)
     t, y = solved(graph, solver, 1e-12)
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
     assert not y.any()
@@ -111,7 +90,7 @@ def test_exact_directions_give_the_truth_and_a_zero_dual(solver):
 
 @SOLVERS
 def test_the_optimality_conditions_hold(solver):
-    graph, _ = drawn(11, sigma=0.05, weighted=True)
+    graph, _ = draw_graph(11, sigma=0.05, weighted=True)
     t, y = solved(graph, solver)
     r = across(differences(t, graph.edges), graph.directions)
     norms, w = np.linalg.norm(r, axis=1), graph.weights
@@ -130,13 +109,13 @@ def test_the_optimality_conditions_hold(solver):
 
 
 def test_dense_and_sparse_find_the_same_answer():
-    graph, _ = drawn(13, n=40, p=0.3, sigma=0.02, weighted=True)
+    graph, _ = draw_graph(13, n=40, p=0.3, sigma=0.02, weighted=True)
     dense, sparse = solved(graph, tol=1e-11)[0], solved(graph, solve_newton_sparse, 1e-11)[0]
     assert np.abs(shape(dense) - shape(sparse)).max() < 1e-8  # both within 1e-11 of a curved minimum
 
 
 def test_the_answer_follows_rotation_relabelling_flips_and_the_scale_of_weights():
-    graph, _ = drawn(17, sigma=0.05, weighted=True)
+    graph, _ = draw_graph(17, sigma=0.05, weighted=True)
     t = shape(solved(graph, tol=1e-11)[0])
     rng = np.random.default_rng(0)
     rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0]
@@ -163,7 +142,7 @@ def test_the_answer_follows_rotation_relabelling_flips_and_the_scale_of_weights(
 
 
 def test_a_pair_of_weight_two_counts_as_two_pairs():
-    graph, _ = drawn(19, sigma=0.1)
+    graph, _ = draw_graph(19, sigma=0.1)
     weights = np.ones(graph.num_edges)
     weights[:5] = 2.0
     weighted = ViewGraph(16, graph.edges, graph.directions, weights)
@@ -176,7 +155,7 @@ def test_a_pair_of_weight_two_counts_as_two_pairs():
 
 
 def test_a_tampered_dual_proves_less_and_never_too_much():
-    graph, _ = drawn(23, sigma=0.05)
+    graph, _ = draw_graph(23, sigma=0.05)
     t, y = solved(graph)
     best = certify(graph, t, y)
     for tampered in (1.5 * y, y + 0.3 * np.roll(y, 1, axis=0), np.roll(y, 1, axis=0), -y, 0 * y):
@@ -190,7 +169,7 @@ def test_a_tampered_dual_proves_less_and_never_too_much():
 
 def test_uniqueness_is_not_claimed_where_a_camera_can_slide():
     # Camera 4 hangs on camera 0 by one pair, which fits exactly wherever 4 stands along it.
-    graph, truth = drawn(29, n=4, p=1.0, q=0.0)
+    graph, truth = draw_graph(29, n=4, p=1.0, q=0.0)
     edges = np.vstack([graph.edges, [[0, 4]]])
     pendant = ViewGraph(5, edges, np.vstack([graph.directions, [[0.0, 0.0, 1.0]]]))
     t = np.vstack([truth, truth[0] - [0.0, 0.0, 1.0]])
@@ -205,21 +184,21 @@ def test_uniqueness_is_not_claimed_where_a_camera_can_slide():
 @pytest.mark.parametrize("n", [2, 3, 4])
 @pytest.mark.parametrize("d", [2, 3])
 def test_the_smallest_graphs_are_solved(n, d, solver):
-    graph, truth = drawn(n, n=n, d=d, p=1.0, q=0.0)
+    graph, truth = draw_graph(n, n=n, d=d, p=1.0, q=0.0)
     t, _ = solved(graph, solver)
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-10
 
 
 @SOLVERS
 def test_corrupted_graphs_of_all_kinds_are_solved(solver):
-    solved(drawn(31, q=1.0)[0], solver)
-    solved(drawn(37, q=0.5, sigma=0.3, d=2)[0], solver)
-    graph, truth = drawn(41)
+    solved(draw_graph(31, q=1.0)[0], solver)
+    solved(draw_graph(37, q=0.5, sigma=0.3, d=2)[0], solver)
+    graph, truth = draw_graph(41)
     coincident = truth.copy()
     coincident[1] = coincident[0]
     baselines = differences(coincident, graph.edges)
     baselines[np.linalg.norm(baselines, axis=1) == 0.0] = [0.0, 0.6, 0.8]
-    t, _ = solved(ViewGraph(16, graph.edges, unit(baselines)), solver)
+    t, _ = solved(ViewGraph(16, graph.edges, normalized(baselines)), solver)
     assert np.linalg.norm(shape(t) - shape(coincident)) < 1e-6
     flipped = np.where(np.arange(graph.num_edges)[:, None] % 4 == 0, -1.0, 1.0) * graph.directions
     t, _ = solved(ViewGraph(16, graph.edges, flipped), solver)
@@ -227,7 +206,7 @@ def test_corrupted_graphs_of_all_kinds_are_solved(solver):
 
 
 def test_bound_and_objective_before_the_first_step_are_those_of_the_formulas():
-    graph, _ = drawn(7, sigma=0.1)
+    graph, _ = draw_graph(7, sigma=0.1)
     problem, iterate, _, _ = steps.allocate(graph)
     rng = np.random.default_rng(7)
     iterate.r[:], iterate.feasible[:] = rng.standard_normal((2, *iterate.r.shape))
@@ -256,7 +235,7 @@ def test_directions_that_cancel_or_do_not_determine_anything_are_refused_or_solv
 
 @SOLVERS
 def test_the_callback_sees_bounds_that_hold_and_can_cancel(solver):
-    graph, _ = drawn(43, sigma=0.05, n=30)
+    graph, _ = draw_graph(43, sigma=0.05, n=30)
     seen: list[IterationInfo] = []
     t, _, count = solver(graph, TOL, 100, seen.append)
     assert [info.iteration for info in seen] == list(range(1, count + 1))
@@ -267,7 +246,7 @@ def test_the_callback_sees_bounds_that_hold_and_can_cancel(solver):
 
 @SOLVERS
 def test_two_runs_and_the_runs_in_between_agree_to_the_last_bit(solver):
-    graph, _ = drawn(47, sigma=0.05, n=30)
+    graph, _ = draw_graph(47, sigma=0.05, n=30)
     t, y, _ = solver(graph, TOL, 100)
     again, dual, _ = solver(graph, TOL, 100, lambda _: None)  # a callback makes it return every cycle
     assert (t == again).all()
@@ -276,14 +255,14 @@ def test_two_runs_and_the_runs_in_between_agree_to_the_last_bit(solver):
 
 @SOLVERS
 def test_the_iteration_limit_is_kept(solver):
-    graph, _ = drawn(53, sigma=0.05, n=30)
+    graph, _ = draw_graph(53, sigma=0.05, n=30)
     t, y, count = solver(graph, 1e-10, 2)
     assert count == 2
     assert 0.0 < certify(graph, t, y).gap < 0.2  # a bound even so
 
 
 def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step(monkeypatch):
-    graph, truth = drawn(67, n=24, q=0.1)
+    graph, truth = draw_graph(67, n=24, q=0.1)
     monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
     monkeypatch.setitem(dense._REFINEMENTS, 4, 0)  # without refinement, no step fulfils its equations
     t, _ = solved(graph, tol=1e-13)
@@ -291,7 +270,7 @@ def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step
 
 
 def test_one_refinement_suffices_for_steps_by_a_factor_in_double_precision(monkeypatch):
-    graph, _ = drawn(67, n=10, sigma=0.05)
+    graph, _ = draw_graph(67, n=10, sigma=0.05)
     monkeypatch.setitem(dense._REFINEMENTS, 8, 1)
     _, _, count = solve_newton_dense(graph, 1e-8, 100)
     monkeypatch.undo()
@@ -299,14 +278,14 @@ def test_one_refinement_suffices_for_steps_by_a_factor_in_double_precision(monke
 
 
 def test_larger_noiseless_graphs_are_recovered_to_rounding_too():
-    graph, truth = drawn(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
+    graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
     t, _ = solved(graph, tol=1e-13)
     assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(sigma, monkeypatch):
-    graph, _ = drawn(71, n=30, sigma=sigma, weighted=True)
+    graph, _ = draw_graph(71, n=30, sigma=sigma, weighted=True)
     double = solved(graph, tol=1e-11)
     monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
     single = solved(graph, tol=1e-11)
@@ -318,7 +297,7 @@ def test_a_factor_in_single_precision_leads_to_the_same_answer_as_one_in_double(
 
 @pytest.mark.parametrize("weighted", [False, True])
 def test_on_a_dense_graph_the_start_is_near_the_optimum(weighted):
-    graph, _ = drawn(5, n=40, p=0.5, q=0.25, weighted=weighted)
+    graph, _ = draw_graph(5, n=40, p=0.5, q=0.25, weighted=weighted)
     problem, iterate, model, step = steps.allocate(graph)
     assert approach(problem, iterate, step)
     assert np.vdot(problem.c, iterate.t) == pytest.approx(problem.kappa, rel=1e-12)
@@ -335,7 +314,7 @@ def test_where_gradients_do_not_converge_the_start_is_that_of_least_squares():
     n = 60  # a chain of triangles
     truth = np.cumsum(np.random.default_rng(2).uniform(0.5, 1.5, (n, 3)), axis=0)
     edges = np.array([(i, i + k) for i in range(n) for k in (1, 2) if i + k < n])
-    graph = ViewGraph(n, edges, unit(differences(truth, edges)))
+    graph = ViewGraph(n, edges, normalized(differences(truth, edges)))
     problem, iterate, _, step = steps.allocate(graph)
     assert not approach(problem, iterate, step)
     np.testing.assert_allclose(shape(solved(graph)[0]), shape(truth), atol=1e-6)

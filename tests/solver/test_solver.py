@@ -25,6 +25,7 @@ from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.split_then_newton import Finish
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import shape
 
 TOL = SolverOptions().tol
 solving = importlib.import_module("sfm_shapefit.solver.solve")
@@ -33,14 +34,7 @@ solving = importlib.import_module("sfm_shapefit.solver.solve")
 def problem(seed, *, n=20, p=0.6, d=3, sigma=0.0, q=0.2):
     """A random problem of the paper's kind: the view graph and the true locations, centroid 0, norm 1."""
     drawn = random_graph_problem(n, p, d=d, sigma=sigma, q=q, seed=seed)
-    truth = drawn.locations - drawn.locations.mean(axis=0)
-    return ViewGraph(n, drawn.edges, drawn.directions), truth / np.linalg.norm(truth)
-
-
-def shape(locations):
-    """Locations with centroid 0 and norm 1."""
-    centred = locations - locations.mean(axis=0)
-    return centred / np.linalg.norm(centred)
+    return drawn.view_graph, shape(drawn.locations)
 
 
 def tetrahedron():

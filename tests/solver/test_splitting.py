@@ -39,6 +39,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
+from tests.problems import shape
 
 
 def view_graph(edges, t, *, sigma, q, seed, weights=None):
@@ -63,12 +64,6 @@ def small_problem(seed, d, *, sigma=0.05, q=0.2, n=24):
     return view_graph(
         edges, t, sigma=sigma, q=q, seed=seed, weights=rng.uniform(0.3, 3.0, size=len(edges))
     ), t
-
-
-def shape(locations):
-    """Locations with centroid 0 and norm 1."""
-    centred = locations - locations.mean(axis=0)
-    return centred / np.linalg.norm(centred)
 
 
 @pytest.mark.parametrize("d", [3, 5])
@@ -355,7 +350,7 @@ def test_new_penalties_keep_the_split_point_and_the_dual():
 
 def test_edges_that_are_sorted_already_are_shared_with_the_graph_and_others_come_back_in_its_order():
     problem = community_graph_problem(200, 12.0, sigma=0.01, q=0.1, seed=3)
-    graph = ViewGraph(200, problem.edges, problem.directions)
+    graph = problem.view_graph
     data = edge_data(graph, -np.inf)
     ascending = np.lexsort(graph.edges.T[::-1])
     assert (ascending == np.arange(graph.num_edges)).all()
@@ -369,7 +364,7 @@ def test_edges_that_are_sorted_already_are_shared_with_the_graph_and_others_come
 def test_expanders_are_recognised_before_an_order_is_looked_for_and_other_graphs_are_not():
     def tree(make, degree):
         problem = make(6000, degree, sigma=0.0, q=0.0, seed=1)
-        return predict_factor(ViewGraph(6000, problem.edges, problem.directions)).tree
+        return predict_factor(problem.view_graph).tree
 
     assert tree(expander_graph_problem, 20.0) is None
     assert tree(box_graph_problem, 20.0) is not None
@@ -381,7 +376,7 @@ def test_huge_graphs_with_wide_levels_are_not_ordered_and_long_ones_are(monkeypa
     monkeypatch.setattr(linear, "_FLOPS_PER_EDGE", 300)  # so that a box of 6000 counts as too much work
 
     def tree(problem):
-        return predict_factor(ViewGraph(len(problem.locations), problem.edges, problem.directions)).tree
+        return predict_factor(problem.view_graph).tree
 
     assert tree(box_graph_problem(6000, 40.0, sigma=0.0, q=0.0, seed=1)) is None
     assert tree(trajectory_graph_problem(6000, 20.0, sigma=0.0, q=0.0, seed=1)) is not None
@@ -389,7 +384,7 @@ def test_huge_graphs_with_wide_levels_are_not_ordered_and_long_ones_are(monkeypa
 
 def test_slow_communities_are_freed_by_smaller_penalties_late():
     problem = community_graph_problem(3000, 67.0, sigma=0.01, q=0.2, seed=1)
-    graph = ViewGraph(3000, problem.edges, problem.directions)
+    graph = problem.view_graph
     factor, objectives = laplacian_factor(graph), []
     solve_admm(graph, 1e-9, 300, factor, on_iteration=lambda info: objectives.append(info.objective))
     # 117 iterations to 1e-5 with the same balance at every renewal
@@ -489,7 +484,7 @@ def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
 @pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])
 def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
     problem = family(6000, 20.0, sigma=0.01, q=0.1, seed=1)
-    graph = ViewGraph(6000, problem.edges, problem.directions)
+    graph = problem.view_graph
     one, two = (solve_hybrid(graph, 1e-4, 200, threads=threads) for threads in (1, 2))
     np.testing.assert_array_equal(one.locations, two.locations)
     np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)
