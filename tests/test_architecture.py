@@ -3,6 +3,7 @@
 import ast
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -62,7 +63,8 @@ DOORS = {
 MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # which imports lazily, from all
 
 
-def imports_of(path: Path, *, at_run_time: bool = False) -> set[str]:
+@cache
+def imports_of(path: Path, *, at_run_time: bool = False) -> frozenset[str]:
     """Dotted names of all modules that a file imports, inside functions too."""
     tree, found = ast.parse(path.read_text(encoding="utf-8")), set()
     for node in ast.walk(tree):
@@ -73,7 +75,7 @@ def imports_of(path: Path, *, at_run_time: bool = False) -> set[str]:
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module:
             found |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
-    return found
+    return frozenset(found)
 
 
 def room_of(path: Path) -> str:

@@ -50,13 +50,26 @@ def test_the_readmes_python_example_runs():
     assert float(re.search(r"median error (\S+) mm", said).group(1)) < 5.0
 
 
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+EXAMPLES = [(page, k) for page in PAGES[1:] for k in range(len(BLOCK.findall(TEXTS[page])))]
+
+
+def test_examples_and_commands_are_found_on_every_page_that_has_them():
+    """The tests below run what these expressions find; here it is counted without them."""
+    for page, text in TEXTS.items():
+        assert len(BLOCK.findall(text)) == text.count("```python")
+        assert len(commands_of(page)) == text.count("\n    sfm-shapefit ")
+    assert EXAMPLES
+    assert len([page for page in PAGES if commands_of(page)]) > 3
+
+
 @pytest.mark.parametrize(
     ("page", "number"),
-    [(page, k) for page in PAGES[1:] for k in range(len(BLOCK.findall(page.read_text(encoding="utf-8"))))],
+    EXAMPLES,
     ids=lambda value: value.name if isinstance(value, Path) else str(value),
 )
 def test_every_python_example_of_the_docs_runs(page, number):
-    process = python("-W", "error", "-c", BLOCK.findall(page.read_text(encoding="utf-8"))[number])
+    process = python("-W", "error", "-c", BLOCK.findall(TEXTS[page])[number])
     said, errors = process.communicate()
     assert process.returncode == 0, errors
     assert said

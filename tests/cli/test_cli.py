@@ -106,6 +106,13 @@ def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_pa
     assert json.loads(result.stdout)["scale"].startswith("unit")
 
 
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory):
+    """What `locate` says of the courtyard without a further option."""
+    out = tmp_path_factory.mktemp("plain") / "out"
+    return json.loads(run("locate", COURTYARD / "truth", out, "--json", "--no-report").stdout)
+
+
 @pytest.mark.parametrize(
     ("flag", "value", "key"),
     [
@@ -121,10 +128,9 @@ def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_pa
         ("--directions", "tracks", "inputs"),
     ],
 )
-def test_each_flag_matters(tmp_path, flag, value, key):
-    plain = json.loads(run("locate", COURTYARD / "truth", tmp_path / "a", "--json").stdout)
+def test_each_flag_matters(tmp_path, plain, flag, value, key):
     values = [] if value is None else [value]
-    result = run("locate", COURTYARD / "truth", tmp_path / "b", "--json", flag, *values)
+    result = run("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", flag, *values)
     if flag == "--min-inliers":
         assert "none of the" in refused(result, 4)
     else:
@@ -392,10 +398,8 @@ cli.main()
 
 def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):
     command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", "nowhere", str(tmp_path / "out")]
-    root = str(ROOT)
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": root}
-    )
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 3
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
