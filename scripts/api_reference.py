@@ -31,7 +31,7 @@ MODULES = (
     "sfm_shapefit.results.tables",
     "sfm_shapefit.results",
     "sfm_shapefit.rigidity",
-    "sfm_shapefit.robust",
+    "sfm_shapefit.judgement",
     "sfm_shapefit.solver",
     "sfm_shapefit.synthetic",
     "sfm_shapefit.synthetic.fixtures",
