@@ -1,1 +1,1 @@
-"""How sfm_shapefit behaves when its input, its machine or its user is against it: see reliability.py."""
+"""How sfm_shapefit behaves when its input, its machine or its user is against it."""

@@ -1,25 +1,22 @@
-"""The parts of scripts/benchmark.py: one module per subcommand, and what they share.
+"""The benchmarks: a module per subcommand of scripts/benchmark.py, under the same name.
 
-    metrics.py   a measured value and what it must reach
-    record.py    tables, the machine and its versions, the file of results
-    process.py   fresh processes with a number of threads and a time limit; memory
-    graphs.py    bare graphs by family and size, and the paper's error
-    real.py      subcommand `real`: real scenes against their ground truth
-    directions.py    subcommand `directions`: speed and calibration of directions from matches
-    glomap.py    GLOMAP's global positioning, run side by side
-    solver.py    subcommand `solver`: Newton against a generic cone solver
-    clarabel_direct.py    ... called without cvxpy
-    scale.py     subcommand `scale`: large graphs as they grow
-    rigs.py      subcommand `rigs`: rigs with known offsets, against global mapping
-    trust.py     subcommand `trust`: standard deviations and trust against errors
-    onedsfm.py   subcommand `onedsfm`: the published scene Madrid Metropolis
-    peers.py     subcommand `peers`: pytheia, gtsam and pycolmap beside ours, in one table
-    graph_peers.py    ... on bare graphs
-    real_peers.py     ... on real scenes
-    answers.py   subcommand `answers`: what every command answers, recorded and compared
-    answer_cases.py       ... the cases
-    answer_inputs.py      ... what they are given
-    answer_differences.py    ... how two recordings differ
-
-A subcommand is a module with `HELP`, `add_arguments(parser)` and `run(args) -> exit code`.
+A module has `BENCHMARK`, which `harness.driver` runs, or the functions `add_arguments(parser)` and
+`run(args) -> exit code` of its own.
 """
+
+INDEX = {
+    "answers": "What every command answers: recorded, and compared with an earlier recording.",
+    "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
+    "directions": "Directions from matches: speed, memory, calibration, and what their weights are worth.",
+    "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
+    "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
+    "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
+    "onedsfm": "The published 1DSfM scene Madrid Metropolis: seconds per stage, residuals of each objective.",
+    "peers": "pytheia, gtsam and pycolmap beside ours, on bare graphs and real scenes.",
+    "real": "Real scenes against their ground truth, before and after bundle adjustment.",
+    "reliability": "Damaged input, faults of the machine, and determinism: a right answer or one sentence.",
+    "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
+    "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
+    "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
+    "trust": "Standard deviations and trust against errors; wrong rotations recognised.",
+}

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.record import table
+from harness.record import table
 
 POSITION, ROTATION, FIGURE, ROUNDOFF = 1e-9, 1e-9, 1e-7, 1e-12
 KINDS = ("exit", "positions", "rotations", "figures", "values", "words")

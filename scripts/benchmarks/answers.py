@@ -1,4 +1,4 @@
-"""Subcommand `answers`: what every command answers, recorded, and compared with an earlier recording.
+"""What every command answers, recorded, and compared with an earlier recording.
 
 For changes of the code that shall change no answer. Commands run as processes of their own, so that nothing
 is known here of how the package is built, and a recording of one checkout can be compared with another's:
@@ -37,9 +37,8 @@ import pycolmap
 from benchmarks.answer_cases import BUNDLED, MADRID, Case, all_cases
 from benchmarks.answer_differences import compare, report
 from benchmarks.answer_inputs import MADE, make_inputs
+from harness.driver import DATA, ROOT
 
-HELP = "What every command answers: recorded, and compared with an earlier recording."
-ROOT = Path(__file__).parents[2]
 LIMIT_S = 300
 """Seconds after which a case is ended; its exit code is then recorded as "timeout"."""
 
@@ -190,9 +189,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, default=2, help="cases side by side")
     parser.add_argument("--strict-words", action="store_true", help="changed wording counts as a difference")
     parser.add_argument("--package", type=Path, default=ROOT, help="root of the checkout whose code runs")
-    parser.add_argument(
-        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real sets"
-    )
+    parser.add_argument("--data", type=Path, default=DATA, help="folder of the real sets")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ The matches are synthetic: two cameras of 1000 px focal length and 1000 x 750 px
 away, with Gaussian noise in each pixel coordinate; wrong matches end anywhere in the second image. The
 baseline is given as a share of 6 units, the typical depth.
 
-A normalised error is r^T Sigma^-1 r, r the error of the direction in its tangent plane and Sigma its
+A normalized error is r^T Sigma^-1 r, r the error of the direction in its tangent plane and Sigma its
 covariance; its mean is 2 where the covariance is right.
 """
 
@@ -13,23 +13,23 @@ import argparse
 import math
 import multiprocessing
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
+from functools import partial
 from typing import TYPE_CHECKING
 
 from benchmarks import weights
-from benchmarks.metrics import Check, Quantity, number, numbers, verdict
-from benchmarks.process import call, resident_memory_mb, thread_environment
-from benchmarks.record import environment, legend, table, write_section
+from benchmarks.real import SCENES
+from harness.driver import NOT_FOUND, Benchmark, positive
+from harness.driver import Case as AnyCase
+from harness.metrics import Check, Quantity, number, numbers, verdict
+from harness.process import resident_memory_mb
+from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
 
-HELP = "Directions from matches: speed, memory, whether their covariance is right, what weights are worth."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "numba")
 FOCAL_PX, WIDTH_PX, HEIGHT_PX, DEPTH = 1000.0, 1000.0, 750.0, 6.0
 MATCHES = 100
 BATCH = 10_000
@@ -83,7 +83,7 @@ class Calibration:
     no_parallax: float
     """Share of the pairs that are said to have no parallax."""
     mean: float
-    """Mean normalised error."""
+    """Mean normalized error."""
     median_deg: float
     p95_deg: float
     """95th percentile of the error."""
@@ -106,69 +106,32 @@ class Speed:
         return self.pairs / self.seconds
 
 
-QUANTITIES = (
-    Quantity(
-        name="pairs/s", unit="1/s", better="higher", rel_tol=0.25, meaning="wall-clock, without start-up"
-    ),
-    Quantity(
-        name="growth",
-        unit="MB",
-        better="lower",
-        rel_tol=1.0,
-        meaning="resident memory at the end minus that after the first batch, of the worst process",
-    ),
-    Quantity(
-        name="normalised error",
-        unit="1",
-        better="neither",
-        rel_tol=0.05,
-        meaning="mean of r^T Sigma^-1 r over the usable pairs; 2 where the covariance is right",
-    ),
-    Quantity(
-        name="error, median / 95 %",
-        unit="deg",
-        better="lower",
-        rel_tol=0.05,
-        meaning="of the usable directions",
-    ),
-)
+Measured = Speed | Calibration | weights.Comparison
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def flags(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `directions`."""
-    parser.add_argument(
-        "--pairs", type=_positive, default=1_000_000, help="pairs in batches (default 1000000)"
-    )
-    parser.add_argument(
-        "--draws", type=_positive, default=2000, help="pairs per calibration case (default 2000)"
-    )
-    parser.add_argument(
-        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real sets"
-    )
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+    parser.add_argument("--pairs", type=positive, default=1_000_000, help="pairs in batches")
+    parser.add_argument("--draws", type=positive, default=2000, help="pairs per calibration case")
 
 
-def _positive(text: str) -> int:
-    """Parse a number that is at least 1."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of 1 or more")
-    return int(text)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section and write it; a missed limit is no failure."""
-    command = f"python scripts/benchmark.py directions --pairs {args.pairs} --draws {args.draws}"
-    about = environment(PACKAGES, command)
-    call(measure_batches, BATCH, 1)  # compiles where nothing is compiled yet
+def cases(args: argparse.Namespace) -> dict[str, AnyCase]:
+    """Return speed by threads and processes, the kinds of pairs, and the sets with and without weights."""
     tenth = max(args.pairs // 10, BATCH)
-    speeds = [call(measure_batches, tenth, threads, environment=thread_environment(1)) for threads in (1, 2)]
-    speeds.append(measure_processes(args.pairs))
-    calibrations = [measure_case(case, args.draws) for case in CASES]
-    still = [measure_case(case, args.draws) for case in STILL]
-    body = section(speeds, calibrations, still, list(weights.comparisons(args.data)), about)
-    print(body)
-    write_section(args.out, "directions", body)
-    return 0
+    found: dict[str, AnyCase] = {
+        "1 thread": partial(measure_batches, BATCH if args.quick else tenth, 1),
+        "2 threads": partial(measure_batches, BATCH if args.quick else tenth, 2),
+        "2 processes": partial(measure_processes, args.pairs),
+    }
+    found |= {case.name: partial(measure_case, case, args.draws) for case in (*CASES, *STILL)}
+    for name in SCENES:
+        is_there = (args.data / name).is_dir()
+        found[name] = partial(weights.compare_real, name, args.data / name) if is_there else NOT_FOUND
+    for shape in weights.MADE:
+        for seed in range(weights.SEEDS):
+            found[f"{shape}, made {seed}"] = partial(weights.compare_made, shape, seed)
+    quick = ("1 thread", CASES[0].name, STILL[0].name, "cloud, made 0")
+    return {name: found[name] for name in quick} if args.quick else found
 
 
 # --- measuring -------------------------------------------------------------------------------------
@@ -288,69 +251,88 @@ def measure_processes(pairs: int) -> Speed:
 # --- the section -----------------------------------------------------------------------------------
 
 
-def calibration_checks(one: Calibration) -> list[Check]:
-    """Return the two checks of a mean normalised error: within 20 % of 2 from either side."""
+def checks(one: Measured) -> list[Check]:
+    """Return the limits of one case; a comparison of weights has none of its own."""
+    if isinstance(one, weights.Comparison):
+        return []
+    if isinstance(one, Speed):
+        limits = [Check(name="growth", value=one.growth_mb, limit=MAX_GROWTH_MB)]
+        if one.label == "2 processes":
+            limits.append(
+                Check(name="pairs/s", value=one.pairs_per_s, limit=MIN_PAIRS_PER_S, better="higher")
+            )
+        return limits
+    if one.case in STILL:
+        return [Check(name="usable", value=one.usable, limit=NO_PARALLAX_LIMIT)]
+    # The mean is to be within 20 % of 2 from either side.
     low, high = EXPECTED * (1.0 - SLACK), EXPECTED * (1.0 + SLACK)
     return [
-        Check(name="normalised error", value=one.mean, limit=high),
-        Check(name="normalised error", value=one.mean, limit=low, better="higher"),
+        Check(name="normalized error", value=one.mean, limit=high),
+        Check(name="normalized error", value=one.mean, limit=low, better="higher"),
     ]
 
 
-def section(
-    speeds: Sequence[Speed],
-    calibrations: Sequence[Calibration],
-    still: Sequence[Calibration],
-    weighted: Sequence[weights.Comparison],
-    about: str,
-) -> str:
-    """Return the section of the file of results."""
-    speed_rows = []
-    for speed in speeds:
-        checks = [Check(name="growth", value=speed.growth_mb, limit=MAX_GROWTH_MB)]
-        if speed.label == "2 processes":
-            checks.append(
-                Check(name="pairs/s", value=speed.pairs_per_s, limit=MIN_PAIRS_PER_S, better="higher")
-            )
-        cells = [speed.label, f"{speed.pairs}", number(speed.pairs_per_s), number(speed.pairs / speed.cpu_s)]
-        speed_rows.append([*cells, number(speed.growth_mb), verdict(checks)])
-    calibration_rows = [
-        [
-            one.case.name,
-            f"{one.usable:.1%}",
-            number(one.mean),
-            numbers([one.median_deg, one.p95_deg]),
-            verdict(calibration_checks(one)),
-        ]
-        for one in calibrations
-    ]
-    still_rows = [
-        [
-            one.case.name,
-            f"{one.no_parallax:.2%}",
-            f"{one.usable:.2%}",
-            verdict([Check(name="usable", value=one.usable, limit=NO_PARALLAX_LIMIT)]),
-        ]
-        for one in still
-    ]
-    return "\n\n".join(
-        [
-            "## Directions",
-            about,
-            f"### Speed, {MATCHES} matches per pair, batches of {BATCH} pairs",
-            table(
-                ["setting", "pairs", "pairs/s", "pairs per CPU second", "growth, MB", "verdict"], speed_rows
-            ),
-            f"### Calibration ({MATCHES} matches, noise 0.5 px, baseline 15 % unless told)",
-            table(
-                ["case", "usable", "normalised error", "error, median / 95 %, deg", "verdict"],
-                calibration_rows,
-            ),
-            "### No parallax",
-            table(["case", "said to have none", "usable", "verdict"], still_rows),
-            "### What the pairs' weights are worth",
-            weights.section(weighted),
-            "### What the columns mean",
-            legend((*QUANTITIES, *weights.QUANTITIES)),
-        ]
+def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
+    """Yield the parts of the section."""
+    found = list(measured.values())
+    calibrations = [one for one in found if isinstance(one, Calibration)]
+    yield f"## Speed, {MATCHES} matches per pair, batches of {BATCH} pairs"
+    yield table_of(
+        [one for one in found if isinstance(one, Speed)],
+        {
+            "setting": lambda one: one.label,
+            "pairs": lambda one: str(one.pairs),
+            "pairs/s": lambda one: number(one.pairs_per_s),
+            "pairs per CPU second": lambda one: number(one.pairs / one.cpu_s),
+            "growth, MB": lambda one: number(one.growth_mb),
+            "verdict": lambda one: verdict(checks(one)),
+        },
     )
+    yield f"## Calibration ({MATCHES} matches, noise 0.5 px, baseline 15 % unless told)"
+    yield table_of(
+        [one for one in calibrations if one.case not in STILL],
+        {
+            "case": lambda one: one.case.name,
+            "usable": lambda one: f"{one.usable:.1%}",
+            "normalized error": lambda one: number(one.mean),
+            "error, median / 95 %, deg": lambda one: numbers([one.median_deg, one.p95_deg]),
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+    yield "## No parallax"
+    yield table_of(
+        [one for one in calibrations if one.case in STILL],
+        {
+            "case": lambda one: one.case.name,
+            "said to have none": lambda one: f"{one.no_parallax:.2%}",
+            "usable": lambda one: f"{one.usable:.2%}",
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+    yield "## What the pairs' weights are worth"
+    yield from weights.tables([one for one in found if isinstance(one, weights.Comparison)])
+
+
+BENCHMARK = Benchmark(
+    name="directions",
+    title="Directions",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    flags=flags,
+    packages=("numpy", "numba"),
+    quick={"pairs": BATCH, "draws": 200},
+    quantities=(
+        Quantity("pairs/s", "1/s", "higher", 0.25, "wall-clock, without start-up"),
+        Quantity(
+            *("growth", "MB", "lower", 1.0),
+            "resident memory at the end minus that after the first batch, of the worst process",
+        ),
+        Quantity(
+            *("normalized error", "1", "neither", 0.05),
+            "mean of r^T Sigma^-1 r over the usable pairs; 2 where the covariance is right",
+        ),
+        Quantity("error, median / 95 %", "deg", "lower", 0.05, "of the usable directions"),
+        *weights.QUANTITIES,
+    ),
+)

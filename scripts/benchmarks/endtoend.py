@@ -2,57 +2,72 @@
 
 Each scene is made by `synth` in a folder that is kept if it is given, so that a run can be repeated: a facade
 with 100 matches a pair, a fifth of them wrong, and a tenth of the pairs wrong as a whole. `locate` runs in a
-process of its own. Stages are compared between sizes by exponents: log(ratio of processor times) / log(ratio
-of matches), 1 where a stage is linear; other users of the machine change the clock, and hardly that.
+process of its own, on real sets too, and the memory that `inspect` forecasts is compared with what it takes.
+Stages are compared between sizes by exponents: log(ratio of processor times) / log(ratio of matches), 1 where
+a stage is linear; other users of the machine change the clock, and hardly that.
 """
 
 import argparse
 import json
 import math
-import os
-import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
-from benchmarks.metrics import Check, number, verdict
-from benchmarks.process import call, peak_memory_mb, reset_peak, thread_environment
-from benchmarks.record import environment, table, write_section
+from harness import ours
+from harness.driver import NOT_FOUND, ROOT, Benchmark, Case, positive
+from harness.metrics import Check, Quantity, number, ratio, verdict
+from harness.process import peak_memory_mb, reset_peak
+from harness.record import table, table_of
 
-HELP = "synth and locate at thousands of images: time by stage, memory, exponents."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pycolmap")
 LARGEST = 10_000
-MOST_S, MOST_MB = 600.0, 4000.0  # of the largest
+# Limits of the largest scene.
+MOST_S, MOST_MB = 600.0, 4000.0
+FORECAST_FACTOR = 1.5
+"""By which the forecast of memory may be off, either way."""
 MATCHES_PER_PAIR, PAIRS_PER_IMAGE, POINTS_PER_IMAGE = 100, 60, 33
-_SHORT_S = 1.0  # a stage that says nothing of an exponent
+SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30", "lego100", "liberty")
+# A shorter stage says nothing of an exponent.
+_SHORT_S = 1.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Usage:
     """What a process took."""
 
-    wall_s: float
-    cpu_s: float
-    peak_mb: float
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_mb: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Located:
-    """One size."""
+    """One scene."""
 
+    name: str
     num_images: int
     num_pairs: int
     num_matches: int
     num_placed: int
     median_error: float
-    """Of the cameras, as a share of the scene's extent."""
-    usage: Usage
+    """Of the cameras, as a share of the scene's extent; NaN of a real set."""
+    forecast_mb: float
     stages: dict[str, Usage]
+
+    @property
+    def usage(self) -> Usage:
+        """What all stages took."""
+        used = self.stages.values()
+        return Usage(
+            wall_s=sum(one.wall_s for one in used),
+            cpu_s=sum(one.cpu_s for one in used),
+            peak_mb=max(one.peak_mb for one in used),
+        )
 
 
 class Stages:
@@ -65,78 +80,80 @@ class Stages:
     def __call__(self, stage: str, _done: int = 0, _total: int = 1) -> None:
         if stage == self._stage:
             return
-        earlier = self.found.get(self._stage, Usage(wall_s=0.0, cpu_s=0.0, peak_mb=0.0))
+        earlier = self.found.get(self._stage, Usage())
         wall_s, cpu_s = time.perf_counter(), time.process_time()
         self.found[self._stage] = Usage(
             wall_s=earlier.wall_s + wall_s - self._wall_s,
             cpu_s=earlier.cpu_s + cpu_s - self._cpu_s,
             peak_mb=max(earlier.peak_mb, peak_memory_mb()),
         )
-        print(f"{self._stage}: {self.found[self._stage]}", file=sys.stderr, flush=True)
         self._stage, self._wall_s, self._cpu_s = stage, wall_s, cpu_s
         reset_peak()
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def flags(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `endtoend`."""
-    parser.add_argument("--images", type=int, nargs="+", default=[2500, LARGEST], help="sizes")
-    parser.add_argument("--threads", type=int, default=2, help="threads (default 2)")
+    parser.add_argument("--images", type=positive, nargs="*", default=[2500, LARGEST], help="of made scenes")
     parser.add_argument("--folder", type=Path, help="where scenes are kept (default: a temporary folder)")
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section and write it; a missed limit is no failure."""
-    sizes = " ".join(map(str, args.images))
-    about = environment(
-        PACKAGES, f"python scripts/benchmark.py endtoend --images {sizes} --threads {args.threads}"
-    )
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = args.folder or Path(temporary)
-        measured = [measure(folder, size, args.threads) for size in sorted(args.images)]
-    body = section(measured, about)
-    print(body)
-    write_section(args.out, "endtoend", body)
-    return 0
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return the made scenes, smallest first, and the real sets."""
+    found: dict[str, Case] = {
+        f"{size} images": partial(measure_made, size, args.folder, args.threads)
+        for size in sorted(args.images)
+    }
+    for name in () if args.quick else SETS:
+        is_there = (args.data / name).is_dir()
+        found[name] = partial(measure, name, args.data / name, args.threads) if is_there else NOT_FOUND
+    return found
 
 
-def measure(folder: Path, num_images: int, threads: int) -> Located:
+def measure_made(num_images: int, folder: Path | None, threads: int) -> Located:
     """Make a scene of so many images if the folder has none, and locate its cameras."""
-    scene, out = folder / f"facade{num_images}", folder / "out"
-    if not scene.exists():
-        print(f"making {num_images} images", file=sys.stderr, flush=True)
-        command("synth", scene, *scene_flags(num_images))
-    shutil.rmtree(out, ignore_errors=True)
-    print(f"locating {num_images} images", file=sys.stderr, flush=True)
-    stages = call(_located, scene, out, threads, environment=thread_environment(threads))
-    facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
-    truth = scene / "sparse" / "0"  # its centres are the true ones, which `locate` does not look at
-    found = json.loads(command("evaluate", out, truth, "--json")[1])
-    located = Located(
-        num_images=num_images,
+    with tempfile.TemporaryDirectory() as temporary:
+        scene = (folder or Path(temporary)) / f"facade{num_images}"
+        if not scene.exists():
+            run_command("synth", scene, *scene_flags(num_images))
+        return measure(f"{num_images} images", scene, threads, is_made=True)
+
+
+def measure(name: str, scene: Path, threads: int, is_made: bool = False) -> Located:
+    """Locate the cameras of a scene, and write the result."""
+    import pycolmap
+
+    model = scene / "sparse" / "0"
+    forecast = json.loads(run_command("inspect", model, "--json"))["expected"]
+    with tempfile.TemporaryDirectory() as temporary:
+        out = Path(temporary) / "out"
+        stages = Stages()
+        ours.locate_and_write(model, out, threads=threads, progress=stages)
+        stages("end")
+        facts = json.loads((out / "locate.json").read_text(encoding="utf-8"))
+        error = math.nan
+        if is_made:
+            # The model's centers are the true ones, at which `locate` does not look.
+            found = json.loads(run_command("evaluate", out, model, "--json"))
+            error = found["position_error"]["median"] / found["extent"]
+        with pycolmap.Database.open(_copy(scene / "database.db", temporary)) as opened:
+            num_matches = int(opened.num_inlier_matches())
+    return Located(
+        name=name,
+        num_images=facts["num_images"],
         num_pairs=facts["num_pairs"],
-        num_matches=_num_matches(scene / "database.db"),
+        num_matches=num_matches,
         num_placed=facts["num_placed"],
-        median_error=found["position_error"]["median"] / found["extent"],
-        usage=Usage(
-            wall_s=sum(one.wall_s for one in stages.values()),
-            cpu_s=sum(one.cpu_s for one in stages.values()),
-            peak_mb=max(one.peak_mb for one in stages.values()),
-        ),
-        stages=stages,
+        median_error=error,
+        forecast_mb=forecast["peak_mb"],
+        stages=stages.found,
     )
-    shutil.rmtree(out)
-    return located
 
 
-def _located(scene: Path, out: Path, threads: int) -> dict[str, Usage]:
-    """Locate a scene, write the result, and return what each stage took."""
-    stages = Stages()
-    from sfm_shapefit import LocateOptions, locate, write_result
+def _copy(database: Path, folder: str) -> Path:
+    """Return a copy of a database, for pycolmap changes what it opens."""
+    from peers.colmap import copy_database
 
-    write_result(locate(scene / "sparse" / "0", options=LocateOptions(threads=threads), progress=stages), out)
-    stages("end")
-    return stages.found
+    return copy_database(database, Path(folder))
 
 
 def scene_flags(num_images: int) -> Iterator[object]:
@@ -148,83 +165,83 @@ def scene_flags(num_images: int) -> Iterator[object]:
     yield from ("--wrong-match-fraction", 0.2, "--corrupted-pair-fraction", 0.1, "--seed", 1)
 
 
-def command(*words: object) -> tuple[Usage, str]:
-    """Run a command of sfm-shapefit; return what it took and what it printed.
+def run_command(*words: object) -> str:
+    """Run a command of sfm-shapefit and return what it printed.
 
     Raises:
-        RuntimeError: if it fails, with its last line.
+        RuntimeError: if it fails, with its last lines.
     """
-    start = time.perf_counter()
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sfm_shapefit.cli", *map(str, words)],
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
+    command = [sys.executable, "-m", "sfm_shapefit.cli", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
+    if done.returncode:
+        raise RuntimeError(f"{words[0]} ended with code {done.returncode}: {done.stderr.strip()[-300:]}")
+    return done.stdout
+
+
+def checks(one: Located) -> list[Check]:
+    """Return the limits of the largest scene, and of every forecast."""
+    used = one.usage
+    off = max(ratio(one.forecast_mb, used.peak_mb), ratio(used.peak_mb, one.forecast_mb))
+    limits = [Check(name="forecast, factor", value=off, limit=FORECAST_FACTOR)]
+    if one.num_images >= LARGEST:
+        limits.append(Check(name="s", value=used.wall_s, limit=MOST_S))
+        limits.append(Check(name="MB", value=used.peak_mb, limit=MOST_MB))
+    return limits
+
+
+def tables(measured: Mapping[str, Located], args: argparse.Namespace) -> Iterator[str]:
+    """Yield the parts of the section."""
+    yield table_of(
+        measured.values(),
+        {
+            "scene": lambda one: one.name,
+            "images": lambda one: str(one.num_images),
+            "pairs": lambda one: str(one.num_pairs),
+            "matches": lambda one: str(one.num_matches),
+            "placed": lambda one: str(one.num_placed),
+            "error / extent": lambda one: f"{one.median_error:.2e}".replace("nan", "-"),
+            "s": lambda one: number(one.usage.wall_s),
+            "CPU s": lambda one: number(one.usage.cpu_s),
+            "peak MB": lambda one: number(one.usage.peak_mb),
+            "MB forecast": lambda one: number(one.forecast_mb),
+            "verdict": lambda one: verdict(checks(one)),
+        },
     )
-    assert process.stdout is not None
-    printed = process.stdout.read()
-    _, code, used = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(code)
-    if process.returncode:
-        raise RuntimeError(f"{words[0]} ended with code {process.returncode}: {printed.strip()[-300:]}")
-    unit = 1 if sys.platform == "darwin" else 1024
-    usage = Usage(
-        wall_s=time.perf_counter() - start,
-        cpu_s=used.ru_utime + used.ru_stime,
-        peak_mb=used.ru_maxrss * unit / 1e6,
-    )
-    return usage, printed
+    made = [one for one in measured.values() if one.name in [f"{size} images" for size in args.images]]
+    if made:
+        yield "Seconds / CPU seconds / peak MB by stage; exponents between smallest and largest:"
+        yield _show_stages(made)
 
 
-def _num_matches(database: Path) -> int:
-    import pycolmap
-
-    with pycolmap.Database.open(database) as opened:
-        return int(opened.num_inlier_matches())
-
-
-def section(measured: Sequence[Located], about: str) -> str:
-    """Return the Markdown of all sizes."""
+def _show_stages(made: Sequence[Located]) -> str:
     rows = []
-    for one in measured:
-        used = one.usage
-        checks = [
-            Check(name="s", value=used.wall_s, limit=MOST_S),
-            Check(name="MB", value=used.peak_mb, limit=MOST_MB),
-        ]
-        rows.append(
-            [
-                str(one.num_images),
-                str(one.num_pairs),
-                str(one.num_matches),
-                str(one.num_placed),
-                f"{one.median_error:.2e}",
-                number(used.wall_s),
-                number(used.cpu_s),
-                number(used.peak_mb),
-                verdict(checks) if one.num_images >= LARGEST else "no target",
-            ]
-        )
-    header = ["images", "pairs", "matches", "placed", "error / extent", "s", "CPU s", "peak MB", "verdict"]
-    parts = ["## Reliability: end to end at scale\n", about, "", table(header, rows)]
-    parts += ["\nSeconds / CPU seconds / peak MB by stage; exponents between smallest and largest:\n"]
-    return "\n".join([*parts, _stages(measured)])
-
-
-def _stages(measured: Sequence[Located]) -> str:
-    none = Usage(wall_s=0.0, cpu_s=0.0, peak_mb=0.0)
-    header = ["stage", *[f"{one.num_images} images" for one in measured], "exponent"]
-    rows = []
-    for name in measured[-1].stages:
-        used = [one.stages.get(name, none) for one in measured]
+    for name in made[-1].stages:
+        used = [one.stages.get(name, Usage()) for one in made]
         cells = [f"{one.wall_s:.1f} / {one.cpu_s:.1f} / {one.peak_mb:.0f}" for one in used]
-        rows.append([name, *cells, _exponent(measured, [one.cpu_s for one in used])])
-    return table(header, rows)
+        rows.append([name, *cells, _show_exponent(made, [one.cpu_s for one in used])])
+    return table(["stage", *[one.name for one in made], "exponent"], rows)
 
 
-def _exponent(measured: Sequence[Located], seconds: Sequence[float]) -> str:
-    if len(measured) < 2 or min(seconds[0], seconds[-1]) < _SHORT_S:
+def _show_exponent(made: Sequence[Located], cpu_s: Sequence[float]) -> str:
+    if len(made) < 2 or min(cpu_s[0], cpu_s[-1]) < _SHORT_S:
         return "-"
-    growth = math.log(measured[-1].num_matches / measured[0].num_matches)
-    return f"{math.log(seconds[-1] / seconds[0]) / growth:.2f}"
+    growth = math.log(made[-1].num_matches / made[0].num_matches)
+    return f"{math.log(cpu_s[-1] / cpu_s[0]) / growth:.2f}"
+
+
+BENCHMARK = Benchmark(
+    name="endtoend",
+    title="End to end at scale",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    flags=flags,
+    quick={"images": [30]},
+    threads=2,
+    quantities=(
+        Quantity("error / extent", "1", "lower", 0.05, "median position error over the scene's extent"),
+        Quantity("s, CPU s", "s", "lower", 0.3, "of reading, locating and writing, imports included"),
+        Quantity("peak MB", "MB", "lower", 0.1, "peak resident memory of the process"),
+        Quantity("MB forecast", "MB", "neither", 0.1, "what `inspect` forecasts of it, beforehand"),
+    ),
+)

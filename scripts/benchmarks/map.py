@@ -4,51 +4,38 @@ All start from the same verified matches and intrinsics. The mappers of pycolmap
 database, with 15 and with 30 as the least number of matches of a pair, and the better one counts; `map`
 chooses by itself. They refine focal lengths; `map` keeps those of the database. Errors are those of the
 largest model against the truth after robust alignment; since `map` leaves out cameras it does not trust,
-the peers' errors are also given on the cameras that `map` placed. One thread each, one run each in a fresh
-process; `map` has its numba kernels loaded by a run on the bundled ring before.
+the peers' errors are also given on the cameras that `map` placed. One run each in a fresh process; `map` has
+its numba kernels loaded by a run on the bundled ring before.
 """
 
 import argparse
 import math
-import shutil
-import sys
 import tempfile
-import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks.metrics import Check, Quantity, number, ratio, verdict
-from benchmarks.process import call, thread_environment
-from benchmarks.record import environment, legend, table, write_section
+from harness import ours
+from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.metrics import Check, Quantity, number, ratio, verdict
+from harness.process import call, thread_environment
+from harness.record import table_of
 
-HELP = "From a database to an adjusted model: map, pycolmap's global mapping and its incremental mapping."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pycolmap")
 SCENES = ("castle-P30", "lego100", "ring")
-MIN_MATCHES = (15, 30)
+SETTINGS = (("map", 0), *((m, k) for m in ("global", "incremental") for k in (15, 30)))
 LARGEST_RATIO = 1.15
 RING = {"shape": "ring", "num_images": 50, "num_points": 2000, "wrong_match_fraction": 0.02, "seed": 6}
-
-QUANTITIES = (
-    Quantity(
-        name="mean error",
-        unit="truth's",
-        better="lower",
-        rel_tol=0.05,
-        meaning="mean position error of the placed cameras; in brackets on those that `map` placed",
-    ),
-    Quantity(name="placed", unit="1", better="higher", rel_tol=0.0, meaning="cameras of the largest model"),
-    Quantity(name="CPU, wall", unit="s", better="lower", rel_tol=0.3, meaning="time of the whole run"),
-)
+QUICK_RING = {**RING, "num_images": 10, "num_points": 500}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """One mapper on one scene."""
 
+    scene: str
     mapper: str
     min_matches: int
     """Of the setting; 0 where the mapper chose."""
@@ -69,131 +56,115 @@ class Outcome:
         return float(np.mean(chosen)) if chosen else math.nan
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="Folder of the scenes."
-    )
-    parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--output", type=Path, default=ROOT / "scripts" / "results.md")
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return the scenes; the ring is made."""
+    if args.quick:
+        return {"ring": partial(measure_scene, "ring", args.data, 1, QUICK_RING)}
+    return {
+        scene: NOT_FOUND
+        if scene != "ring" and not (args.data / scene).is_dir()
+        else partial(measure_scene, scene, args.data, args.threads, RING)
+        for scene in SCENES
+    }
 
 
-def run(args: argparse.Namespace) -> int:
-    about = environment(PACKAGES, f"python scripts/benchmark.py map --scenes {' '.join(args.scenes)}")
-    measured: dict[str, list[Outcome]] = {}
-    for scene in args.scenes:
-        if scene != "ring" and not (args.data / scene).is_dir():
-            print(f"{scene} is not at hand; skipped", file=sys.stderr)
-            continue
-        measured[scene] = measure_scene(scene, args.data)
-        print("\n".join(" | ".join(row) for row in _rows(scene, measured[scene])), flush=True)
-    write_section(args.output, "map", section(measured, about))
-    return 0 if all(verdict(checks(runs)) == "met" for runs in measured.values()) else 1
-
-
-def measure_scene(scene: str, data: Path) -> list[Outcome]:
+def measure_scene(scene: str, data: Path, threads: int, ring: Mapping[str, object]) -> list[Outcome]:
     """Run all mappers on one scene, each in a fresh process."""
-    with tempfile.TemporaryDirectory() as folder:
-        database, truth = _inputs(scene, data, Path(folder))
-        settings = [("map", 0), *((m, k) for m in ("global", "incremental") for k in MIN_MATCHES)]
+    with tempfile.TemporaryDirectory() as name:
+        folder = data / scene
+        truth = folder / "gt"
+        if scene == "ring":
+            from sfm_shapefit.synthetic import SceneOptions, make_scene
+            from sfm_shapefit.synthetic.workspace import write_workspace
+
+            folder = Path(name) / "ring"
+            write_workspace(make_scene(SceneOptions(**ring)), folder)  # type: ignore[arg-type]
+            truth = folder / "sparse" / "0"
         return [
-            call(measure, mapper, database, truth, k, environment=thread_environment(1))
-            for mapper, k in settings
+            call(
+                *(measure, scene, mapper, folder / "database.db", truth, min_matches, threads),
+                environment=thread_environment(threads),
+            )
+            for mapper, min_matches in SETTINGS
         ]
 
 
-def _inputs(scene: str, data: Path, folder: Path) -> tuple[Path, Path]:
-    """Return database and true model of a scene; the ring is made."""
-    if scene != "ring":
-        return data / scene / "database.db", data / scene / "gt"
-    from sfm_shapefit.synthetic import SceneOptions, make_scene
-    from sfm_shapefit.synthetic.workspace import write_workspace
-
-    write_workspace(make_scene(SceneOptions(**RING)), folder / "ring")  # type: ignore[arg-type]
-    return folder / "ring" / "database.db", folder / "ring" / "sparse" / "0"
-
-
-def measure(mapper: str, database: Path, truth: Path, min_matches: int) -> Outcome:
+def measure(scene: str, mapper: str, database: Path, truth: Path, min_matches: int, threads: int) -> Outcome:
     """Run one mapper once, and compare its largest model with the truth."""
     import sfm_shapefit
+    from peers.colmap import map_database
     from sfm_shapefit.colmap.quiet import quiet_stderr
 
+    def run() -> object:
+        with quiet_stderr():
+            if mapper == "map":
+                return ours.map_database(database, bundle_adjust=True, threads=threads)
+            is_incremental = mapper == "incremental"
+            try:
+                return map_database(database, min_matches, incremental=is_incremental, num_threads=threads)[0]
+            except RuntimeError:
+                return None
+
     if mapper == "map":
-        _map(ROOT / "data_synthetic" / "ring8" / "database.db")  # compiles or loads the kernels
-    wall, cpu = time.perf_counter(), time.process_time()
-    with quiet_stderr():
-        model = _map(database) if mapper == "map" else _peer(mapper, database, min_matches)
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
-    errors = None if model is None else sfm_shapefit.evaluate(model, truth)  # type: ignore[arg-type]
+        # Compiled code is loaded.
+        ours.map_database(ROOT / "data_synthetic" / "ring8" / "database.db", bundle_adjust=True, threads=1)
+    done = ours.timed(run)
+    errors = None if done.found is None else sfm_shapefit.evaluate(done.found, truth)
     return Outcome(
+        scene=scene,
         mapper=mapper,
         min_matches=min_matches,
         names=() if errors is None else tuple(errors.names),
         errors=() if errors is None else tuple(errors.position_errors.tolist()),
-        cpu_s=cpu,
-        wall_s=wall,
+        cpu_s=done.cpu_s,
+        wall_s=done.wall_s,
     )
-
-
-def _map(database: Path) -> object:
-    """Return the largest model of `map` with bundle adjustment."""
-    import sfm_shapefit
-
-    options = sfm_shapefit.MapOptions(bundle_adjust=True, threads=1)
-    return sfm_shapefit.map_database(database, options).models[0].located.reconstruction
-
-
-def _peer(mapper: str, database: Path, min_matches: int) -> object:
-    """Return the largest model of one of pycolmap's mappers; None if there is none."""
-    import pycolmap
-
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        copied = Path(shutil.copyfile(database, folder / "database.db"))
-        (folder / "images").mkdir()
-        options = (
-            pycolmap.GlobalPipelineOptions() if mapper == "global" else pycolmap.IncrementalPipelineOptions()
-        )
-        options.min_num_matches, options.num_threads, options.random_seed = min_matches, 1, 0
-        function = pycolmap.global_mapping if mapper == "global" else pycolmap.incremental_mapping
-        models = function(str(copied), str(folder / "images"), str(folder), options)
-    return max(models.values(), key=lambda model: model.num_reg_images()) if models else None
 
 
 def checks(runs: Sequence[Outcome]) -> list[Check]:
-    """Return the check of the mean error against the better peer, on all its cameras."""
-    ours = next(run for run in runs if run.mapper == "map")
-    best = min((run.mean for run in runs if run.mapper != "map"), default=math.nan)
-    return [Check(name="mean error / better peer", value=ratio(ours.mean, best), limit=LARGEST_RATIO)]
+    """Return the check of the mean error against the better peer, on all its cameras; ours comes first."""
+    best = min((run.mean for run in runs[1:]), default=math.nan)
+    return [Check(name="mean error / better peer", value=ratio(runs[0].mean, best), limit=LARGEST_RATIO)]
 
 
-def section(measured: dict[str, list[Outcome]], about: str) -> str:
-    """Return the section of results.md."""
-    header = ["scene", "mapper", "least matches", "placed", "mean error", "CPU, wall s", "result"]
-    rows = [row for scene, runs in measured.items() for row in _rows(scene, runs)]
-    return "\n\n".join(
-        [
-            "## map: from a database to an adjusted model",
-            about,
-            f"The limit is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers at its "
-            f"better setting. The ring: {RING['num_images']} images with a share of "
-            f"{RING['wrong_match_fraction']} of all matches wrong; truth in its own units.",
-            legend(QUANTITIES),
-            table(header, rows),
-        ]
+def tables(measured: Mapping[str, Sequence[Outcome]], _args: argparse.Namespace) -> Iterator[str]:
+    """Yield the parts of the section."""
+    yield (
+        f"The limit is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers at its better"
+        f" setting. The ring: {RING['num_images']} images with a share of {RING['wrong_match_fraction']} of"
+        " all matches wrong; truth in its own units."
+    )
+
+    def show_mean(run: Outcome) -> str:
+        among = "" if run.mapper == "map" else f" ({number(run.mean_among(measured[run.scene][0].names))})"
+        return number(run.mean) + among
+
+    yield table_of(
+        [run for runs in measured.values() for run in runs],
+        {
+            "scene": lambda run: run.scene,
+            "mapper": lambda run: run.mapper,
+            "least matches": lambda run: str(run.min_matches or "chosen"),
+            "placed": lambda run: str(len(run.names)),
+            "mean error": show_mean,
+            "CPU, wall s": lambda run: f"{run.cpu_s:.1f}, {run.wall_s:.1f}",
+            "result": lambda run: verdict(checks(measured[run.scene])) if run.mapper == "map" else "",
+        },
     )
 
 
-def _rows(scene: str, runs: Sequence[Outcome]) -> list[list[str]]:
-    ours = next(run for run in runs if run.mapper == "map")
-    return [
-        [
-            scene,
-            run.mapper,
-            str(run.min_matches or "chosen"),
-            str(len(run.names)),
-            number(run.mean) + ("" if run is ours else f" ({number(run.mean_among(ours.names))})"),
-            f"{run.cpu_s:.1f}, {run.wall_s:.1f}",
-            verdict(checks(runs)) if run is ours else "",
-        ]
-        for run in runs
-    ]
+BENCHMARK = Benchmark(
+    name="map",
+    title="map: from a database to an adjusted model",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    quantities=(
+        Quantity(
+            *("mean error", "truth's", "lower", 0.05),
+            "mean position error of the placed cameras; in brackets on those that `map` placed",
+        ),
+        Quantity("placed", "1", "higher", 0.0, "cameras of the largest model"),
+        Quantity("CPU, wall", "s", "lower", 0.3, "time of the whole run"),
+    ),
+)

@@ -1,4 +1,4 @@
-"""Subcommand `rigs`: a drive of two rigs of three cameras, against pycolmap's global mapping on its database.
+"""A drive of two rigs of three cameras, beside pycolmap's global mapping on its database.
 
 The scale is known here: `locate` takes it from the offsets of the sensors, and so may global mapping, which
 holds their poses too. Its answer is aligned by shift and rotation alone; the scale that a similarity would
@@ -9,140 +9,172 @@ change sensors in their rigs) the best one of each drive stands in the table.
 
 import argparse
 import tempfile
-import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
-import sfm_shapefit
-from benchmarks.glomap import copy_database, quiet
-from benchmarks.record import environment, table, write_section
-from sfm_shapefit import LocateOptions
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.quiet import quiet_stderr
-from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.synthetic import RigScene, SceneOptions, WorkspaceOptions, make_rig_drive
-from sfm_shapefit.synthetic.workspace import write_workspace
+from harness import ours
+from harness.driver import Benchmark, Case, positive
+from harness.metrics import Check, Quantity
+from harness.record import table_of
 
-HELP = "metric scale and errors of a drive of two three-camera rigs, against pycolmap's global mapping"
-RESULTS = Path(__file__).parents[1] / "results.md"
+if TYPE_CHECKING:
+    import pycolmap
 
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.synthetic import RigScene
+
+LOCATE, ADJUSTED, MAPPING = "locate", "locate --bundle-adjust", "global mapping, its best setting"
 _SHARES = (0.0, 0.2)
 _MIN_MATCHES = (15, 50)
 
 
-class Outcome(NamedTuple):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Outcome:
     """What one run gave."""
 
     num_images: int
     scale_error: float
     """Of the similarity onto the truth."""
-    errors_m: FloatArray
+    errors_m: "FloatArray"
     """Of each camera after shift and rotation, at the run's own scale."""
-    seconds: float
+    wall_s: float
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--images", type=int, default=90, help="images of the drive, six per metre and a half"
-    )
-    parser.add_argument("--seeds", type=int, default=3, help="drives per share of wrong pairs")
-    parser.add_argument("--no-record", action="store_true", help="print the table only")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drives:
+    """A method on all drives of one share of wrong pairs."""
+
+    share: float
+    method: str
+    outcomes: Sequence[Outcome]
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, print, and write the section of results.md."""
-    rows = [row for share in _SHARES for row in _rows(args.images, range(args.seeds), share)]
-    header = ["wrong pairs", "method", "images", "scale error", "median (m)", "worst camera (m)", "seconds"]
-    command = f"python scripts/benchmark.py rigs --images {args.images} --seeds {args.seeds}"
-    body = (
-        f"## Rigs\n\n{environment(['pycolmap', 'numpy'], command)}\n"
-        f"Two vehicles with three cameras each, {args.images} images, {args.seeds} drives: medians over "
-        "these, and the worst camera of all. No position is given to anyone; `locate` is given rotations.\n\n"
-        f"{table(header, rows)}"
-    )
-    print(body)
-    if not args.no_record:
-        write_section(RESULTS, "rigs", body)
-    return 0
+def flags(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `rigs`."""
+    parser.add_argument("--images", type=positive, default=90, help="of a drive, six per metre and a half")
 
 
-def _rows(num_images: int, seeds: range, share: float) -> list[list[str]]:
-    """Return the table's rows for one share of wrong pairs."""
-    found: dict[str, list[Outcome]] = {}
-    for seed in seeds:
-        options = SceneOptions(
-            num_images=num_images,
-            num_points=2000,
-            corrupted_pair_fraction=share,
-            max_pairs_per_image=12,
-            seed=seed,
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return each method on each share of wrong pairs."""
+    return {
+        f"{share:.0%} wrong, {method}": partial(measure, method, share, args.images, args.repeats)
+        for share in _SHARES
+        for method in (LOCATE, ADJUSTED, MAPPING)
+    }
+
+
+def measure(method: str, share: float, num_images: int, drives: int) -> Drives:
+    """Run a method on so many drives."""
+    from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
+    from sfm_shapefit.synthetic.workspace import write_workspace
+
+    outcomes = []
+    for seed in range(drives):
+        scene = make_rig_drive(
+            SceneOptions(
+                num_images=num_images,
+                num_points=2000,
+                corrupted_pair_fraction=share,
+                max_pairs_per_image=12,
+                seed=seed,
+            )
         )
-        rigs = make_rig_drive(options)
         with tempfile.TemporaryDirectory() as folder:
             workspace = Path(folder) / "drive"
-            write_workspace(
-                rigs.scene, workspace, WorkspaceOptions(model="rotations", relative_poses=True), rigs
-            )
-            for adjusted in (False, True):
-                name = "locate --bundle-adjust" if adjusted else "locate"
-                found.setdefault(name, []).append(_located(rigs, workspace, adjusted))
-            found.setdefault("global mapping, its best setting", []).append(_best_mapping(rigs, workspace))
-    return [[f"{share:.0%}", name, *_cells(outcomes)] for name, outcomes in found.items()]
+            options = WorkspaceOptions(model="rotations", relative_poses=True)
+            write_workspace(scene.scene, workspace, options, scene)
+            outcomes.append(_run(method, scene, workspace))
+    return Drives(share=share, method=method, outcomes=outcomes)
 
 
-def _cells(outcomes: list[Outcome]) -> list[str]:
-    def median(values: list[float]) -> float:
-        return float(np.median(values))
-
-    return [
-        " / ".join(str(o.num_images) for o in outcomes),
-        f"{median([abs(o.scale_error) for o in outcomes]):.2%}",
-        f"{median([float(np.median(o.errors_m)) for o in outcomes]):.4f}",
-        f"{max(float(o.errors_m.max()) for o in outcomes):.4f}",
-        f"{median([o.seconds for o in outcomes]):.1f}",
-    ]
+def _run(method: str, scene: "RigScene", workspace: Path) -> Outcome:
+    if method == MAPPING:
+        return _best_mapping(scene, workspace)
+    run = ours.timed(lambda: ours.locate(workspace / "sparse" / "0", bundle_adjust=method == ADJUSTED))
+    return compare(scene, run.found.reconstruction, run.wall_s)
 
 
-def _located(rigs: RigScene, workspace: Path, adjusted: bool) -> Outcome:
-    start = time.perf_counter()
-    found = sfm_shapefit.locate(workspace / "sparse" / "0", options=LocateOptions(bundle_adjust=adjusted))
-    return _outcome(rigs, found.reconstruction, time.perf_counter() - start)
-
-
-def _best_mapping(rigs: RigScene, workspace: Path) -> Outcome:
+def _best_mapping(scene: "RigScene", workspace: Path) -> Outcome:
     """Return the run of global mapping with most images and, of those, the lowest median error."""
-    runs = [_mapped(rigs, workspace, matches, refine) for matches in _MIN_MATCHES for refine in (False, True)]
+    runs = [_map(scene, workspace, matches, refine) for matches in _MIN_MATCHES for refine in (False, True)]
     return min(runs, key=lambda run: (-run.num_images, float(np.median(run.errors_m))))
 
 
-def _mapped(rigs: RigScene, workspace: Path, min_num_matches: int, refine_sensors: bool) -> Outcome:
+def _map(scene: "RigScene", workspace: Path, min_num_matches: int, refine_sensors: bool) -> Outcome:
     """Run global mapping on a copy of the database, whatever it may do to it."""
-    options = pycolmap.GlobalPipelineOptions()
-    options.min_num_matches = min_num_matches
-    options.random_seed = 0
-    options.mapper.refine_sensor_from_rig = refine_sensors
-    with tempfile.TemporaryDirectory() as folder, quiet(), quiet_stderr():
-        database = copy_database(workspace / "database.db", Path(folder))
-        out, images = Path(folder) / "out", Path(folder) / "images"
-        out.mkdir()
-        images.mkdir()
-        start = time.perf_counter()
-        models = pycolmap.global_mapping(database, images, out, options)
-        seconds = time.perf_counter() - start
-    if not models:
-        return Outcome(0, np.nan, np.full(1, np.nan), seconds)
-    largest = max(models.values(), key=lambda model: model.num_reg_images())
-    return _outcome(rigs, largest, seconds)
+    from peers.colmap import map_database, quiet
+
+    with quiet():
+        try:
+            model, wall_s = map_database(
+                workspace / "database.db", min_num_matches, refine_sensors=refine_sensors
+            )
+        except RuntimeError:
+            return Outcome(num_images=0, scale_error=np.nan, errors_m=np.full(1, np.nan), wall_s=np.nan)
+    return compare(scene, model, wall_s)
 
 
-def _outcome(rigs: RigScene, model: pycolmap.Reconstruction, seconds: float) -> Outcome:
+def compare(scene: "RigScene", model: "pycolmap.Reconstruction", wall_s: float) -> Outcome:
+    """Compare a model with the truth."""
+    from sfm_shapefit.geometry import fit_similarity
+
     ids = sorted(i for i, image in model.images.items() if image.has_pose)
     centers = np.array([model.image(i).projection_center() for i in ids])
-    truth = rigs.scene.centers[np.array(ids) - 1]
+    truth = scene.scene.centers[np.array(ids) - 1]
     fit = fit_similarity(centers, truth)
     aligned = (centers - centers.mean(axis=0)) @ fit.rotation.T + truth.mean(axis=0)
     errors = np.linalg.norm(aligned - truth, axis=1)
-    return Outcome(len(ids), 1.0 / fit.scale - 1.0, errors, seconds)
+    return Outcome(num_images=len(ids), scale_error=1.0 / fit.scale - 1.0, errors_m=errors, wall_s=wall_s)
+
+
+def checks(_one: Drives) -> list[Check]:
+    """Return nothing: the table compares, and has no limit."""
+    return []
+
+
+def tables(measured: Mapping[str, Drives], args: argparse.Namespace) -> Iterator[str]:
+    """Yield the parts of the section."""
+    yield (
+        f"Two vehicles with three cameras each, {args.images} images, {args.repeats} drives: medians over"
+        " these, and the worst camera of all. No position is given to anyone; `locate` is given rotations."
+    )
+    yield table_of(
+        measured.values(),
+        {
+            "wrong pairs": lambda one: f"{one.share:.0%}",
+            "method": lambda one: one.method,
+            "images": lambda one: " / ".join(str(o.num_images) for o in one.outcomes),
+            "scale error": lambda one: f"{np.median([abs(o.scale_error) for o in one.outcomes]):.2%}",
+            "median (m)": lambda one: f"{np.median([np.median(o.errors_m) for o in one.outcomes]):.4f}",
+            "worst camera (m)": lambda one: f"{max(o.errors_m.max() for o in one.outcomes):.4f}",
+            "seconds": lambda one: f"{np.median([o.wall_s for o in one.outcomes]):.1f}",
+        },
+    )
+
+
+BENCHMARK = Benchmark(
+    name="rigs",
+    title="Rigs",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    flags=flags,
+    packages=("pycolmap", "numpy"),
+    quick={"repeats": 1, "images": 18},
+    repeats=3,
+    threads=2,
+    quantities=(
+        Quantity("images", "images", "higher", 0.0, "placed ones of each drive"),
+        Quantity("scale error", "1", "lower", 0.1, "scale of the similarity onto the truth, minus 1; median"),
+        Quantity(
+            *("median, worst camera", "m", "lower", 0.1),
+            "distance from the truth after shift and rotation: median camera, median of the drives; worst",
+        ),
+        Quantity("seconds", "s", "lower", 0.5, "wall-clock of the call, median of the drives"),
+    ),
+)

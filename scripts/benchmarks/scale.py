@@ -7,37 +7,41 @@ certificate. From `on_iteration` come the objective and the clock after each ite
 time at which the objective came, and stayed, within 1e-4 of the best one known. That is the lower of the
 run's own and of a second, tighter run's.
 
-`auto` carries the limits: it is what a user gets. Where it does not choose ADMM, ADMM is measured beside
-it, so that its iterations can be compared within a family.
+`auto` carries the limits: it is what a user gets. ADMM is measured beside it on graphs that are not too
+large, so that its iterations can be compared within a family.
+
+Rigid pieces, a stage of it that has limits of its own, are found in further processes that are given the
+pairs alone: their peak memory is that of the imports, the pairs and the search.
 """
 
 import argparse
 import math
-import sys
+import statistics
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.graphs import GraphSpec, draw, relative_error, view_graph
-from benchmarks.metrics import Check, Quantity, number, verdict
-from benchmarks.process import call, peak_memory_mb, reset_peak, resident_memory_mb, thread_environment
-from benchmarks.record import environment, legend, table, write_section
+from harness import ours
+from harness.driver import ROOT, Benchmark, Case
+from harness.graphs import GraphSpec, draw, relative_error, view_graph
+from harness.metrics import Check, Quantity, number, verdict
+from harness.process import call, peak_memory_mb, reset_peak, resident_memory_mb
+from harness.record import table, table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import SolverResult, ViewGraph
 
-HELP = "Large graphs of four families: time, iterations and memory as they grow."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pymetis")
-CLOSE = 1e-4  # relative excess of the objective
+CLOSE = 1e-4
+"""Relative excess of the objective that counts as close."""
 FAMILIES = {"geo": "geometric", "comm": "community", "er": "random of degree 40", "seq": "trajectory"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
+class Problem:
     """A problem, the gap asked for, and what is to be reached."""
 
     spec: GraphSpec
@@ -61,13 +65,13 @@ def _spec(family: str, n: int, degree: float, sigma: float = 0.01) -> GraphSpec:
     return GraphSpec(family=family, n=n, degree=degree, sigma=sigma)
 
 
-CASES = (
-    Case(spec=_spec("geo", 1_000, 40.0), tol=1e-6, reference_tol=1e-8),
-    Case(
+PROBLEMS = (
+    Problem(spec=_spec("geo", 1_000, 40.0), tol=1e-6, reference_tol=1e-8),
+    Problem(
         spec=_spec("geo", 10_000, 40.0), tol=1e-6, reference_tol=1e-7, close_s=0.5, certified_s=3.0, gap=1e-6
     ),
-    Case(spec=_spec("geo", 10_000, 40.0, sigma=0.0), tol=3e-12, error=1e-12, gap=1e-10),
-    Case(
+    Problem(spec=_spec("geo", 10_000, 40.0, sigma=0.0), tol=3e-12, error=1e-12, gap=1e-10),
+    Problem(
         spec=_spec("geo", 100_000, 60.0),
         tol=1e-4,
         reference_tol=1e-6,
@@ -76,19 +80,21 @@ CASES = (
         memory_mb=1300.0,
         gap=1e-4,
     ),
-    Case(spec=_spec("comm", 1_000, 67.0), tol=1e-4, reference_tol=1e-7),
-    Case(spec=_spec("comm", 10_000, 67.0), tol=1e-4, reference_tol=1e-6),
+    Problem(spec=_spec("comm", 1_000, 67.0), tol=1e-4, reference_tol=1e-7),
+    Problem(spec=_spec("comm", 10_000, 67.0), tol=1e-4, reference_tol=1e-6),
     # Of 1e-4 the splitting would stop short, relatively; a run that knows the optimum would take an hour.
-    Case(spec=_spec("comm", 100_000, 67.0), tol=3e-5, close_s=40.0, memory_mb=2000.0),
-    Case(spec=_spec("er", 1_000, 40.0), tol=1e-4, reference_tol=1e-7),
-    Case(spec=_spec("er", 10_000, 40.0), tol=1e-4, reference_tol=1e-6),
-    Case(spec=_spec("er", 100_000, 40.0), tol=1e-4, reference_tol=1e-5, close_s=14.0, memory_mb=600.0),
-    Case(spec=_spec("seq", 1_000, 20.0), tol=1e-4, reference_tol=1e-7),
-    Case(spec=_spec("seq", 10_000, 20.0), tol=1e-4, reference_tol=1e-6),
-    Case(spec=_spec("seq", 100_000, 20.0), tol=1e-4, reference_tol=1e-5),
+    Problem(spec=_spec("comm", 100_000, 67.0), tol=3e-5, close_s=40.0, memory_mb=2000.0),
+    Problem(spec=_spec("er", 1_000, 40.0), tol=1e-4, reference_tol=1e-7),
+    Problem(spec=_spec("er", 10_000, 40.0), tol=1e-4, reference_tol=1e-6),
+    Problem(spec=_spec("er", 100_000, 40.0), tol=1e-4, reference_tol=1e-5, close_s=14.0, memory_mb=600.0),
+    Problem(spec=_spec("seq", 1_000, 20.0), tol=1e-4, reference_tol=1e-7),
+    Problem(spec=_spec("seq", 10_000, 20.0), tol=1e-4, reference_tol=1e-6),
+    Problem(spec=_spec("seq", 100_000, 20.0), tol=1e-4, reference_tol=1e-5),
 )
-MILLION = Case(spec=_spec("geo", 1_000_000, 38.0), tol=1e-4, close_s=300.0, memory_mb=6000.0)
-BESIDE_UP_TO = 10_000  # cameras, for ADMM beside another choice of `auto`
+MILLION = Problem(spec=_spec("geo", 1_000_000, 38.0), tol=1e-4, close_s=300.0, memory_mb=6000.0)
+QUICK = Problem(spec=_spec("seq", 200, 20.0), tol=1e-4)
+BESIDE_UP_TO = 10_000
+"""Cameras, for ADMM beside another choice of `auto`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +109,7 @@ class Trace:
 class Measured:
     """What one solve gave."""
 
-    case: Case
+    problem: Problem
     asked: str
     num_edges: int
     method: str
@@ -147,129 +153,65 @@ def settled(values: Sequence[float], limit: float) -> int | None:
     return first if first <= len(values) else None
 
 
-QUANTITIES = (
-    Quantity(
-        name="to 1e-4",
-        unit="s",
-        better="lower",
-        rel_tol=0.5,
-        meaning="until the objective stays within 1e-4, relatively, of the best one known",
-    ),
-    Quantity(name="iterations", unit="1", better="lower", rel_tol=0.0, meaning="until then / in all"),
-    Quantity(
-        name="total",
-        unit="s",
-        better="lower",
-        rel_tol=0.5,
-        meaning="wall-clock of `solve`, everything included, once",
-    ),
-    Quantity(
-        name="certificate",
-        unit="s",
-        better="lower",
-        rel_tol=0.5,
-        meaning="part of the total after the last iteration",
-    ),
-    Quantity(
-        name="gap",
-        unit="1",
-        better="lower",
-        rel_tol=1.0,
-        meaning="certified: objective minus a rigorous bound",
-    ),
-    Quantity(
-        name="excess known",
-        unit="1",
-        better="lower",
-        rel_tol=1.0,
-        meaning="best objective known over the best bound known, minus 1: how soft `to 1e-4` is",
-    ),
-    Quantity(name="error", unit="1", better="lower", rel_tol=0.01, meaning="the paper's, against the truth"),
-    Quantity(
-        name="memory",
-        unit="MB",
-        better="lower",
-        rel_tol=0.15,
-        meaning="peak resident memory during `solve`, all included / before it: libraries, problem",
-    ),
-)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigidProblem:
+    """A graph in 3D, and what finding its pieces may take."""
+
+    spec: GraphSpec
+    seconds: float | None = None
+    peak_mb: float | None = None
 
 
-# --- the subcommand --------------------------------------------------------------------------------
+RIGID_PROBLEMS = {
+    **{
+        f"{family}-10000": RigidProblem(spec=GraphSpec(family=family, n=10_000, degree=degree), seconds=0.5)
+        for family, degree in (("geo", 32.0), ("seq", 36.0), ("comm", 45.0))
+    },
+    "er-10000, few triangles": RigidProblem(spec=GraphSpec(family="er", n=10_000, degree=20.0)),
+    **{
+        f"{family}-100000": RigidProblem(
+            spec=GraphSpec(family=family, n=100_000, degree=degree), seconds=20.0, peak_mb=1000.0
+        )
+        for family, degree in (("geo", 53.0), ("seq", 60.0), ("comm", 62.0))
+    },
+}
+QUICK_RIGID = RigidProblem(spec=GraphSpec(family="geo", n=200, degree=20.0))
+RIGID_REPEATS = 3
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """What finding the rigid pieces of one graph gave and took."""
+
+    name: str
+    problem: RigidProblem
+    num_pairs: int
+    num_pieces: int
+    num_single_pairs: int
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+
+
+# --- the cases -------------------------------------------------------------------------------------
+
+
+def flags(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `scale`."""
-    parser.add_argument(
-        "--families", type=families, default=list(FAMILIES), help="geo,comm,er,seq by default"
-    )
-    parser.add_argument("--max-n", type=int, default=100_000, help="largest number of cameras (default 1e5)")
     parser.add_argument("--million", action="store_true", help="also a geometric graph of 1e6 cameras")
-    parser.add_argument("--threads", type=int, default=2, help="threads (default 2)")
-    parser.add_argument("--timeout", type=float, default=1800.0, help="seconds per solve (default 1800)")
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
-    parser.add_argument("--plot", type=Path, default=ROOT / "docs" / "scale.png", help="the plot's file")
+    parser.add_argument("--plot", type=Path, help="the plot's file (docs/scale.png)")
 
 
-def families(text: str) -> list[str]:
-    """Parse `--families`."""
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in names if name not in FAMILIES]
-    if unknown or not names:
-        raise argparse.ArgumentTypeError(
-            f"unknown family {', '.join(unknown) or '(none)'}; known: {', '.join(FAMILIES)}"
-        )
-    return list(dict.fromkeys(names))
-
-
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section, write it and draw the plot; a missed limit is no failure."""
-    about = environment(PACKAGES, command_line(args))
-    cases = [
-        case
-        for case in (*CASES, *([MILLION] if args.million else []))
-        if case.spec.family in args.families and (case.spec.n <= args.max_n or case is MILLION)
-    ]
-    measured: list[Measured] = []
-    failed: list[str] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for case in cases:
-            print(f"measuring {case.name}", file=sys.stderr, flush=True)
-            try:
-                measured += _measure_case(case, Path(folder) / "problem.npz", args)
-            except (RuntimeError, TimeoutError) as error:
-                failed.append(f"{case.name}: {error}")
-    body = section(measured, about, failed, args.threads)
-    print(body)
-    write_section(args.out, "scale", body)
-    if measured:
-        plot(measured, args.plot)
-    return 0
-
-
-def command_line(args: argparse.Namespace) -> str:
-    """Return the command that repeats the measurement, without paths."""
-    chosen = "" if args.families == list(FAMILIES) else f" --families {','.join(args.families)}"
-    smaller = "" if args.max_n == 100_000 else f" --max-n {args.max_n}"
-    million = " --million" if args.million else ""
-    return f"python scripts/benchmark.py scale{chosen}{smaller}{million} --threads {args.threads}"
-
-
-def _measure_case(case: Case, file: Path, args: argparse.Namespace) -> list[Measured]:
-    """Draw the problem into a file; solve it in fresh processes, by `auto` and by ADMM if that differs."""
-    variables = thread_environment(args.threads)
-    call(save_problem, case.spec, file, environment=variables)
-
-    def solved(asked: str) -> Measured:
-        found: Measured = call(
-            measure, case, file, asked, args.threads, environment=variables, timeout_s=args.timeout
-        )
-        return found
-
-    chosen = solved("auto")
-    if "admm" in chosen.method or case.spec.n > BESIDE_UP_TO:
-        return [chosen]
-    return [chosen, solved("admm")]
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return the graphs by `auto` and, if they are not too large, by ADMM, and the searches for pieces."""
+    problems = (QUICK,) if args.quick else (*PROBLEMS, *([MILLION] if args.million else []))
+    found: dict[str, Case] = {}
+    for problem in problems:
+        found[problem.name] = partial(measure, problem, "auto", args.threads)
+        if problem.spec.n <= BESIDE_UP_TO:
+            found[f"{problem.name} (admm)"] = partial(measure, problem, "admm", args.threads)
+    rigid = {"geo-200": QUICK_RIGID} if args.quick else RIGID_PROBLEMS
+    return found | {f"rigid {name}": partial(search, name, problem) for name, problem in rigid.items()}
 
 
 # --- measuring -------------------------------------------------------------------------------------
@@ -283,28 +225,30 @@ def save_problem(spec: GraphSpec, file: Path) -> None:
     np.savez(file, edges=problem.edges, directions=problem.directions, locations=problem.locations)
 
 
-def measure(case: Case, file: Path, asked: str, threads: int) -> Measured:
-    """Solve the stored problem; to be called once per process."""
+def measure(problem: Problem, asked: str, threads: int) -> Measured:
+    """Solve a problem that another process draws; to be called once per process."""
     import numpy as np
 
     from sfm_shapefit import ViewGraph
 
-    _warm_up(case.spec, threads)
-    with np.load(file) as stored:
-        truth = stored["locations"]
-        graph = ViewGraph(len(truth), stored["edges"], stored["directions"])
+    _warm_up(problem.spec, threads)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "problem.npz"
+        call(save_problem, problem.spec, file)
+        with np.load(file) as stored:
+            truth = stored["locations"]
+            graph = ViewGraph(len(truth), stored["edges"], stored["directions"])
     before_mb = resident_memory_mb()
     reset_peak()
-    cpu_start = time.process_time()
-    found, trace, total_s = _traced(graph, asked, case.tol, threads)
-    cpu_s, peak_mb = time.process_time() - cpu_start, peak_memory_mb()
+    run = ours.timed(lambda: _trace(graph, asked, problem.tol, threads))
+    (found, trace), peak_mb = run.found, peak_memory_mb()
     best, bound = min([found.objective, *trace.objectives]), found.dual_bound
-    if case.reference_tol is not None:
-        again, longer, _ = _traced(graph, asked, case.reference_tol, threads)
+    if problem.reference_tol is not None:
+        again, longer = _trace(graph, asked, problem.reference_tol, threads)
         best = min([best, again.objective, *longer.objectives])
         bound = max(bound, again.dual_bound)
     return Measured(
-        case=case,
+        problem=problem,
         asked=asked,
         num_edges=graph.num_edges,
         method=found.method,
@@ -313,8 +257,8 @@ def measure(case: Case, file: Path, asked: str, threads: int) -> Measured:
         trace=trace,
         best_objective=best,
         bound=bound,
-        total_s=total_s,
-        cpu_s=cpu_s,
+        total_s=run.wall_s,
+        cpu_s=run.cpu_s,
         objective=found.objective,
         gap=found.gap,
         equality_residual=found.equality_residual,
@@ -329,44 +273,67 @@ def _warm_up(spec: GraphSpec, threads: int) -> None:
     small = GraphSpec(family=spec.family, n=1000, degree=min(spec.degree, 40.0), sigma=0.01)
     graph = view_graph(draw(small))
     for method in ("auto", "newton", "admm"):
-        _traced(graph, method, 1e-4, threads)
+        _trace(graph, method, 1e-4, threads)
 
 
-def _traced(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple[SolverResult, Trace, float]":
-    """Solve; return the result, the objective and the clock after each iteration, and the seconds in all."""
-    from sfm_shapefit import SolverOptions, solve
-    from sfm_shapefit.solver.options import IterationInfo
-
+def _trace(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple[SolverResult, Trace]":
+    """Solve; return the result, and the objective and the clock after each iteration."""
     objectives: list[float] = []
     seconds: list[float] = []
 
-    def note(info: IterationInfo) -> None:
+    def note(info: object) -> None:
         seconds.append(time.perf_counter() - start)
-        objectives.append(info.objective)
+        objectives.append(info.objective)  # type: ignore[attr-defined]
 
-    options = SolverOptions(method=method, tol=tol, uniqueness=False, threads=threads)  # type: ignore[arg-type]
     start = time.perf_counter()
-    found = solve(graph, options, note)
-    total_s = time.perf_counter() - start
-    return found, Trace(objectives=tuple(objectives), seconds=tuple(seconds)), total_s
+    found = ours.solve(graph, note=note, method=method, tol=tol, threads=threads)
+    return found, Trace(objectives=tuple(objectives), seconds=tuple(seconds))
+
+
+def search(name: str, problem: RigidProblem) -> Search:
+    """Find the pieces in 3D a few times, after a small graph that loads the compiled code."""
+    import numpy as np
+
+    edges = call(draw_edges, problem.spec)
+    ours.rigid_pieces(5, np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 0]]))
+    runs = [ours.timed(lambda: ours.rigid_pieces(problem.spec.n, edges)) for _ in range(RIGID_REPEATS)]
+    sizes = np.bincount(runs[0].found)
+    return Search(
+        name=name,
+        problem=problem,
+        num_pairs=len(edges),
+        num_pieces=int(np.sum(sizes > 1)),
+        num_single_pairs=int(np.sum(sizes == 1)),
+        wall_s=statistics.median(run.wall_s for run in runs),
+        cpu_s=statistics.median(run.cpu_s for run in runs),
+        peak_mb=peak_memory_mb(),
+    )
+
+
+def draw_edges(spec: GraphSpec) -> object:
+    """Return the pairs of a problem."""
+    return draw(spec).edges
 
 
 # --- what is to be reached -------------------------------------------------------------------------
 
 
-def checks(one: Measured) -> list[Check]:
-    """Return the checks of one solve; only `auto` has any."""
-    case = one.case
-    if one.asked != "auto":
+def checks(one: Measured | Search) -> list[Check]:
+    """Return the limits of one case; of solves, only `auto` has any."""
+    if isinstance(one, Search):
+        values = [("seconds", one.wall_s, one.problem.seconds), ("peak", one.peak_mb, one.problem.peak_mb)]
+    elif one.asked != "auto":
         return []
-    certified_s = one.total_s if case.gap is not None and one.gap <= case.gap else math.nan
-    values = (
-        ("to 1e-4, s", one.close_s, case.close_s),
-        ("certified, s", certified_s, case.certified_s),
-        ("memory, MB", one.peak_mb, case.memory_mb),
-        ("error", one.error, case.error),
-        ("gap", one.gap, case.gap),
-    )
+    else:
+        problem = one.problem
+        certified_s = one.total_s if problem.gap is not None and one.gap <= problem.gap else math.nan
+        values = [
+            ("to 1e-4, s", one.close_s, problem.close_s),
+            ("certified, s", certified_s, problem.certified_s),
+            ("memory, MB", one.peak_mb, problem.memory_mb),
+            ("error", one.error, problem.error),
+            ("gap", one.gap, problem.gap),
+        ]
     return [Check(name=name, value=value, limit=limit) for name, value, limit in values if limit is not None]
 
 
@@ -385,40 +352,46 @@ def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> l
     chosen = [
         one
         for one in measured
-        if one.case.spec.family == family
-        and one.case.spec.sigma > 0.0
+        if one.problem.spec.family == family
+        and one.problem.spec.sigma > 0.0
         and ("admm" in one.method if by_admm else one.asked == "auto")
     ]
-    return sorted(chosen, key=lambda one: one.case.spec.n)
+    return sorted(chosen, key=lambda one: one.problem.spec.n)
 
 
 # --- the section -----------------------------------------------------------------------------------
 
 
-def section(measured: Sequence[Measured], about: str, failed: Sequence[str], threads: int) -> str:
-    """Return the section of the file of results."""
-    every = [check for one in measured for check in checks(one)]
-    parts = [
-        "## Large graphs",
-        about + f"- Threads: {threads}, BLAS too; q = 0.2 of the directions random; each solve once, after a"
-        " warm-up on 1000 cameras of the family, so that nothing is compiled while the clock runs",
-        f"**{sum(check.met for check in every)} of {len(every)} limits met.**",
-        "### Time",
-        _time_table(measured),
-        "### Certificate, error and memory",
-        _proof_table(measured),
-        f"### Iterations of ADMM until the objective is within {CLOSE:.0e}, as n grows",
-        _iteration_table(measured),
-        "### Exponents: value ~ size^exponent, least squares of logarithms over the sizes above\n\n"
-        "![time and memory against cameras](../docs/scale.png)",
-        _exponent_table(measured),
-    ]
-    if failed:
-        parts.append("Failed: " + "; ".join(failed) + ".")
-    reasons = {f"- {one.case.name}: {one.method}, because {one.reason}": None for one in measured}
-    parts += ["### Why this solver", "\n".join(reasons)]
-    parts += ["### What the columns mean", legend(QUANTITIES), _CAVEATS]
-    return "\n\n".join(part.strip() for part in parts)
+def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) -> Iterator[str]:
+    """Yield the parts of the section, and draw the plot."""
+    solves = [one for one in measured.values() if isinstance(one, Measured)]
+    searches = [one for one in measured.values() if isinstance(one, Search)]
+    if solves:
+        if args.plot is not None or not args.quick:
+            plot(solves, args.plot or ROOT / "docs" / "scale.png")
+        yield (
+            "q = 0.2 of the directions are random; each solve once, after a warm-up on 1000 cameras of the"
+            " family, so that nothing is compiled while the clock runs."
+        )
+        yield "## Time"
+        yield _show_times(solves)
+        yield "## Certificate, error and memory"
+        yield _show_proofs(solves)
+        yield f"## Iterations of ADMM until the objective is within {CLOSE:.0e}, as n grows"
+        yield _show_iterations(solves)
+        yield (
+            "## Exponents: value ~ size^exponent, least squares of logarithms over the sizes above\n\n"
+            "![time and memory against cameras](../../docs/scale.png)"
+        )
+        yield _show_exponents(solves)
+        yield "## Why this solver"
+        yield "\n".join(
+            dict.fromkeys(f"- {one.problem.name}: {one.method}, because {one.reason}" for one in solves)
+        )
+        yield _CAVEATS
+    if searches:
+        yield "## Rigid pieces"
+        yield _show_searches(searches)
 
 
 _CAVEATS = (
@@ -433,112 +406,102 @@ _CAVEATS = (
 )
 
 
-def _row_name(one: Measured) -> str:
-    return one.case.name + ("" if one.asked == "auto" else f" ({one.asked})")
+def _label(one: Measured) -> str:
+    return one.problem.name + ("" if one.asked == "auto" else f" ({one.asked})")
 
 
-def _time_table(measured: Sequence[Measured]) -> str:
-    rows = []
-    for one in measured:
-        limits = [
-            "-" if limit is None else f"{limit:g} s" for limit in (one.case.close_s, one.case.certified_s)
-        ]
-        reached = "-" if one.close_at is None else f"{one.close_at}"
-        rows.append(
-            [
-                _row_name(one),
-                f"{one.case.spec.n}",
-                f"{one.num_edges}",
-                one.method,
-                number(one.close_s),
-                f"{reached} / {len(one.trace.objectives)}",
-                number(one.total_s),
-                number(one.cpu_s),
-                number(one.certificate_s),
-                " / ".join(limits) if one.asked == "auto" else "-",
-                verdict(checks(one)),
-            ]
-        )
-    header = [
-        "problem",
-        "cameras",
-        "pairs",
-        "method",
-        "to 1e-4, s",
-        "iterations",
-        "total, s",
-        "CPU, s",
-        "certificate, s",
-        "to reach: to 1e-4 / certified",
-        "verdict",
-    ]
-    return table(header, rows)
+def _show_times(solves: Sequence[Measured]) -> str:
+    def show_limits(one: Measured) -> str:
+        limits = (one.problem.close_s, one.problem.certified_s)
+        shown = ["-" if limit is None else f"{limit:g} s" for limit in limits]
+        return " / ".join(shown) if one.asked == "auto" else "-"
+
+    return table_of(
+        solves,
+        {
+            "problem": _label,
+            "cameras": lambda one: str(one.problem.spec.n),
+            "pairs": lambda one: str(one.num_edges),
+            "method": lambda one: one.method,
+            "to 1e-4, s": lambda one: number(one.close_s),
+            "iterations": lambda one: f"{one.close_at or '-'} / {len(one.trace.objectives)}",
+            "total, s": lambda one: number(one.total_s),
+            "CPU, s": lambda one: number(one.cpu_s),
+            "certificate, s": lambda one: number(one.certificate_s),
+            "to reach: to 1e-4 / certified": show_limits,
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
 
 
-def _proof_table(measured: Sequence[Measured]) -> str:
-    rows = [
-        [
-            _row_name(one),
-            one.status,
-            f"{one.case.tol:.0e}",
-            number(one.objective),
-            number(one.gap),
-            number(one.equality_residual),
-            number(one.best_objective / one.bound - 1.0) if one.bound > 0.0 else "-",
-            number(one.error),
-            f"{number(one.peak_mb)} / {number(one.before_mb)}",
-            "-" if one.case.memory_mb is None or one.asked != "auto" else f"{one.case.memory_mb:g} MB",
-        ]
-        for one in measured
-    ]
-    header = [
-        "problem",
-        "status",
-        "gap asked",
-        "objective",
-        "gap",
-        "equality residual",
-        "excess known",
-        "error",
-        "memory, MB",
-        "to reach",
-    ]
-    return table(header, rows)
+def _show_proofs(solves: Sequence[Measured]) -> str:
+    def show_excess(one: Measured) -> str:
+        return number(one.best_objective / one.bound - 1.0) if one.bound > 0.0 else "-"
+
+    def show_limit(one: Measured) -> str:
+        has_limit = one.problem.memory_mb is not None and one.asked == "auto"
+        return f"{one.problem.memory_mb:g} MB" if has_limit else "-"
+
+    return table_of(
+        solves,
+        {
+            "problem": _label,
+            "status": lambda one: one.status,
+            "gap asked": lambda one: f"{one.problem.tol:.0e}",
+            "objective": lambda one: number(one.objective),
+            "gap": lambda one: number(one.gap),
+            "equality residual": lambda one: number(one.equality_residual),
+            "excess known": show_excess,
+            "error": lambda one: number(one.error),
+            "memory, MB": lambda one: f"{number(one.peak_mb)} / {number(one.before_mb)}",
+            "to reach": show_limit,
+        },
+    )
 
 
-def _iteration_table(measured: Sequence[Measured]) -> str:
+def _show_searches(searches: Sequence[Search]) -> str:
+    return table_of(
+        searches,
+        {
+            "graph": lambda one: one.name,
+            "cameras": lambda one: str(one.problem.spec.n),
+            "pairs": lambda one: str(one.num_pairs),
+            "pieces; single pairs": lambda one: f"{one.num_pieces}; {one.num_single_pairs}",
+            "seconds (CPU)": lambda one: f"{number(one.wall_s)} ({number(one.cpu_s)})",
+            "peak, MB": lambda one: number(one.peak_mb),
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+
+
+def _show_iterations(measured: Sequence[Measured]) -> str:
     by_admm = {family: noisy(measured, family, by_admm=True) for family in FAMILIES}
-    sizes = sorted({one.case.spec.n for found in by_admm.values() for one in found})
+    sizes = sorted({one.problem.spec.n for found in by_admm.values() for one in found})
     rows = []
     for family, name in FAMILIES.items():
-        close_at = {one.case.spec.n: one.close_at for one in by_admm[family]}
+        close_at = {one.problem.spec.n: one.close_at for one in by_admm[family]}
         if close_at:
             cells = [close_at.get(n) for n in sizes]
             rows.append([name, *("-" if cell is None else f"{cell}" for cell in cells)])
     return table(["family", *(f"{n} cameras" for n in sizes)], rows)
 
 
-def _exponent_table(measured: Sequence[Measured]) -> str:
+def _show_exponents(measured: Sequence[Measured]) -> str:
     rows = []
     for family, name in FAMILIES.items():
         for by_admm in (False, True):
             found = noisy(measured, family, by_admm)
             if len(found) > 1:
                 rows.append([name, "admm" if by_admm else "auto", *_exponent_cells(found)])
-    header = [
-        "family",
-        "solver",
-        "cameras",
-        "to 1e-4: per cameras / pairs",
-        "total: per cameras / pairs",
-        "memory of the solve: per cameras / pairs",
-    ]
-    return table(header, rows)
+    values = ("to 1e-4", "total", "memory of the solve")
+    return table(
+        ["family", "solver", "cameras", *(f"{value}: per cameras / pairs" for value in values)], rows
+    )
 
 
 def _exponent_cells(found: Sequence[Measured]) -> list[str]:
     """Return the sizes, and the exponents of times and memory."""
-    cameras = [float(one.case.spec.n) for one in found]
+    cameras = [float(one.problem.spec.n) for one in found]
     pairs = [float(one.num_edges) for one in found]
     values = (
         [one.close_s for one in found],
@@ -562,7 +525,7 @@ def plot(measured: Sequence[Measured], file: Path) -> None:
         found = noisy(measured, family)
         if not found:
             continue
-        cameras = [one.case.spec.n for one in found]
+        cameras = [one.problem.spec.n for one in found]
         style = {"color": f"C{color}", "marker": "o", "markersize": 4.0}
         slope = exponent(cameras, [one.total_s for one in found])
         fitted = "" if math.isnan(slope) else f", n^{slope:.2f}"
@@ -576,3 +539,44 @@ def plot(measured: Sequence[Measured], file: Path) -> None:
         panel.grid(True, which="both", alpha=0.25)
         panel.legend(frameon=False)
     figure.savefig(file, dpi=110)
+
+
+BENCHMARK = Benchmark(
+    name="scale",
+    title="Large graphs",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    flags=flags,
+    packages=("numpy", "scipy", "numba", "pymetis"),
+    threads=2,
+    timeout_s=3600.0,
+    quantities=(
+        Quantity(
+            *("to 1e-4", "s", "lower", 0.5),
+            "until the objective stays within 1e-4, relatively, of the best one known",
+        ),
+        Quantity("iterations", "1", "lower", 0.0, "until then / in all"),
+        Quantity("total", "s", "lower", 0.5, "wall-clock of `solve`, everything included, once"),
+        Quantity("certificate", "s", "lower", 0.5, "part of the total after the last iteration"),
+        Quantity("gap", "1", "lower", 1.0, "certified: objective minus a rigorous bound"),
+        Quantity(
+            *("excess known", "1", "lower", 1.0),
+            "best objective known over the best bound known, minus 1: how soft `to 1e-4` is",
+        ),
+        Quantity("error", "1", "lower", 0.01, "the paper's, against the truth"),
+        Quantity(
+            *("memory", "MB", "lower", 0.15),
+            "peak resident memory during `solve`, all included / before it: libraries, problem",
+        ),
+        Quantity("pieces", "1", "neither", 0.0, "of three cameras or more; single pairs"),
+        Quantity(
+            *("seconds (CPU)", "s", "lower", 0.3),
+            f"of `parallel_rigid_pieces`, median of {RIGID_REPEATS} (processor time), one thread",
+        ),
+        Quantity(
+            *("peak", "MB", "lower", 0.05),
+            "resident memory of the process: imports, the pairs, and the search for pieces",
+        ),
+    ),
+)

@@ -12,55 +12,35 @@ camera is flagged if `locate` leaves it out. The truth of liberty* is the model 
 """
 
 import argparse
-import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.metrics import Check, Quantity, number, verdict
-from benchmarks.record import environment, legend, table, write_section
+from harness import ours
+from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.graphs import view_graph
+from harness.metrics import Check, Quantity, number, numbers, verdict
+from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
     from sfm_shapefit.colmap.model import PosedModel
     from sfm_shapefit.placement.place import Placement
-    from sfm_shapefit.synthetic.options import Shape
 
-HELP = "Standard deviations against errors, trust against errors, wrong rotations recognised."
-ROOT = Path(__file__).parents[2]
-PACKAGES = ("numpy", "scipy", "numba", "pycolmap")
 SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30", "lego100")
 FURTHER_SETS = ("liberty", "liberty-calibrated")
-COVERAGE = (0.546, 0.816)  # 68 % within 20 %
+COVERAGE = (0.546, 0.816)
+"""68 % within 20 %."""
 LEAST_AUC = 0.9
-BAD = 3.0  # times the median error
+BAD = 3.0
+"""Times the median error."""
 WRONG_DEG = 5.0
-SHAPES: "tuple[Shape, ...]" = ("ring", "facade", "cloud", "courtyard")
-
-QUANTITIES = (
-    Quantity(
-        name="covered",
-        unit="1",
-        better="neither",
-        rel_tol=0.05,
-        meaning="share of coordinate errors within one standard deviation; 0.546 to 0.816 is asked",
-    ),
-    Quantity(
-        name="rms", unit="1", better="neither", rel_tol=0.05, meaning="of errors over standard deviations"
-    ),
-    Quantity(name="AUC", unit="1", better="higher", rel_tol=0.02, meaning="trust against bad cameras"),
-    Quantity(
-        name="flagged",
-        unit="cameras",
-        better="neither",
-        rel_tol=0.0,
-        meaning="wrong ones / right ones left out",
-    ),
-)
+SHAPES = ("ring", "facade", "cloud", "courtyard")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,83 +53,98 @@ class Graph:
     covariances: "FloatArray"
 
 
-# --- the subcommand --------------------------------------------------------------------------------
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """Errors over standard deviations of one problem."""
+
+    name: str
+    covered: float
+    rms: float
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `trust`."""
-    parser.add_argument("--seeds", type=int, default=5, help="seeds of each synthetic problem (default 5)")
-    parser.add_argument(
-        "--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of the real sets"
-    )
-    parser.add_argument("--out", type=Path, default=ROOT / "scripts" / "results.md", help="file of results")
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ranking:
+    """How trust ranks the errors of one problem."""
+
+    name: str
+    area: float
+    """Under the curve, mean of the seeds that have bad cameras."""
+    num_bad: int
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, print the section and write it; a missed limit is no failure."""
-    about = environment(PACKAGES, f"python scripts/benchmark.py trust --seeds {args.seeds}")
-    parts = [
-        "## Trust\n",
-        about,
-        "\n### Standard deviations\n",
-        calibration_table(args.seeds),
-        "\n### Ranking\n",
-        ranking_table(args.seeds),
-        "\n### Wrong rotations\n",
-        real_table(args.data),
-        "\n### Columns\n",
-        legend(QUANTITIES),
-    ]
-    body = "\n".join(parts)
-    print(body)
-    write_section(args.out, "trust", body)
-    return 0
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Flagged:
+    """Which cameras of a real set were left out."""
+
+    name: str
+    num_cameras: int
+    num_wrong: int
+    num_caught: int
+    """Wrong rotations left out."""
+    num_blamed: int
+    """Right rotations left out."""
+    lowest_trust: float
+    errors: tuple[float, float]
+    """Median and mean of the others."""
+
+
+def cases(args: argparse.Namespace) -> dict[str, Case]:
+    """Return the problems of calibration and of ranking, and the real sets."""
+    found: dict[str, Case] = {
+        f"graph {name}, {wrong:.0%} wrong": partial(calibrate_graph, name, wrong, args.repeats)
+        for name in GRAPHS
+        for wrong in (0.0, 0.2)
+    }
+    found |= {
+        f"scene {shape}, 25 images, 0.5 px": partial(calibrate_scene, shape, args.repeats) for shape in SHAPES
+    }
+    found |= {name: partial(rank, name, args.repeats) for name in SPOILED}
+    for name in (*SETS, *FURTHER_SETS):
+        is_there = (args.data / name).is_dir()
+        found[name] = partial(flag, args.data / name) if is_there else NOT_FOUND
+    if args.quick:
+        chosen = ("graph box, 20% wrong", "scene cloud, 25 images, 0.5 px", *list(SPOILED)[:1])
+        found = {name: found[name] for name in chosen}
+        found["courtyard"] = partial(flag, ROOT / "data_synthetic" / "courtyard")
+    return found
 
 
 # --- calibration -----------------------------------------------------------------------------------
 
 
-def calibration_table(seeds: int) -> str:
-    """Return the table of errors over standard deviations."""
-    rows = []
-    for name, draw in GRAPHS.items():
-        for wrong in (0.0, 0.2):
-            print(f"calibrating {name}, {wrong:.0%} wrong", file=sys.stderr, flush=True)
-            ratios = [_graph_ratios(draw(seed, wrong)) for seed in range(seeds)]
-            rows.append(_calibration_row(f"graph {name}, {wrong:.0%} wrong", ratios))
-    for shape in SHAPES:
-        print(f"calibrating scene {shape}", file=sys.stderr, flush=True)
-        ratios = [_scene_ratios(shape, seed) for seed in range(seeds)]
-        rows.append(_calibration_row(f"scene {shape}, 25 images, 0.5 px", ratios))
-    header = ["problem", "covered", "rms", "verdict"]
-    return table(header, rows)
+def calibrate_graph(name: str, wrong: float, seeds: int) -> Calibration:
+    """Compare errors with standard deviations on graphs of one kind."""
+    ratios = [graph_ratios(GRAPHS[name](seed, wrong)) for seed in range(seeds)]
+    return _summarize(f"graph {name}, {wrong:.0%} wrong", np.concatenate(ratios))
 
 
-def _calibration_row(name: str, found: "list[FloatArray]") -> list[str]:
-    ratios = np.concatenate(found)
-    covered = float(np.mean(np.abs(ratios) < 1.0))
-    checks = [
-        Check(name="covered", value=covered, limit=COVERAGE[0], better="higher"),
-        Check(name="covered", value=covered, limit=COVERAGE[1]),
-    ]
-    return [name, number(covered), number(float(np.sqrt(np.mean(ratios**2)))), verdict(checks)]
+def calibrate_scene(shape: str, seeds: int) -> Calibration:
+    """Compare errors with standard deviations on photographed scenes of one shape."""
+    ratios = [scene_ratios(shape, seed) for seed in range(seeds)]
+    return _summarize(f"scene {shape}, 25 images, 0.5 px", np.concatenate(ratios))
+
+
+def _summarize(name: str, ratios: "FloatArray") -> Calibration:
+    covered, rms = float(np.mean(np.abs(ratios) < 1.0)), float(np.sqrt(np.mean(ratios**2)))
+    return Calibration(name=name, covered=covered, rms=rms)
 
 
 def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray") -> "FloatArray":
     """Return errors over standard deviations, centroid and scale of the held cameras brought together."""
     held = np.isfinite(sigmas).all(axis=1)
-    centred, wanted = found - found[held].mean(axis=0), truth - truth[held].mean(axis=0)
-    scale = np.sum(centred[held] ** 2) / np.sum(centred[held] * wanted[held])
-    ratios: FloatArray = ((centred - scale * wanted)[held] / sigmas[held]).ravel()
+    centered, wanted = found - found[held].mean(axis=0), truth - truth[held].mean(axis=0)
+    scale = np.sum(centered[held] ** 2) / np.sum(centered[held] * wanted[held])
+    ratios: FloatArray = ((centered - scale * wanted)[held] / sigmas[held]).ravel()
     return ratios
 
 
-def _graph_ratios(graph: Graph) -> "FloatArray":
-    from sfm_shapefit.placement.place import place
-    from sfm_shapefit.viewgraph import ViewGraph
+def graph_ratios(graph: Graph) -> "FloatArray":
+    """Return errors over standard deviations of a graph's placement."""
+    return _placement_ratios(_place(graph), graph.locations)
 
-    given = ViewGraph(len(graph.locations), graph.edges, graph.directions)
-    return _placement_ratios(place(given, covariance=graph.covariances), graph.locations)
+
+def _place(graph: Graph) -> "Placement":
+    return ours.place(view_graph(graph), covariance=graph.covariances)
 
 
 def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArray":
@@ -158,34 +153,32 @@ def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArra
     return error_ratios(placement.locations, truth[cameras], sigmas)
 
 
-def _scene_ratios(shape: "Shape", seed: int) -> "FloatArray":
-    import sfm_shapefit
-    from sfm_shapefit.options import LocateOptions
+def scene_ratios(shape: str, seed: int) -> "FloatArray":
+    """Return errors over standard deviations of a photographed scene's cameras."""
     from sfm_shapefit.synthetic import SceneOptions, make_scene
     from sfm_shapefit.synthetic.workspace import write_workspace
 
-    scene = make_scene(SceneOptions(shape=shape, num_images=25, num_points=1000, seed=seed))
+    options = SceneOptions(shape=shape, num_images=25, num_points=1000, seed=seed)  # type: ignore[arg-type]
+    scene = make_scene(options)
     with tempfile.TemporaryDirectory() as folder:
         workspace = Path(folder) / "scene"
         write_workspace(scene, workspace)
-        found = sfm_shapefit.locate(workspace / "sparse" / "0", options=LocateOptions(min_trust=0.0))
+        found = ours.locate(workspace / "sparse" / "0", min_trust=0.0)
     return _placement_ratios(found.placement, scene.centers)
 
 
 # --- ranking ---------------------------------------------------------------------------------------
 
 
-def ranking_table(seeds: int) -> str:
-    """Return the table of AUCs."""
-    rows = []
-    for name, spoil in SPOILED.items():
-        print(f"ranking, {name}", file=sys.stderr, flush=True)
-        found = [_ranked(spoil(seed)) for seed in range(seeds)]
-        known = [(area, bad) for area, bad in found if bad]
-        area = float(np.mean([area for area, _ in known])) if known else float("nan")
-        check = Check(name="AUC", value=area, limit=LEAST_AUC, better="higher")
-        rows.append([name, number(area), str(sum(bad for _, bad in known)), verdict([check])])
-    return table(["problem", "AUC", "bad cameras", "verdict"], rows)
+def rank(name: str, seeds: int) -> Ranking:
+    """Rank the cameras of spoiled graphs by their trust."""
+    found = [rank_graph(SPOILED[name](seed)) for seed in range(seeds)]
+    areas = [area for area, num_bad in found if num_bad]
+    return Ranking(
+        name=name,
+        area=float(np.mean(areas)) if areas else float("nan"),
+        num_bad=sum(num_bad for _, num_bad in found),
+    )
 
 
 def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
@@ -194,15 +187,11 @@ def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
     return float(np.mean((low < high) + 0.5 * (low == high)))
 
 
-def _ranked(graph: Graph) -> tuple[float, int]:
+def rank_graph(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
     from sfm_shapefit.geometry import fit_similarity_l1
-    from sfm_shapefit.placement.place import place
-    from sfm_shapefit.viewgraph import ViewGraph
 
-    placement = place(
-        ViewGraph(len(graph.locations), graph.edges, graph.directions), covariance=graph.covariances
-    )
+    placement = _place(graph)
     truth = graph.locations[placement.cameras]
     found = placement.locations
     errors = np.linalg.norm(fit_similarity_l1(found, truth, rotate=False).apply(found) - truth, axis=1)
@@ -213,7 +202,7 @@ def _ranked(graph: Graph) -> tuple[float, int]:
 # --- synthetic problems ----------------------------------------------------------------------------
 
 
-def _measured(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
+def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
     """Return directions with normal errors of known, varying size, and random ones where `wrong`."""
     from sfm_shapefit.geometry import normalized, tangent_bases
 
@@ -235,21 +224,21 @@ def _random(seed: int, wrong: float) -> Graph:
     from sfm_shapefit.synthetic import random_graph_problem
 
     problem = random_graph_problem(80, 0.4, q=wrong, seed=seed)
-    return _measured(problem.locations, problem.edges, problem.corrupted, seed)
+    return _measure(problem.locations, problem.edges, problem.corrupted, seed)
 
 
 def _box(seed: int, wrong: float) -> Graph:
     from sfm_shapefit.synthetic import box_graph_problem
 
     problem = box_graph_problem(200, 20.0, q=wrong, seed=seed)
-    return _measured(problem.locations, problem.edges, problem.corrupted, seed)
+    return _measure(problem.locations, problem.edges, problem.corrupted, seed)
 
 
 def _community(seed: int, wrong: float) -> Graph:
     from sfm_shapefit.synthetic import community_graph_problem
 
     problem = community_graph_problem(200, 30.0, q=wrong, seed=seed)
-    return _measured(problem.locations, problem.edges, problem.corrupted, seed)
+    return _measure(problem.locations, problem.edges, problem.corrupted, seed)
 
 
 GRAPHS: dict[str, Callable[[int, float], Graph]] = {"random": _random, "box": _box, "community": _community}
@@ -269,7 +258,7 @@ def concentrated(seed: int) -> Graph:
     graph = _box(seed, 0.0)
     own = _chosen(seed, graph)[graph.edges].any(axis=1)
     wrong = own & (np.random.default_rng(3000 + seed).random(len(graph.edges)) < 0.7)
-    return _measured(graph.locations, graph.edges, wrong, seed)
+    return _measure(graph.locations, graph.edges, wrong, seed)
 
 
 def turned(seed: int) -> Graph:
@@ -296,7 +285,7 @@ def weak(seed: int) -> Graph:
         own = np.flatnonzero((graph.edges == camera).any(axis=1) & kept)
         kept[own[3:]] = False
     edges = graph.edges[kept]
-    return _measured(graph.locations, edges, np.zeros(len(edges), dtype=np.bool_), seed)
+    return _measure(graph.locations, edges, np.zeros(len(edges), dtype=np.bool_), seed)
 
 
 SPOILED: dict[str, Callable[[int], Graph]] = {
@@ -309,54 +298,25 @@ SPOILED: dict[str, Callable[[int], Graph]] = {
 # --- real scenes -----------------------------------------------------------------------------------
 
 
-def real_table(data: Path) -> str:
-    """Return the table of cameras left out of the real scenes that are at hand."""
-    rows = []
-    for name in (*SETS, *FURTHER_SETS):
-        if not (data / name).is_dir():
-            rows.append([name, "-", "-", "-", "-", "not at hand"])
-            continue
-        print(f"locating {name}", file=sys.stderr, flush=True)
-        rows.append(_real_row(data / name))
-    header = [
-        "set",
-        "wrong rotations",
-        "flagged wrong / right",
-        "lowest trust kept",
-        "median / mean",
-        "verdict",
-    ]
-    return table(header, rows)
-
-
-def _real_row(scene: Path) -> list[str]:
+def flag(folder: Path) -> Flagged:
+    """Locate the cameras of a set and compare those left out with the wrong rotations."""
     import sfm_shapefit
     from sfm_shapefit.colmap.model import read_model
 
-    found = sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db")
-    reference = scene / "gt" if (scene / "gt").is_dir() else scene / "sparse" / "0"
-    truth = read_model(reference)
+    found = ours.locate(folder / "sparse" / "0", folder / "database.db")
+    reference = next(folder / name for name in ("gt", "truth", "sparse/0") if (folder / name).is_dir())
     cameras = found.placement.cameras
-    wrong = rotation_errors_deg(found.model, truth)[cameras] > WRONG_DEG
+    wrong = rotation_errors_deg(found.model, read_model(reference))[cameras] > WRONG_DEG
     errors = sfm_shapefit.evaluate(found.reconstruction, reference).position
-    caught, blamed = int(np.sum(wrong & ~found.kept)), int(np.sum(~wrong & ~found.kept))
-    checks = []
-    if scene.name in SETS:
-        least = int(np.sum(wrong)) - (1 if wrong.any() else 0)
-        most = 6 if scene.name == "lego100" else 0
-        checks = [
-            Check(name="wrong", value=caught, limit=least, better="higher"),
-            Check(name="right", value=blamed, limit=most),
-        ]
-    lowest = float(found.placement.assessment.trust[found.kept].min())
-    return [
-        scene.name,
-        f"{int(np.sum(wrong))} of {len(cameras)}",
-        f"{caught} / {blamed}",
-        number(lowest),
-        f"{number(errors.median)} / {number(errors.mean)}",
-        verdict(checks),
-    ]
+    return Flagged(
+        name=folder.name,
+        num_cameras=len(cameras),
+        num_wrong=int(np.sum(wrong)),
+        num_caught=int(np.sum(wrong & ~found.kept)),
+        num_blamed=int(np.sum(~wrong & ~found.kept)),
+        lowest_trust=float(found.placement.assessment.trust[found.kept].min()),
+        errors=(errors.median, errors.mean),
+    )
 
 
 def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray":
@@ -370,3 +330,85 @@ def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray
     errors = np.full(len(model.names), np.nan)
     errors[common] = rotation_angles_deg(relative @ mean_rotation_l1(relative).T)
     return errors
+
+
+# --- the section -----------------------------------------------------------------------------------
+
+
+def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
+    """Return the limits of one case; sets whose truth gives their rotations have none."""
+    if isinstance(one, Calibration):
+        return [
+            Check(name="covered", value=one.covered, limit=COVERAGE[0], better="higher"),
+            Check(name="covered", value=one.covered, limit=COVERAGE[1]),
+        ]
+    if isinstance(one, Ranking):
+        return [Check(name="AUC", value=one.area, limit=LEAST_AUC, better="higher")]
+    if one.name not in SETS:
+        return []
+    least = one.num_wrong - (1 if one.num_wrong else 0)
+    most = 6 if one.name == "lego100" else 0
+    return [
+        Check(name="wrong", value=one.num_caught, limit=least, better="higher"),
+        Check(name="right", value=one.num_blamed, limit=most),
+    ]
+
+
+def tables(
+    measured: Mapping[str, Calibration | Ranking | Flagged], _args: argparse.Namespace
+) -> Iterator[str]:
+    """Yield the parts of the section."""
+    found = list(measured.values())
+    yield "## Standard deviations"
+    yield table_of(
+        [one for one in found if isinstance(one, Calibration)],
+        {
+            "problem": lambda one: one.name,
+            "covered": lambda one: number(one.covered),
+            "rms": lambda one: number(one.rms),
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+    yield "## Ranking"
+    yield table_of(
+        [one for one in found if isinstance(one, Ranking)],
+        {
+            "problem": lambda one: one.name,
+            "AUC": lambda one: number(one.area),
+            "bad cameras": lambda one: str(one.num_bad),
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+    yield "## Wrong rotations"
+    yield table_of(
+        [one for one in found if isinstance(one, Flagged)],
+        {
+            "set": lambda one: one.name,
+            "wrong rotations": lambda one: f"{one.num_wrong} of {one.num_cameras}",
+            "flagged wrong / right": lambda one: f"{one.num_caught} / {one.num_blamed}",
+            "lowest trust kept": lambda one: number(one.lowest_trust),
+            "median / mean": lambda one: numbers(one.errors),
+            "verdict": lambda one: verdict(checks(one)),
+        },
+    )
+
+
+BENCHMARK = Benchmark(
+    name="trust",
+    title="Trust",
+    cases=cases,
+    checks=checks,
+    tables=tables,
+    quick={"repeats": 1},
+    repeats=5,
+    threads=2,
+    quantities=(
+        Quantity(
+            *("covered", "1", "neither", 0.05),
+            "share of coordinate errors within one standard deviation; 0.546 to 0.816 is asked",
+        ),
+        Quantity("rms", "1", "neither", 0.05, "of errors over standard deviations"),
+        Quantity("AUC", "1", "higher", 0.02, "trust against bad cameras"),
+        Quantity("flagged", "cameras", "neither", 0.0, "wrong ones / right ones left out"),
+    ),
+)

@@ -12,41 +12,27 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from benchmarks.metrics import Check, Quantity, number, numbers, verdict
-from benchmarks.record import table
+from benchmarks.real import SCENES
+from harness import ours
+from harness.metrics import Check, Quantity, number, numbers, verdict
+from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
     from sfm_shapefit.directions import PairDirections
 
-REAL = {
-    "fountain-P11": "gt",
-    "Herz-Jesus-P8": "gt",
-    "Herz-Jesus-P25": "gt",
-    "castle-P19": "gt",
-    "castle-P30": "gt",
-    "lego100": "gt",
-    "liberty": "sparse/0",
-    "liberty-calibrated": "sparse/0",
-}
 MADE = ("ring", "facade", "cloud", "courtyard")
 SEEDS = 3
 
 QUANTITIES = (
     Quantity(
-        name="ShapeFit, placed",
-        unit="of the set",
-        better="lower",
-        rel_tol=0.05,
-        meaning="median / mean position error of ShapeFit's optimum, and of what is placed, after robust "
+        *("ShapeFit, placed", "of the set", "lower", 0.05),
+        "median / mean position error of ShapeFit's optimum, and of what is placed, after robust "
         "(L1) alignment, of the largest rigid piece; with equal weights, and with the pairs' own",
     ),
     Quantity(
-        name="gain",
-        unit="1",
-        better="higher",
-        rel_tol=0.05,
-        meaning="mean error with equal weights over that with their own, of ShapeFit / of what is placed",
+        *("gain", "1", "higher", 0.05),
+        "mean error with equal weights over that with their own, of ShapeFit / of what is placed",
     ),
 )
 
@@ -76,35 +62,21 @@ class Comparison:
         )
 
 
-def comparisons(data: Path) -> Iterator[Comparison]:
-    """Yield the comparison of every real set that is there, and of the made scenes."""
-    for name, truth in REAL.items():
-        if (data / name).is_dir():
-            yield comparison_of_real(name, data / name, truth)
-    for shape in MADE:
-        for seed in range(SEEDS):
-            yield comparison_of_made(shape, seed)
-
-
-def section(found: Sequence[Comparison]) -> str:
-    """Return the table of the comparisons and what all of them say together."""
-    rows = [
-        [
-            one.name,
-            numbers(one.equal.shapefit),
-            numbers(one.weighted.shapefit),
-            numbers(one.equal.placed),
-            numbers(one.weighted.placed),
-            numbers(one.gains),
-        ]
-        for one in found
-    ]
-    header = ["set", "ShapeFit, equal", "ShapeFit, own", "placed, equal", "placed, own", "gain"]
-    summaries = [
-        _summary("what is placed, all sets", [one.gains[1] for one in found]),
-        _summary("ShapeFit, real sets", [one.gains[0] for one in found if one.name in REAL]),
-    ]
-    return "\n\n".join([table(header, rows), *summaries])
+def tables(found: Sequence[Comparison]) -> Iterator[str]:
+    """Yield the table of the comparisons and what all of them say together."""
+    yield table_of(
+        found,
+        {
+            "set": lambda one: one.name,
+            "ShapeFit, equal": lambda one: numbers(one.equal.shapefit),
+            "ShapeFit, own": lambda one: numbers(one.weighted.shapefit),
+            "placed, equal": lambda one: numbers(one.equal.placed),
+            "placed, own": lambda one: numbers(one.weighted.placed),
+            "gain": lambda one: numbers(one.gains),
+        },
+    )
+    yield _summary("what is placed, all sets", [one.gains[1] for one in found])
+    yield _summary("ShapeFit, real sets", [one.gains[0] for one in found if one.name in SCENES])
 
 
 def _summary(what: str, gains: list[float]) -> str:
@@ -116,28 +88,19 @@ def _summary(what: str, gains: list[float]) -> str:
     return f"Gain of {what}, geometric mean: {number(gain)}, {judged}."
 
 
-def comparison_of_real(name: str, folder: Path, truth: str) -> Comparison:
+def compare_real(name: str, folder: Path) -> Comparison:
     """Compare on the directions of a COLMAP model, whose matches are read from its database."""
     import numpy as np
     import pycolmap
 
-    from sfm_shapefit.colmap.database import open_database
-    from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.commands.stages.execution import directions_of
-    from sfm_shapefit.directions import concatenate
-    from sfm_shapefit.options import LocateOptions
-
-    model = read_model(folder / "sparse" / "0")
-    wanted = LocateOptions().for_directions()
-    with open_database(folder / "database.db", model) as database:
-        parts = [directions_of(b, model.focal_lengths_px, wanted, 1) for b in database.iter_matches(1)]
-    known = pycolmap.Reconstruction(folder / truth)
+    names, directions = ours.directions_of_set(folder)
+    known = pycolmap.Reconstruction(folder / SCENES[name].truth)
     center_of = {image.name: image.projection_center() for image in known.images.values() if image.has_pose}
-    centers = np.array([center_of.get(image, [np.nan] * 3) for image in model.names])
-    return compare(name, concatenate(parts), centers)
+    centers = np.array([center_of.get(image, [np.nan] * 3) for image in names])
+    return compare(name, directions, centers)
 
 
-def comparison_of_made(shape: str, seed: int) -> Comparison:
+def compare_made(shape: str, seed: int) -> Comparison:
     """Compare on a made scene of 30 cameras: a tenth of the pairs and a fifth of the matches are wrong."""
     import numpy as np
 
@@ -174,7 +137,7 @@ def comparison_of_made(shape: str, seed: int) -> Comparison:
 
 
 def compare(name: str, directions: "PairDirections", centers: "FloatArray") -> Comparison:
-    """Solve directions with equal weights and with their own; centres (n, 3) are NaN where unknown."""
+    """Solve directions with equal weights and with their own; centers (n, 3) are NaN where unknown."""
     own = directions.weights()[directions.usable()]
     return Comparison(
         name=name,
@@ -184,16 +147,15 @@ def compare(name: str, directions: "PairDirections", centers: "FloatArray") -> C
 
 
 def _errors(directions: "PairDirections", weights: "FloatArray", centers: "FloatArray") -> Errors:
-    """Place the usable directions with weights and compare with the centres."""
+    """Place the usable directions with weights and compare with the centers."""
     import numpy as np
 
     from sfm_shapefit import ViewGraph
     from sfm_shapefit.geometry import fit_similarity_l1
-    from sfm_shapefit.placement.place import place
 
     usable = directions.usable()
     graph = ViewGraph(len(centers), directions.pairs[usable], directions.directions[usable], weights)
-    placement = place(graph, covariance=directions.covariance[usable])
+    placement = ours.place(graph, covariance=directions.covariance[usable])
     true = centers[placement.cameras]
     known = np.isfinite(true).all(axis=1)
 

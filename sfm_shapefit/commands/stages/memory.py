@@ -2,7 +2,7 @@
 
 Every stage is linear in what it works on: keypoints, matches, pairs, edges of the graph, entries of the
 factor and multiplications of the factorisation, which the symbolic analysis knows beforehand. The rates
-below were fitted to runs on six sets of 25 to 10,000 images (scripts/results.md, Reliability). Memory is
+below were fitted to runs on six sets of 25 to 10,000 images (scripts/results/endtoend.md). Memory is
 counted in bytes per item, time in multiples of a small kernel that is timed on the machine at hand: some
 sorting, which is bound by the scalar processor and the caches, and some multiplication of matrices, as the
 stages are.

@@ -1,0 +1,33 @@
+"""The figures of the docs: `python scripts/figure.py phase_transition --help`; a module of figures each."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+
+NAMES = ("courtyard", "noise_robustness", "phase_transition", "theory_plot")
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    words = sys.argv[1:] if argv is None else list(argv)
+    parser = argparse.ArgumentParser(description=__doc__)
+    subparsers = parser.add_subparsers(dest="name", required=True)
+    for name in NAMES:
+        subparser = subparsers.add_parser(name)
+        if words[:1] == [name]:
+            module = import_module(f"figures.{name}")
+            subparser.description = module.__doc__
+            add = subparser.add_argument
+            add("--out", type=Path, required=True, help="PNG to write")
+            add("--quick", action="store_true", help="a small version that takes seconds")
+            add("--trials", type=int, default=5 if name == "theory_plot" else 10, help="problems per setting")
+            add("--processes", type=int, default=2, help="worker processes, one thread each")
+            add("--cache", type=Path, help="npz that keeps results between runs")
+            module.add_arguments(subparser)
+    args = parser.parse_args(words)
+    module.run(args)
+
+
+if __name__ == "__main__":
+    main()

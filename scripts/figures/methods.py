@@ -1,0 +1,69 @@
+"""The methods that the figures compare, by name: each takes a graph and returns locations."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from harness import ours
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.baselines import locate_least_squares, locate_lud
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.synthetic.graphs import GraphProblem
+from sfm_shapefit.viewgraph import ViewGraph
+
+# Exact recovery means an error below 1e-9.
+_TOL = 1e-12
+
+
+def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return ours.solve(graph, tol=_TOL).locations
+
+
+def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return ours.solve(graph, method="conic", tol=1e-9).locations
+
+
+def _refined(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    """ShapeFit and LUD, both refined in angles, the better kept: what `locate` does."""
+    placement = ours.place(graph, tol=_TOL, uniqueness=False)
+    if len(placement.cameras) < graph.num_nodes:
+        raise UnsolvableError("the graph is not parallel rigid")
+    return placement.locations
+
+
+def _lud(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return locate_lud(graph)
+
+
+def _least_squares(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+    return locate_least_squares(graph)
+
+
+def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
+    """Least squares of the pairs that are not corrupted: no method can be told more.
+
+    Reweighted, they are of sines, which is best for small noise; under large noise that collapses, for a sine
+    is small near 180 degrees too, and the first answer is kept: whichever fits the directions better.
+    """
+    clean, cameras = graph.restricted_to(np.flatnonzero(~problem.corrupted))
+    if len(cameras) < graph.num_nodes:
+        return np.full((graph.num_nodes, graph.dimension), np.nan)
+    answers = [locate_least_squares(clean, reweightings=count) for count in (0, 10)]
+    return min(answers, key=lambda t: _misfit(clean, t))
+
+
+def _misfit(graph: ViewGraph, locations: FloatArray) -> float:
+    """Return the sum of squared distances between directions as measured and as located."""
+    return float(np.sum((normalized(differences(locations, graph.edges)) - graph.directions) ** 2))
+
+
+METHODS: dict[str, Callable[[ViewGraph, GraphProblem], FloatArray]] = {
+    "ShapeFit": _shapefit,
+    "ShapeFit, conic": _conic,
+    "refined": _refined,
+    "LUD": _lud,
+    "least squares": _least_squares,
+    "oracle": _oracle,
+}

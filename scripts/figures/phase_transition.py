@@ -1,0 +1,242 @@
+"""Figure 1 of the paper and its extensions: `python scripts/figure.py phase_transition --out FILE`.
+
+Mean relative error over 10 problems of the random model for every number of locations n and probability q of
+corruption, drawn as in the paper: white is 0, black is 1. `--figure` picks what is compared; interrupted runs
+go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
+"""
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import get_args
+
+import matplotlib as mpl
+import numpy as np
+
+from figures.trials import Cell, Results, problems, run_trials
+from harness import ours
+from harness.graphs import view_graph
+from sfm_shapefit.rigidity import is_parallel_rigid
+from sfm_shapefit.synthetic.graphs import Corruption
+
+mpl.use("Agg")
+import matplotlib.pyplot as plt
+
+SEED = 0
+EXACT = 1e-9
+AGREE = 1e-6
+"""Of the mean errors of a cell by two solvers."""
+NOISE = 0.05
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture of a figure: a method on one setting of the model."""
+
+    title: str
+    method: str
+    n: tuple[int, ...]
+    q: tuple[float, ...]
+    sigma: float = 0.0
+    p: float = 0.5
+    d: int = 3
+    corruption: Corruption = "uniform"
+
+    def cells(self) -> list[Cell]:
+        return [Cell(n, q, self.sigma, self.p, self.d, self.corruption) for n in self.n for q in self.q]
+
+    @property
+    def doubles(self) -> bool:
+        """Whether each n is twice the one before: drawn on a logarithmic axis."""
+        return all(later == 2 * n for n, later in pairwise(self.n))
+
+
+def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
+    return tuple(range(low, high + 1, step))
+
+
+def _shares(num: int) -> tuple[float, ...]:
+    return tuple(np.round(np.linspace(0.0, 0.5, num), 4).tolist())
+
+
+NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
+FINE, COARSE = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
+
+
+def panels(figure: str) -> list[Panel]:
+    """Return the panels of a figure."""
+    return FIGURES[figure]()
+
+
+def _paper(method: str = "ShapeFit") -> list[Panel]:
+    return [Panel(f"{method}, {words}", method, *FINE, sigma=s) for s, words in NOISES]
+
+
+def _reference() -> list[Panel]:
+    return _paper() + _paper("ShapeFit, conic")
+
+
+def _methods() -> list[Panel]:
+    methods = ("ShapeFit", "refined", "LUD", "least squares")
+    return [Panel(f"{m}, {words}", m, *COARSE, sigma=s) for s, words in NOISES for m in methods]
+
+
+def _corruption() -> list[Panel]:
+    methods = ("ShapeFit", "refined", "LUD")
+    return [
+        Panel(f"{m}, {kind}", m, *COARSE, corruption=kind) for kind in get_args(Corruption) for m in methods
+    ]
+
+
+def _density() -> list[Panel]:
+    return [Panel(f"ShapeFit, p = {p}", "ShapeFit", *COARSE, p=p) for p in (0.25, 0.5, 0.75)]
+
+
+def _dimension() -> list[Panel]:
+    low = [Panel(f"ShapeFit, d = {d}", "ShapeFit", *COARSE, d=d) for d in (2, 3, 10)]
+    return [*low, Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50)]
+
+
+def _large() -> list[Panel]:
+    return [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])]
+
+
+FIGURES: dict[str, Callable[[], list[Panel]]] = {
+    "paper": _paper,
+    "reference": _reference,
+    "methods": _methods,
+    "corruption": _corruption,
+    "density": _density,
+    "dimension": _dimension,
+    "large": _large,
+}
+
+
+def quick(panel: Panel) -> Panel:
+    """Return the panel with few cells: what the tests run."""
+    return Panel(
+        panel.title, panel.method, (10, 30), (0.0, 0.2), panel.sigma, panel.p, panel.d, panel.corruption
+    )
+
+
+def compute(shown: Sequence[Panel], trials: int, cache: Path | None, processes: int) -> Results:
+    """Run all cells of the panels; every method runs on every cell."""
+    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
+    methods = list(dict.fromkeys(panel.method for panel in shown))
+    return run_trials(cells, methods, trials, cache=cache, processes=processes, seed=SEED)
+
+
+def image(panel: Panel, results: Results) -> np.ndarray:
+    """Return the mean errors of a panel, rows by n, columns by q."""
+    means = dict(zip(results.cells, results.mean_errors(panel.method), strict=True))
+    return np.array([means[cell] for cell in panel.cells()]).reshape(len(panel.n), len(panel.q))
+
+
+def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
+    """Draw the panels as the paper does."""
+    columns = min(len(shown), 3 if len(shown) % 3 == 0 else 4)
+    rows = -(-len(shown) // columns)
+    figure, axes = plt.subplots(
+        rows, columns, figsize=(4.2 * columns, 3.9 * rows), dpi=80, squeeze=False, layout="constrained"
+    )
+    for panel, axis in zip(shown, axes.ravel(), strict=False):
+        picture = axis.pcolormesh(
+            panel.q, panel.n, image(panel, results), cmap="gray_r", vmin=0.0, vmax=1.0, shading="nearest"
+        )
+        if panel.doubles:
+            axis.set_yscale("log")
+            axis.set_yticks(panel.n, [str(n) for n in panel.n])
+            axis.minorticks_off()
+        axis.set(title=panel.title, xlabel="corruption probability q", ylabel="number of locations n")
+    for axis in axes.ravel()[len(shown) :]:
+        axis.set_axis_off()
+    figure.colorbar(picture, ax=axes, label="mean relative error", shrink=0.7)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def report(shown: Sequence[Panel], results: Results) -> str:
+    """Say what the paper's text says of its figure, and which camera fails where a large problem does."""
+    lines = [f"{len(results.cells)} cells in {results.seconds:.0f} s"]
+    for panel in shown:
+        rows = {cell: k for k, cell in enumerate(results.cells)}
+        values = results.values[[rows[cell] for cell in panel.cells()], results.methods.index(panel.method)]
+        exact = values[..., 0] < EXACT
+        lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
+        if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
+            lines += _failures(panel.cells(), values)
+    lines += _noisy_where_exact(shown, results)
+    if len(results.methods) == 2:
+        lines.append(_apart(results))
+    return "\n".join(lines)
+
+
+def _apart(results: Results) -> str:
+    """Say how far two methods are apart, and whether they may be: where the optimum is not unique."""
+    apart = np.abs(np.subtract(*(results.mean_errors(m) for m in results.methods)))
+    trials = results.values.shape[2]
+    far = [k for k in np.flatnonzero(apart > AGREE) if not _are_unique(results.cells[k], trials)]
+    said = f"largest difference of a cell between {' and '.join(results.methods)}: {apart.max():.1e}"
+    if far:
+        near = np.delete(apart, far).max(initial=0.0)
+        said += f"; {near:.1e} without {len(far)} cells where an optimum is not certified to be unique"
+    return said
+
+
+def _are_unique(cell: Cell, trials: int) -> bool:
+    """Return whether each problem of a cell has an optimum certified to be unique, or none at all."""
+    graphs = [view_graph(problem) for problem in problems(cell, trials, SEED)]
+    rigid = [g for g in graphs if is_parallel_rigid(g.num_nodes, g.edges, g.dimension)]
+    return all(ours.solve(graph, tol=1e-12, uniqueness=True).unique for graph in rigid)
+
+
+def _noisy_where_exact(shown: Sequence[Panel], results: Results) -> list[str]:
+    """Say how large the errors with noise are in the cells that are exact without."""
+    lines, known = [], {replace(panel, title=""): panel for panel in shown}
+    for noisy in shown:
+        clean = known.get(replace(noisy, title="", sigma=0.0))
+        if clean is None or noisy.sigma == 0.0:
+            continue
+        errors = image(noisy, results)[image(clean, results) < EXACT]
+        largest = errors.max(initial=0.0)
+        lines.append(f"{noisy.title}: at most {largest:.2g} in the {errors.size} cells exact without")
+    return lines
+
+
+def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
+    """Describe the cells the paper speaks of: n = 50 at q = 0.25, and the largest n up to q = 0.3."""
+    lines = []
+    largest = max(cell.n for cell in cells)
+    for cell, trials in zip(cells, values, strict=True):
+        if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
+            mean = np.minimum(trials[:, 0], 1.0).mean()
+            lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
+            lines += [_failure(t) for t in trials.tolist() if t[0] >= EXACT]
+    return lines
+
+
+def _failure(trial: Sequence[float]) -> str:
+    error, camera, share, others = trial
+    if camera < 0:
+        return "    a problem that is not parallel rigid"
+    return (
+        f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong; {others:.2g} without it"
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare which figure is drawn."""
+    parser.add_argument("--figure", choices=FIGURES, default="paper")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Compute and draw a figure, and say what the paper's text says of its own."""
+    shown, trials = panels(args.figure), args.trials
+    if args.quick:
+        shown, trials = [quick(panel) for panel in shown], 2
+    results = compute(shown, trials, args.cache, args.processes)
+    draw(shown, results, args.out)
+    print(report(shown, results))

@@ -1,0 +1,132 @@
+"""Our own calls, as the benchmarks and figures make them: the one place that knows the package's signatures.
+
+Everything is imported where it is used: a process that is measured loads no more than it needs.
+"""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+if TYPE_CHECKING:
+    from sfm_shapefit import LocateResult, SolverResult, ViewGraph
+    from sfm_shapefit.arrays import FloatArray, IntArray
+    from sfm_shapefit.placement.place import Placement
+
+
+class Timed(NamedTuple):
+    """An answer and what it took."""
+
+    found: Any
+    wall_s: float
+    cpu_s: float
+
+
+def timed(function: Callable[[], Any]) -> Timed:
+    """Call a function once."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    found = function()
+    return Timed(found, time.perf_counter() - wall, time.process_time() - cpu)
+
+
+def solve(graph: "ViewGraph", *, note: Any = None, **options: Any) -> "SolverResult":
+    """Return the certified ShapeFit optimum; `note` is called after each iteration."""
+    from sfm_shapefit import SolverOptions
+    from sfm_shapefit import solve as solve_program
+
+    return solve_program(graph, SolverOptions(**{"uniqueness": False, **options}), note)
+
+
+def solve_lud(graph: "ViewGraph") -> "FloatArray":
+    """Return the LUD start, (n, d)."""
+    from sfm_shapefit.solver.splitting import solve_lud as solve_program
+
+    return solve_program(graph).locations
+
+
+def place(
+    graph: "ViewGraph",
+    *,
+    covariance: "FloatArray | None" = None,
+    num_cameras: int | None = None,
+    **options: Any,
+) -> "Placement":
+    """Return the placement of the largest rigid piece: what the command does with a graph."""
+    from sfm_shapefit.placement.place import place as place_graph
+    from sfm_shapefit.refinement.options import PlacementOptions
+
+    return place_graph(graph, PlacementOptions(**options), covariance=covariance, num_cameras=num_cameras)
+
+
+def place_file(source: Path, **options: Any) -> Any:
+    """Place a graph file: what the command gives, with `placement`, `statement` and `timings_s`."""
+    from sfm_shapefit.commands.place import solve_graph_file
+    from sfm_shapefit.refinement.options import PlacementOptions
+
+    return solve_graph_file(source, PlacementOptions(**options))
+
+
+def lud_of(placement: "Placement") -> "FloatArray | None":
+    """Return the locations of the LUD start that a placement was compared with, if there was one."""
+    lud = placement.finish.lud
+    return None if lud is None else lud.locations
+
+
+def start_of(placement: "Placement") -> str:
+    """Return which start was kept."""
+    return placement.finish.start
+
+
+def warns(placement: "Placement") -> bool:
+    """Return whether the report of a placement carries a warning."""
+    from sfm_shapefit.results import quality_warnings
+
+    return any(True for _ in quality_warnings(placement))
+
+
+def locate(model: Any, database: Path | None = None, **options: Any) -> "LocateResult":
+    """Locate the cameras of a model."""
+    from sfm_shapefit import LocateOptions
+    from sfm_shapefit import locate as locate_cameras
+
+    progress = {"progress": options.pop("progress")} if "progress" in options else {}
+    return locate_cameras(model, database, LocateOptions(**options), **progress)
+
+
+def locate_and_write(model: Any, out: Path, **options: Any) -> "LocateResult":
+    """Locate the cameras of a model and write the output."""
+    from sfm_shapefit import write_result
+
+    found = locate(model, **options)
+    write_result(found, out)
+    return found
+
+
+def map_database(database: Path, **options: Any) -> Any:
+    """Return the largest model of `map`."""
+    import sfm_shapefit
+
+    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**options))
+    return found.models[0].located.reconstruction
+
+
+def directions_of_set(folder: Path) -> Any:
+    """Return the names of a model's images, and the directions measured from its database."""
+    from sfm_shapefit import LocateOptions
+    from sfm_shapefit.colmap.database import open_database
+    from sfm_shapefit.colmap.model import read_model
+    from sfm_shapefit.commands.stages.execution import directions_of
+    from sfm_shapefit.directions import concatenate
+
+    model = read_model(folder / "sparse" / "0")
+    wanted = LocateOptions().for_directions()
+    with open_database(folder / "database.db", model) as database:
+        parts = [directions_of(b, model.focal_lengths_px, wanted, 1) for b in database.iter_matches(1)]
+    return model.names, concatenate(parts)
+
+
+def rigid_pieces(num_nodes: int, edges: "IntArray") -> "IntArray":
+    """Return the parallel-rigid piece of each edge in space."""
+    from sfm_shapefit.rigidity import parallel_rigid_pieces
+
+    return parallel_rigid_pieces(num_nodes, edges, 3)

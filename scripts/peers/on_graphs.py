@@ -1,0 +1,302 @@
+"""Bare graphs: pytheia's and gtsam's translation averaging beside ours, on the same directions.
+
+Every contender runs in its own fresh process with a limit of CPU time, once after a small warm-up problem, on
+one thread. The clock covers the call alone: a peer's own input types are built before. All keep their default
+options, except that our ShapeFit is certified to 1e-6, and gtsam's measurements have the noise model that
+its interface demands, sigma 0.01, with or without a Huber loss of 1.345 on it. Rotations are identities, so
+that pytheia's camera axes are the world's. Its nonlinear estimator starts at random, and may fail from a bad
+start: it runs three times, and the median counts.
+
+pytheia and gtsam are optional (`pip install pytheia gtsam`, the extra `peers`); without them their rows say
+so.
+"""
+
+import contextlib
+import math
+import os
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
+
+from harness import ours
+from harness.graphs import GraphSpec, draw, relative_error, view_graph
+from harness.metrics import Check, numbers, ratio
+from harness.process import call, peak_memory_mb, reset_peak, thread_environment
+
+if TYPE_CHECKING:
+    from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.viewgraph import ViewGraph
+
+WALL_PER_CPU = 30
+"""Wall-clock limit over the limit of CPU time: ends what waits instead of computing."""
+FASTER = 5.0
+"""Times faster than the fastest peer of equal or better error, to be reached."""
+_GTSAM_SIGMA, _HUBER = 0.01, 1.345
+_SHAPEFIT_TOL = 1e-6
+
+PROBLEMS = {
+    "er2-100": GraphSpec(family="er2", n=100, sigma=0.01),
+    "er2-300": GraphSpec(family="er2", n=300, sigma=0.01),
+    "geo-1000": GraphSpec(family="geo", n=1000, degree=40.0, sigma=0.01),
+    "geo-5000": GraphSpec(family="geo", n=5000, degree=40.0, sigma=0.01),
+    "comm-1000": GraphSpec(family="comm", n=1000, degree=67.0, sigma=0.01),
+    "lawn-1000": GraphSpec(family="lawn", n=1000, degree=20.0, sigma=0.01),
+    "ring-500": GraphSpec(family="ring", n=500, degree=20.0, sigma=0.01),
+    "corr-500": GraphSpec(family="corr", n=500, degree=20.0, sigma=0.01),
+    "seq-300": GraphSpec(family="seq", n=300, degree=36.0, sigma=0.01),
+}
+WARM_UP = {
+    # Above 450 unknowns there are factors in single precision too.
+    "er2": GraphSpec(family="er2", n=160, sigma=0.01),
+    "geo": GraphSpec(family="geo", n=1000, degree=20.0, sigma=0.01),
+    "comm": GraphSpec(family="comm", n=1000, degree=20.0, sigma=0.01),
+    "small": GraphSpec(family="er2", n=60, sigma=0.01),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Answer:
+    """What a contender gave on a problem."""
+
+    name: str
+    ours: bool
+    error: float = math.nan
+    seconds: float = math.nan
+    cpu_s: float = math.nan
+    """CPU time of all threads of its process while the clock ran."""
+    peak_mb: float = math.nan
+    """Peak resident memory of its process while the clock ran, in 10^6 bytes."""
+    note: str = ""
+    """Why there is no answer, or what else it says."""
+
+    @property
+    def spent_s(self) -> float:
+        """What is raced: CPU time, which other programs do not lengthen; seconds where it is unknown."""
+        return self.cpu_s if math.isfinite(self.cpu_s) else self.seconds
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """A problem and all answers."""
+
+    name: str
+    num_cameras: int
+    num_edges: int
+    answers: tuple[Answer, ...]
+
+
+# --- running ---------------------------------------------------------------------------------------
+
+
+def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
+    """Return a contender's answer, or why there is none."""
+    empty = Answer(name=contender.name, ours=contender.package is None)
+    if contender.package is not None and find_spec(contender.package) is None:
+        return replace(empty, note=f"skipped: {contender.package} is not installed")
+    try:
+        error, seconds, cpu_s, note, peak_mb = call(
+            measure,
+            contender.name,
+            spec,
+            environment=thread_environment(1),
+            timeout_s=WALL_PER_CPU * cpu_limit_s,
+            cpu_limit_s=cpu_limit_s,
+        )
+    except (TimeoutError, RuntimeError) as reason:
+        return replace(empty, note=f"failed: {reason}")
+    return replace(empty, error=error, seconds=seconds, cpu_s=cpu_s, note=note, peak_mb=peak_mb)
+
+
+# --- the contenders --------------------------------------------------------------------------------
+
+Solver = Callable[[], tuple["FloatArray", str]]
+"""Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
+
+
+def _prepare_shapefit(graph: "ViewGraph") -> Solver:
+    def run_it() -> tuple["FloatArray", str]:
+        found = ours.solve(graph, tol=_SHAPEFIT_TOL)
+        return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
+
+    return run_it
+
+
+def _prepare_placed(graph: "ViewGraph") -> Solver:
+    def run_it() -> tuple["FloatArray", str]:
+        found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
+        positions = dict(zip(found.cameras.tolist(), found.locations, strict=True))
+        return _gathered(positions, graph.num_nodes), f"from {ours.start_of(found)}, verdicts included"
+
+    return run_it
+
+
+def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["ViewGraph"], Solver]:
+    def prepare(graph: "ViewGraph") -> Solver:
+        import numpy as np
+        import pytheia
+
+        pairs = {}
+        for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
+            info = pytheia.sfm.TwoViewInfo()
+            info.rotation_2 = np.zeros(3)
+            info.position_2 = -v if i < j else v  # where the second camera is, seen from the first
+            info.num_verified_matches = 100
+            pairs[min(i, j), max(i, j)] = info
+        orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
+
+        def run_it() -> tuple["FloatArray", str]:
+            with _silence():
+                found = estimate(pytheia.sfm, pairs, orientations)
+            return _gathered({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
+
+        return run_it
+
+    return prepare
+
+
+def _pytheia_lud(sfm: Any, pairs: Any, orientations: Any) -> Any:
+    options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
+    return sfm.LeastUnsquaredDeviationPositionEstimator(options).EstimatePositions(pairs, orientations)
+
+
+def _pytheia_nonlinear(sfm: Any, pairs: Any, orientations: Any) -> Any:
+    options = sfm.NonlinearPositionEstimatorOptions()
+    estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
+    return estimator.EstimatePositions(pairs, orientations)
+
+
+def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph"], Solver]:
+    def prepare(graph: "ViewGraph") -> Solver:
+        import gtsam
+
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, _GTSAM_SIGMA)
+        if robust:
+            huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
+            noise = gtsam.noiseModel.Robust.Create(huber, noise)
+        measurements = [
+            gtsam.BinaryMeasurementUnit3(i, j, gtsam.Unit3(-v), noise)  # gtsam's points from i to j
+            for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True)
+        ]
+        recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), bilinear)
+
+        def run_it() -> tuple["FloatArray", str]:
+            with _silence():
+                values = recovery.run(measurements, 1.0)
+            points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
+            return _gathered(points, graph.num_nodes), ""
+
+        return run_it
+
+    return prepare
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contender:
+    """A solver of bare graphs and the package it needs; None: ours."""
+
+    name: str
+    prepare: Callable[["ViewGraph"], Solver]
+    package: str | None = None
+    runs: int = 1
+    """The answer is the one of median error; 3 where a random start may fail."""
+
+
+CONTENDERS = (
+    Contender(name="ours, placed", prepare=_prepare_placed),
+    Contender(name="ours, ShapeFit", prepare=_prepare_shapefit),
+    Contender(name="pytheia LUD", prepare=_prepare_pytheia(_pytheia_lud), package="pytheia"),
+    Contender(
+        name="pytheia Nonlinear", prepare=_prepare_pytheia(_pytheia_nonlinear), package="pytheia", runs=3
+    ),
+    Contender(name="gtsam TranslationRecovery", prepare=_prepare_gtsam(robust=False), package="gtsam"),
+    Contender(name="gtsam with Huber", prepare=_prepare_gtsam(robust=True), package="gtsam"),
+    Contender(
+        name="gtsam bilinear with Huber", prepare=_prepare_gtsam(robust=True, bilinear=True), package="gtsam"
+    ),
+)
+
+
+# --- measuring -------------------------------------------------------------------------------------
+
+
+def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float]:
+    """Return error, seconds, CPU seconds, note and peak memory; to be called once per process."""
+    contender = next(one for one in CONTENDERS if one.name == name)
+    if contender.package is None:
+        # Compiled code is loaded.
+        for warm_up in dict.fromkeys((spec.family if spec.family in WARM_UP else "geo", "er2", "small")):
+            contender.prepare(view_graph(draw(WARM_UP[warm_up])))()
+    problem = draw(spec)
+    runs = []
+    reset_peak()
+    for _ in range(contender.runs):
+        solver = contender.prepare(view_graph(problem))
+        (locations, note), wall_s, cpu_s = ours.timed(solver)
+        runs.append((relative_error(locations, problem.locations), wall_s, cpu_s, note))
+    runs.sort()
+    error, wall_s, cpu_s, note = runs[len(runs) // 2]
+    if len(runs) > 1:
+        note = f"median of {len(runs)} random starts, errors {numbers([run[0] for run in runs])}"
+    return error, wall_s, cpu_s, note, peak_memory_mb()
+
+
+def _gathered(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
+    """Return the points as an array; RuntimeError if cameras are missing or not finite."""
+    import numpy as np
+
+    missing = n - len(points)
+    if missing:
+        raise RuntimeError(f"{missing} of {n} cameras have no position")
+    locations: FloatArray = np.array([points[camera] for camera in range(n)], dtype=np.float64)
+    if not np.isfinite(locations).all():
+        raise RuntimeError("positions that are not finite")
+    return locations
+
+
+@contextlib.contextmanager
+def _silence() -> Iterator[None]:
+    """Send what C++ libraries write to stdout and stderr nowhere."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    saved = [os.dup(1), os.dup(2)]
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        yield
+    finally:
+        for descriptor, target in zip(saved, (1, 2), strict=True):
+            os.dup2(descriptor, target)
+            os.close(descriptor)
+        os.close(nowhere)
+
+
+# --- what is to be reached -------------------------------------------------------------------------
+
+
+def best_of_ours(one: Compared) -> Answer | None:
+    """Return our answer of the lowest error, None if there is none."""
+    found = [answer for answer in one.answers if answer.ours and math.isfinite(answer.error)]
+    return min(found, key=lambda answer: answer.error, default=None)
+
+
+def checks(one: Compared) -> list[Check]:
+    """Return the checks of one problem: the lowest error of all, and the time of the equally accurate.
+
+    A peer without an answer has no check; where no peer is as accurate as ours, there is none of the time.
+    """
+    ours = best_of_ours(one)
+    peers = [answer for answer in one.answers if not answer.ours and math.isfinite(answer.error)]
+    if not peers:
+        return []
+    error = math.nan if ours is None else ours.error
+    spent_s = math.nan if ours is None else ours.spent_s
+    found = [Check(name="error", value=error, limit=min(peer.error for peer in peers))]
+    as_good = [peer.spent_s for peer in peers if peer.error <= error]
+    if as_good:
+        found.append(
+            Check(name="times faster", value=ratio(min(as_good), spent_s), limit=FASTER, better="higher")
+        )
+    return found

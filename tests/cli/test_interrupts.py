@@ -1,0 +1,63 @@
+"""Interrupts and lack of memory end a command in one sentence."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from sfm_shapefit.cli import console
+from tests.scenes import RING, ROOT
+
+
+def failing(error):
+    with console.reported():
+        raise error
+
+
+def test_an_error_that_native_code_makes_of_an_interrupt_is_an_interrupt(capsys, monkeypatch):
+    monkeypatch.setattr(console, "_received", [signal.SIGINT])
+    with pytest.raises(console.typer.Exit) as caught:
+        failing(RuntimeError("Caught an unknown exception!"))
+    assert caught.value.exit_code == 130
+    assert capsys.readouterr().err == "sfm-shapefit: interrupted; nothing was written\n"
+
+
+def test_an_interrupt_that_a_callback_of_native_code_loses_comes_again_without_a_traceback():
+    script = """
+import ctypes, os, signal, sys, time
+from sfm_shapefit.cli import console
+console.catch_termination()
+console.repeat_lost_interrupts()
+try:
+    ctypes.CFUNCTYPE(None)(lambda: os.kill(os.getpid(), signal.SIGTERM))()
+    time.sleep(20)
+except KeyboardInterrupt:
+    sys.exit(130)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stderr) == (130, "")
+
+
+@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
+def test_lack_of_memory_is_one_sentence(capsys, error):
+    with pytest.raises(console.typer.Exit) as caught:
+        failing(error)
+    assert caught.value.exit_code == 3
+    assert "memory" in capsys.readouterr().err
+    with pytest.raises(ZeroDivisionError):  # a defect of ours stays visible
+        failing(ZeroDivisionError())
+
+
+def test_an_address_space_too_small_for_the_libraries_is_refused_at_once(tmp_path):
+    command = (
+        f"ulimit -v 500000; exec {sys.executable} -m sfm_shapefit.cli locate {RING}/sparse/0 {tmp_path}/out"
+    )
+    done = subprocess.run(
+        ["bash", "-c", command], capture_output=True, text=True, check=False, cwd=ROOT, timeout=60
+    )
+    assert done.returncode == 3
+    assert "512 MB of address space" in done.stderr
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,171 @@
+"""Hostile input, faults, determinism and many calls: `benchmark.py reliability` in small."""
+
+import gc
+import os
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abuse import determinism, sandbox, verdicts
+from abuse.fuzz import make_base
+from tests.scenes import COURTYARD, FACADE, RING, ROOT
+
+SCRIPTS = ROOT / "scripts"
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
+
+
+def reliability(*arguments, timeout=280):
+    return subprocess.run(
+        [sys.executable, str(SCRIPTS / "benchmark.py"), "reliability", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=timeout,
+        env=ENVIRONMENT,
+    )
+
+
+# --- hostile input -------------------------------------------------------------------------------------
+
+
+def test_300_damaged_inputs_end_in_a_correct_result_or_one_sentence():
+    done = reliability("fuzz", "--cases", 300, "--seed", 7)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "300 cases, 0 failed" in done.stdout
+
+
+SINS = """
+import os, signal, sys
+from pathlib import Path
+from abuse import sandbox, verdicts
+
+def traceback(): raise ZeroDivisionError
+def crash(): os.kill(os.getpid(), signal.SIGSEGV)
+def outside(): Path("../stray").write_text("x")
+def network():
+    import socket
+    socket.socket()
+def shell(): os.system("true")
+def memory(): bytearray(3 * 10**9)
+def chatter(): print("sfm-shapefit: one\\nand two", file=sys.stderr); sys.exit(3)
+def loop():
+    import resource
+    resource.setrlimit(resource.RLIMIT_CPU, (1, 2))
+    while True: pass
+def good(): Path("inside").write_text("x"); sys.exit(0)
+
+work = Path(sys.argv[1])
+for sin in (traceback, crash, outside, network, shell, memory, chatter, loop, good):
+    outcome = sandbox.run_forked(sin, work, [work])
+    print(sin.__name__, "; ".join(verdicts.faults(outcome)), sep=": ")
+"""
+
+
+def test_the_sandbox_sees_every_sin(tmp_path):
+    (tmp_path / "work").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", SINS, str(tmp_path / "work")],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=ENVIRONMENT,
+    )
+    seen = dict(line.split(": ", 1) for line in done.stdout.splitlines())
+    words = {
+        "traceback": "a traceback",
+        "crash": "signal 11",
+        "outside": "did open",
+        "network": "did socket",
+        "shell": "did os.system",
+        "memory": "a traceback",
+        "chatter": "not one sentence",
+        "loop": "signal 24",
+    }
+    for sin, word in words.items():
+        assert word in seen[sin], sin
+    assert seen["good"] == ""
+
+
+def test_the_verdict_sees_a_changed_input_and_another_answer(tmp_path):
+    (tmp_path / "a").write_text("1")
+    (tmp_path / "b").symlink_to("a")
+    before = verdicts.snapshot(tmp_path)
+    (tmp_path / "a").write_text("2")
+    assert verdicts.snapshot(tmp_path) != before
+    assert not verdicts.differs([(1.0, 0.0, 0.0)], [(1.0 + 1e-8, 0.0, 0.0)])
+    assert verdicts.differs([(1.0, 0.0, 0.0)], [(1.0 + 1e-5, 0.0, 0.0)])
+    assert verdicts.differs([], [(1.0, 0.0, 0.0)])
+
+
+def test_the_sandbox_limits_are_those_that_are_promised():
+    assert (sandbox.CPU_LIMIT_S, sandbox.MEMORY_LIMIT_BYTES) == (10, 2_000_000_000)
+
+
+# --- faults --------------------------------------------------------------------------------------------
+
+
+def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
+    done = reliability("faults", "--moments", 3, "--cold", 0, "--rivals", 2)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout.count("held") == 12
+
+
+# --- determinism ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("scene", [RING, FACADE, COURTYARD], ids=lambda scene: scene.name)
+def test_the_order_of_images_pairs_matches_and_points_does_not_matter(scene, tmp_path):
+    assert determinism.reordered_difference(scene, tmp_path, seed=1) <= 1e-12
+
+
+def test_reordering_changes_every_file_of_the_input(tmp_path):
+    copy = determinism.reordered(RING, tmp_path / "copy", determinism.np.random.default_rng(1))
+    for file in ("sparse/0/images.bin", "sparse/0/points3D.bin", "sparse/0/frames.bin", "database.db"):
+        assert (copy / file).read_bytes() != (RING / file).read_bytes()
+
+
+def test_hash_seed_and_threads_do_not_change_a_byte(tmp_path, monkeypatch):
+    name = "hash seed 4242, two threads"
+    monkeypatch.setattr(determinism, "VARIANTS", {name: determinism.VARIANTS[name]})
+    assert list(determinism.differing_files(RING, tmp_path)) == []
+
+
+@pytest.mark.slow
+def test_no_variant_of_a_run_changes_a_byte(tmp_path):
+    assert list(determinism.differing_files(COURTYARD, tmp_path)) == []
+
+
+# --- many calls ----------------------------------------------------------------------------------------
+
+WARM_UP = 10
+"""Calls in which caches and allocators fill."""
+GROWTH_BYTES = 8_000_000
+"""Allowed between the first and the last quarter, whatever the number of calls."""
+
+
+@pytest.mark.slow
+def test_30_calls_in_one_process_leave_memory_files_and_answers_as_they_were(tmp_path):
+    from sfm_shapefit.commands.locate import locate
+    from sfm_shapefit.commands.write import write_result
+    from sfm_shapefit.options import LocateOptions
+
+    base = make_base(tmp_path / "base")
+    sources = [(base / "sparse" / "0", base / "database.db", "auto"), (base / "old", None, "tracks")]
+    answers, sizes, descriptors = {}, [], set()
+    for call in range(30 + WARM_UP):
+        model, database, directions = sources[call % 2]
+        found = locate(model, database, LocateOptions(directions=directions, threads=1))
+        write_result(found, tmp_path / "out", overwrite=True)
+        centers = np.array([row.center for row in found.cameras if row.placed]).tobytes()
+        assert answers.setdefault(call % 2, centers) == centers
+        del found
+        if call >= WARM_UP:
+            sizes.append(int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize())
+            descriptors.add(len(os.listdir("/proc/self/fd")))
+    gc.collect()
+    assert np.median(sizes[-8:]) - np.median(sizes[:8]) < GROWTH_BYTES
+    assert len(descriptors) == 1

@@ -1,0 +1,80 @@
+"""scripts/benchmark.py: its index is true, and the quick version of every benchmark writes its section."""
+
+import re
+
+import pytest
+
+import benchmark
+from benchmarks import INDEX
+from harness.driver import RESULTS
+from tests.scenes import RING, ROOT, fingerprint
+
+SCRIPTS = ROOT / "scripts"
+PARTS = {"weights", "answer_cases", "answer_differences", "answer_inputs"}
+"""Modules that belong to another one."""
+SECTIONS = sorted(set(INDEX) - {"answers", "reliability"})
+
+
+def test_the_index_names_every_module():
+    assert {path.stem for path in (SCRIPTS / "benchmarks").glob("*.py")} == {*INDEX, *PARTS, "__init__"}
+    assert list(INDEX) == sorted(INDEX)
+
+
+def test_the_readme_names_every_benchmark_script_and_section():
+    text = (SCRIPTS / "README.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \|", text, flags=re.MULTILINE)
+    assert sorted(rows) == sorted(INDEX)
+    assert {f"results/{path.name}" for path in RESULTS.glob("*")} == set(
+        re.findall(r"\((results/.*?)\)", text)
+    )
+    folders = {path.parent.name for path in SCRIPTS.glob("*/*.py")}
+    files = {path.name for path in SCRIPTS.glob("*") if path.is_file()} - {"README.md"}
+    assert [
+        name for name in sorted(folders | files) if f"`{name}" not in text and f"/{name}" not in text
+    ] == []
+
+
+def test_every_recorded_section_names_the_command_that_writes_it():
+    for name in SECTIONS:
+        assert f"python scripts/benchmark.py {name}" in (RESULTS / f"{name}.md").read_text().splitlines()[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SECTIONS)
+def test_the_quick_version_writes_its_section(name, tmp_path):
+    before = fingerprint(RING)
+    out = tmp_path / "section.md"
+    plot = ["--plot", str(tmp_path / "scale.png")] if name == "scale" else []
+    assert benchmark.main([name, "--quick", "--out", str(out), *plot]) == 0
+    text = out.read_text()
+    assert f"- Command: `python scripts/benchmark.py {name} --quick`" in text
+    assert "\n## What the columns mean\n" in text
+    assert "failed" not in text
+    assert str(ROOT) not in text
+    assert fingerprint(RING) == before
+    if name == "scale":
+        assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_missing_data_is_a_sentence_per_case_and_no_failure(tmp_path, capsys):
+    out = tmp_path / "section.md"
+    only = ["--only", "lego100", "castle-P19"]
+    assert benchmark.main(["real", "--data", str(tmp_path), *only, "--out", str(out)]) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert [line.partition(": ")[0] for line in said] == ["castle-P19", "lego100"]
+    assert "give their folder with --data" in said[0]
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["real", "--only", "nowhere"], "no case begins with nowhere; known: fountain-P11"),
+        (["real", "--repeats", "0"], "'0' is not a whole number of 1 or more"),
+        (["unreal"], "invalid choice: 'unreal'"),
+    ],
+)
+def test_wrong_usage_is_explained(words, message, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        benchmark.main(words)
+    assert message in f"{stopped.value} {capsys.readouterr().err}"

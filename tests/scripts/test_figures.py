@@ -1,0 +1,129 @@
+"""The figures of the paper: their trials, what is kept between runs, and the scripts in their quick mode."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import figure
+from figures import noise_robustness, phase_transition, theory_plot, trials
+from figures.methods import METHODS
+from figures.trials import Cell, run_batch, run_trials
+
+CELLS = [Cell(12, 0.0), Cell(12, 0.2, 0.05)]
+
+
+def test_every_method_solves_the_same_problems_and_a_trial_is_that_of_its_seed():
+    both = run_batch(CELLS, ["ShapeFit", "least squares"], 2, 0)
+    assert both.shape == (2, 2, 2, 4)
+    np.testing.assert_array_equal(run_batch(CELLS[1:], ["ShapeFit"], 2, 0)[0, 0], both[1, 0])
+    assert not np.array_equal(run_batch(CELLS[1:], ["ShapeFit"], 2, 1)[0, 0], both[1, 0])
+
+
+def test_a_problem_without_an_answer_counts_as_not_recovered():
+    values = run_batch([Cell(4, 0.0, p=0.1)], ["ShapeFit"], 3, 0)
+    np.testing.assert_array_equal(values[0, 0, :, 0], 1.0)
+    np.testing.assert_array_equal(values[0, 0, :, 1], -1)
+
+
+def test_the_camera_that_is_farthest_off_is_named_with_its_share_of_wrong_pairs():
+    problem = next(trials.problems(Cell(10, 0.3), 1, 0))
+
+    def one_flies(_graph, problem):
+        t = problem.locations.copy()
+        t[7] += 100.0
+        return t
+
+    found = trials.trial(problem, one_flies)
+    touching = (problem.edges == 7).any(axis=1)
+    assert found.worst_camera == 7
+    assert found.wrong_share == pytest.approx(problem.corrupted[touching].mean())
+    assert found.error_of_others < 1e-12 < found.error
+
+
+def test_an_interrupted_run_goes_on_where_it_was(tmp_path, monkeypatch):
+    cache = tmp_path / "kept.npz"
+    whole = run_trials(CELLS, ["ShapeFit"], 2, cache=cache, processes=1)
+    with np.load(cache) as kept:
+        values, settings = kept["values"].copy(), str(kept["settings"])
+    values[0] = np.nan  # as if the run had been stopped before this cell
+    values[1, ..., 0] = 0.125
+    np.savez(cache, settings=settings, values=values, seconds=1.0)
+    resumed = run_trials(CELLS, ["ShapeFit"], 2, cache=cache, processes=1)
+    np.testing.assert_array_equal(resumed.values[0], whole.values[0])
+    np.testing.assert_array_equal(resumed.values[1, ..., 0], 0.125)
+
+
+def test_results_of_other_settings_are_not_mixed_in(tmp_path):
+    cache = tmp_path / "kept.npz"
+    run_trials(CELLS[:1], ["ShapeFit"], 1, cache=cache, processes=1)
+    with pytest.raises(ValueError, match="other settings"):
+        run_trials(CELLS[:1], ["ShapeFit"], 2, cache=cache, processes=1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("figure", ["paper", "methods"])
+def test_figure_1_has_a_quick_mode(figure, tmp_path, capsys):
+    figure.main(["phase_transition", "--out", str(tmp_path / "f.png"), "--quick", "--figure", figure])
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    said = capsys.readouterr().out
+    assert "problems recovered below 1e-09" in said
+    worst, cells = said.split("ShapeFit, noise 0.05: at most ")[1].split()[0:4:3]
+    assert int(cells) >= 1
+    assert float(worst) < 0.1  # twice the noise
+
+
+@pytest.mark.slow
+def test_figure_2_has_a_quick_mode_and_its_slope_is_one(tmp_path, capsys):
+    figure.main(["noise_robustness", "--out", str(tmp_path / "f.png"), "--quick"])
+    assert (tmp_path / "f.png").stat().st_size > 5000
+    slope = float(capsys.readouterr().out.split("ShapeFit: slope ")[1].split()[0])
+    assert slope == pytest.approx(1.0, abs=0.05)
+
+
+def test_the_slope_is_fitted_where_the_noise_is_small():
+    sigmas = np.logspace(-6, 0, 7)
+    errors = np.where(sigmas <= 1e-2, 3.0 * sigmas**1.5, 1.0)
+    assert noise_robustness.fitted_slope(sigmas, errors) == pytest.approx(1.5)
+
+
+def test_every_panel_of_every_figure_names_a_known_method():
+    for name in phase_transition.FIGURES:
+        panels = phase_transition.panels(name)
+        assert panels
+        assert {panel.method for panel in panels} <= set(METHODS)
+
+
+def test_solvers_may_be_apart_only_where_the_optimum_is_not_certified_to_be_unique():
+    cells = (Cell(16, 0.425), Cell(40, 0.2), Cell(6, 0.5))  # a flat optimum, a unique one, a graph that bends
+    errors = np.array([[0.3, 0.3001], [1e-12, 2e-7], [1.0, 1.0]])
+    values = np.repeat(errors[:, :, None, None], 4, axis=3)
+    said = phase_transition._apart(trials.Results(cells, ("a", "b"), values, 0.0))
+    assert said.startswith("largest difference of a cell between a and b: 1.0e-04; 2.0e-07 without 1 cells")
+    values[1, 1] = 1e-3
+    said = phase_transition._apart(trials.Results(cells[1:], ("a", "b"), values[1:], 0.0))
+    assert said == "largest difference of a cell between a and b: 1.0e-03"
+
+
+def test_only_sizes_that_double_are_drawn_on_a_logarithmic_axis():
+    panels = {name: phase_transition.panels(name) for name in phase_transition.FIGURES}
+    assert [name for name, shown in panels.items() if any(panel.doubles for panel in shown)] == ["large"]
+    assert all(panel.doubles for panel in panels["large"])
+
+
+def test_the_theory_plot_has_a_quick_mode_and_grants_less_than_is_recovered(tmp_path, capsys):
+    figure.main(["theory_plot", "--out", str(tmp_path / "f.png"), "--quick"])
+    assert (tmp_path / "f.png").read_bytes().startswith(b"\x89PNG")
+    *_, dense = capsys.readouterr().out.splitlines()
+    granted, recovered = (float(dense.split(word)[1].split()[0]) for word in ("granted ", "recovered "))
+    assert dense.split()[0] == "1:"  # every pair: the theorems speak
+    assert 0.0 < granted < 1e-6 < recovered
+
+
+def test_the_worst_share_is_that_of_the_camera_with_most_wrong_pairs():
+    problem = SimpleNamespace(
+        locations=np.zeros((4, 3)),
+        edges=np.array([[0, 1], [0, 2], [0, 3], [2, 3]]),
+        corrupted=np.array([True, False, True, True]),
+    )
+    assert theory_plot.worst_share(problem) == 0.5  # cameras 0 and 3 have two of four

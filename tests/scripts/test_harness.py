@@ -1,0 +1,219 @@
+"""What all benchmarks share: limits and numbers, tables, fresh processes, the driver."""
+
+import argparse
+import itertools
+import math
+import os
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from harness import driver, process, record
+from harness.driver import Benchmark, Kept
+from harness.graphs import GraphSpec, draw, relative_error
+from harness.metrics import Check, Quantity, count_met, median, number, ratio, times, verdict
+
+# --- limits, ratios, numbers -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("value", "better", "met"),
+    [
+        (0.025, "lower", True),
+        (0.025 * (1 + 1e-9), "lower", False),  # prints as 0.0250, and is above it nevertheless
+        (0.025 * (1 - 1e-9), "lower", True),
+        (0.026, "higher", True),
+        (0.024, "higher", False),
+        (math.nan, "lower", False),
+        (-math.inf, "lower", False),
+        (math.inf, "higher", False),
+    ],
+)
+def test_a_limit_is_met_by_the_unrounded_finite_value_only(value, better, met):
+    assert Check(name="median", value=value, limit=0.025, better=better).met is met
+
+
+def test_a_check_needs_a_direction():
+    with pytest.raises(ValueError, match="pairs needs a direction"):
+        Check(name="pairs", value=1.0, limit=2.0, better="neither")
+
+
+def test_a_verdict_names_every_limit_that_is_missed_and_no_other():
+    checks = [
+        Check(name="median", value=0.03, limit=0.025),
+        Check(name="mean", value=0.02, limit=0.026),
+        Check(name="max", value=math.nan, limit=1.0),
+    ]
+    assert verdict(checks) == "**missed**: median 0.0300 > 0.0250, max - > 1.00"
+    assert verdict(checks[1:2]) == "met"
+    assert verdict([]) == "no target"
+
+
+@pytest.mark.parametrize("bad", [(1.0, 0.0), (1.0, -2.0), (math.nan, 1.0), (1.0, math.nan), (math.inf, 1.0)])
+def test_a_ratio_to_nothing_sensible_is_not_a_number_and_prints_as_a_dash(bad):
+    assert math.isnan(ratio(*bad))
+    assert times(ratio(*bad)) == "-"
+
+
+def test_a_ratio_is_the_value_over_the_reference():
+    assert ratio(3.0, 2.0) == 1.5
+    assert [times(value) for value in (0.156, 1.5, 9.96, 21.4)] == ["0.16x", "1.5x", "10x", "21x"]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (0.0, "0"),
+        (0.00226, "0.00226"),
+        (0.03, "0.0300"),
+        (7.28, "7.28"),
+        (447.2, "447"),
+        (12345.6, "12346"),
+        (3e-11, "3.0e-11"),
+        (2e7, "2.0e+07"),
+        (-0.5, "-0.500"),
+        (math.inf, "-"),
+    ],
+)
+def test_numbers_have_three_significant_digits(value, text):
+    assert number(value) == text
+
+
+def test_the_median_of_nothing_is_not_a_number():
+    assert median([3.0, 1.0, 2.0]) == 2.0
+    assert math.isnan(median([]))
+
+
+# --- tables ----------------------------------------------------------------------------------------
+
+
+def test_a_table_has_a_line_per_row_and_refuses_ragged_rows():
+    assert record.table(["a", "b"], [["1", "2|3"]]) == "| a | b |\n| --- | --- |\n| 1 | 2/3 |\n"
+    with pytest.raises(ValueError, match="row '1' has 1 cells, the header has 2"):
+        record.table(["a", "b"], [["1"]])
+
+
+def test_the_processor_is_named_by_its_model(tmp_path):
+    (tmp_path / "cpuinfo").write_text("processor : 0\nmodel name\t: Some CPU @ 2 GHz\nmodel name\t: other\n")
+    assert record.cpu_model(tmp_path / "cpuinfo") == "Some CPU @ 2 GHz"
+    assert record.cpu_model(tmp_path / "missing")
+
+
+# --- bare graphs -----------------------------------------------------------------------------------
+
+
+def test_the_error_knows_the_gauge():
+    rng = np.random.default_rng(5)
+    t = rng.standard_normal((9, 3))
+    assert relative_error(3.0 * t + 7.0, t) < 1e-14  # rounding
+    assert relative_error(-t, t) == pytest.approx(2.0)
+
+
+def test_a_family_is_drawn_the_same_each_time():
+    spec = GraphSpec(family="comm", n=60, degree=12.0, sigma=0.01)
+    assert np.array_equal(draw(spec).directions, draw(spec).directions)
+
+
+# --- fresh processes -------------------------------------------------------------------------------
+
+
+def test_a_fresh_process_has_the_threads_that_were_asked_for_and_this_one_keeps_its_own():
+    before = dict(os.environ)
+    assert process.call(os.getenv, "OPENBLAS_NUM_THREADS", environment=process.thread_environment(3)) == "3"
+    assert dict(os.environ) == before
+
+
+def test_a_failure_in_a_fresh_process_is_one_sentence():
+    with pytest.raises(RuntimeError, match=r"^ValueError: .*literal"):
+        process.call(int, "x")
+    with pytest.raises(RuntimeError, match="ended with code 7 and no answer"):
+        process.call(os._exit, 7)
+
+
+def test_a_process_that_takes_too_long_is_ended():
+    start = time.perf_counter()
+    with pytest.raises(TimeoutError, match=r"no answer within 0\.5 s"):
+        process.call(time.sleep, 60.0, timeout_s=0.5)
+    assert time.perf_counter() - start < 20.0
+    with pytest.raises(TimeoutError, match="no answer within 1 s of CPU time"):
+        process.call(sum, itertools.repeat(0), cpu_limit_s=1)
+
+
+# --- the driver ------------------------------------------------------------------------------------
+
+
+def fail():
+    raise ValueError("no luck")
+
+
+BENCHMARK = Benchmark(
+    name="made",
+    title="Made",
+    cases=lambda args: {
+        "one": partial(float, args.repeats),
+        "two": fail,
+        "three": "it is not there",
+    },
+    checks=lambda value: [Check(name="value", value=value, limit=2.0)],
+    tables=lambda measured, _args: [record.table_of(measured.values(), {"value": str})],
+    quantities=(Quantity("value", "1", "lower", 0.0, "what it is"),),
+    packages=("numpy",),
+    quick={"repeats": 2},
+)
+
+
+def parse(*words):
+    parser = argparse.ArgumentParser()
+    BENCHMARK.add_arguments(parser)
+    return parser.parse_args([*map(str, words)])
+
+
+def test_a_section_says_what_was_measured_by_which_command_and_what_was_not_and_why(tmp_path, capsys):
+    out = tmp_path / "made.md"
+    assert BENCHMARK.run(parse("--out", out, "--repeats", 3)) == 0
+    text = out.read_text()
+    assert text.startswith("# Made\n\n- Command: `python scripts/benchmark.py made --repeats 3`\n")
+    assert "**0 of 1 limits met.**" in text
+    assert "| value |\n| --- |\n| 3.0 |" in text
+    assert "Not measured: two: failed: ValueError: no luck; three: it is not there." in text
+    assert "| value | 1 | lower | 0% | what it is |" in text
+    assert str(tmp_path) not in text
+    assert "two: failed: ValueError: no luck" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["made.md"]
+
+
+def test_the_quick_version_is_recorded_as_such():
+    args = parse("--quick")
+    vars(args).update(BENCHMARK.quick)
+    assert BENCHMARK.command_line(args) == "python scripts/benchmark.py made --quick"
+
+
+def test_where_nothing_is_measured_nothing_is_written(tmp_path, capsys):
+    assert BENCHMARK.run(parse("--out", tmp_path / "made.md", "--only", "three")) == 0
+    assert capsys.readouterr().err == "three: it is not there\n"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_cases_are_chosen_by_the_beginning_of_their_names():
+    cases = {"seq-300": "a", "seq-300 exact": "b", "er2": "c"}
+    assert list(driver.choose(cases, ["seq-300"])) == ["seq-300", "seq-300 exact"]
+    assert list(driver.choose(cases, [])) == list(cases)
+    with pytest.raises(SystemExit, match="no case begins with x; known: seq-300; seq-300 exact; er2"):
+        driver.choose(cases, ["er2", "x"])
+
+
+def test_answers_of_an_interrupted_run_are_kept_and_not_asked_again(tmp_path):
+    file, asked = tmp_path / "kept", []
+    first = Kept(file, {"limit": 1})
+    first.get("one", lambda: asked.append(1) or 2.5)
+    again = Kept(file, {"limit": 1})
+    assert again.get("one", lambda: asked.append(2)) == 2.5
+    assert asked == [1]
+    with pytest.raises(ValueError, match="other settings; delete it or give another --cache"):
+        Kept(file, {"limit": 2})
+
+
+def test_without_limits_none_are_counted():
+    assert count_met([]) == ""
