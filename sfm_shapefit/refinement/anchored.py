@@ -15,17 +15,24 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
-from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import plan_factorisation
-from sfm_shapefit.refinement.angular import KERNEL_WIDTH, AngularTerms, Metric
+from sfm_shapefit.laplacian.cholesky import allocate_factor
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.refinement.angular import (
+    DAMPING,
+    DEFAULT_MAX_BYTES,
+    KERNEL_WIDTH,
+    AngularTerms,
+    Metric,
+    NormalFactor,
+    plan_refinement,
+)
+from sfm_shapefit.solver.damping import take_damped_step
 from sfm_shapefit.solver.program import adjoint
 from sfm_shapefit.viewgraph import ViewGraph
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
 _MAX_STEPS = 40
-_CONVERGED = 1e-9  # relative decrease of the cost that counts as none
+# A step that lowers the cost by less than this share of it is the last one.
+_CONVERGED = 1e-9
 
 
 class Anchors(NamedTuple):
@@ -40,7 +47,13 @@ class Anchors(NamedTuple):
 
 
 def refine_anchored(
-    graph: ViewGraph, start: FloatArray, metric: Metric, levels: FloatArray, anchors: Anchors
+    graph: ViewGraph,
+    start: FloatArray,
+    metric: Metric,
+    levels: FloatArray,
+    anchors: Anchors,
+    *,
+    max_bytes: int = DEFAULT_MAX_BYTES,
 ) -> FloatArray:
     """Return locations (n, d), in the anchors' units, of least cost of directions and anchors together.
 
@@ -50,9 +63,13 @@ def refine_anchored(
         metric: covariance and class of each pair.
         levels: (number of classes,) in radians.
         anchors: measured positions of some nodes.
+        max_bytes: what a factor of the normal equations may take.
+
+    Raises:
+        UnsolvableError: if it would take more.
     """
-    problem = _Problem(AngularTerms(graph, metric, levels), anchors)
-    t, damping = start, _FIRST_DAMPING
+    problem = _Problem(AngularTerms(graph, metric, levels), anchors, max_bytes)
+    t, damping = start, DAMPING.first
     cost = problem.cost(t)
     for _ in range(_MAX_STEPS):
         moved, damping, lower = _step(problem, t, damping, cost)
@@ -62,17 +79,29 @@ def refine_anchored(
     return t
 
 
-class _Problem:
-    """The joint cost and its normal equations; the last node is the origin."""
+class _JoinedGraph(NamedTuple):
+    """The pairs of the graph, and those of the anchors' nodes with the origin, which is the last node."""
 
-    def __init__(self, terms: AngularTerms, anchors: Anchors) -> None:
-        n = terms.graph.num_nodes
+    num_nodes: int
+    edges: IntArray
+    dimension: int
+
+
+class _Problem:
+    """The joint cost and its normal equations."""
+
+    def __init__(self, terms: AngularTerms, anchors: Anchors, max_bytes: int) -> None:
+        n, d = terms.graph.num_nodes, terms.graph.dimension
         links = np.stack([anchors.nodes, np.full(len(anchors.nodes), n)], axis=1)
         self.terms, self.anchors, self.num_nodes = terms, anchors, n + 1
         self.edges = np.concatenate([terms.graph.edges, links])
-        neighbours = adjacency(n + 1, self.edges)
-        plan = plan_factorisation(neighbours, self.edges, best_order(neighbours))
-        self.factor: CholeskyFactor = allocate_factor(plan, terms.graph.dimension)
+        plan = plan_refinement(_JoinedGraph(n + 1, self.edges, d), max_bytes)
+        if plan is None:
+            raise UnsolvableError(
+                "the factor for the refinement with priors would take more than the "
+                f"{max_bytes / 1e6:.0f} MB allowed for one; allow more, or leave this refinement out"
+            )
+        self.factor: NormalFactor = allocate_factor(plan, d) if isinstance(plan, SymbolicFactor) else plan
 
     def cost(self, t: FloatArray) -> float:
         """Return the cost at t, (n, d)."""
@@ -82,7 +111,7 @@ class _Problem:
 
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
-        blocks, damped, gradient = self.terms.linearised(t)
+        blocks, damped, gradient = self.terms.linearize(t)
         weights = 1.0 / (1.0 + (self._chi2(t) / KERNEL_WIDTH**2) ** 2)
         own = weights[:, None, None] * self.anchors.information
         pull = np.einsum("kab,kb->ka", own, t[self.anchors.nodes] - self.anchors.positions)
@@ -97,16 +126,17 @@ class _Problem:
 def _step(problem: _Problem, t: FloatArray, damping: float, before: float) -> tuple[FloatArray, float, float]:
     """Take one step that lowers the cost; return locations, damping and the cost, the same if none does."""
     blocks, damped, right = problem.normal_equations(t)
-    while damping <= _MOST_DAMPING:
+
+    def propose(damping: float) -> tuple[FloatArray, float] | None:
         try:
             problem.factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(t.shape[1]))
         except UnsolvableError:
-            damping *= 10.0
-            continue
+            return None
         step = problem.factor.solve(right)
         proposed = t + step[:-1] - step[-1]
         after = problem.cost(proposed)
-        if after < before:
-            return proposed, max(damping / 10.0, _LEAST_DAMPING), after
-        damping *= 10.0
-    return t, _FIRST_DAMPING, before
+        return (proposed, after) if after < before else None
+
+    found, damping = take_damped_step(propose, damping, DAMPING)
+    moved, after = (t, before) if found is None else found
+    return moved, damping, after

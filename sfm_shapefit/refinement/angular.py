@@ -38,17 +38,20 @@ from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
-from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
+from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
+from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 KERNEL_WIDTH = 3.0
 """k: a residual of so many standard deviations counts half of what it can."""
 
+DAMPING = DampingRange()
+"""Of the steps, relative to the damping matrix of `AngularTerms`."""
+
 _FIRST_LEVEL_RAD = 0.1 / KERNEL_WIDTH
 _LEAST_LEVEL_RAD = 1e-4 / KERNEL_WIDTH  # exact data: a smaller level would reject pairs for their rounding
 _LEAST_SHARE = 0.2  # of a class inside the kernel, below which its level stays: most of it is not fitted yet
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-9, 1e2
 _SHORTEST = 1e-3  # of the median length: the floor under |d|, where a direction says nothing
 _SETTLED = 0.03  # relative change of the levels that counts as none
 _CONVERGED = 1e-9  # relative decrease of the cost that counts as none
@@ -57,7 +60,8 @@ _ALIKE = 1e-6  # relative difference of costs that says that two refinements end
 _HOPELESS = 20.0  # times the last decrease of the cost: farther above its rival it does not catch up
 _MAX_STEPS = 60
 _MAX_FLOPS = 3e10  # of one factorisation in blocks: about a second, of which 15 to 40 are needed
-_MAX_BYTES = 2_000_000_000
+DEFAULT_MAX_BYTES = 2_000_000_000
+"""What a factor may take if the caller says nothing."""
 
 
 class NormalFactor(Protocol):
@@ -93,7 +97,9 @@ class AngularResult:
     """Factorisations."""
 
 
-def plan_refinement(graph: ViewGraph, max_bytes: int = _MAX_BYTES) -> SymbolicFactor | IterativeNormal | None:
+def plan_refinement(
+    graph: GraphShape, max_bytes: int = DEFAULT_MAX_BYTES
+) -> SymbolicFactor | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 
     Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
@@ -135,7 +141,7 @@ def refine_angles(
     spread = _spread(graph, metric)
     first = _unit(start)
     other = None if rival is None else _unit(rival)
-    t, damping, steps = first, _FIRST_DAMPING, 0
+    t, damping, steps = first, DAMPING.first, 0
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
         lower = np.clip(residual_levels(graph, t, metric, levels), levels / 2.0, levels)
@@ -185,9 +191,9 @@ class AngularTerms:
         """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
         return _cost(self.graph, self._information, locations)
 
-    def linearised(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def linearize(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
-        return _linearised(self.graph, self._information, locations)
+        return _linearize(self.graph, self._information, locations)
 
 
 def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
@@ -266,20 +272,21 @@ def _step(
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
     before = _cost(graph, information, t, steep)
-    blocks, damped, gradient = _linearised(graph, information, t, steep)
+    blocks, damped, gradient = _linearize(graph, information, t, steep)
     right = -adjoint(gradient, graph.edges, graph.num_nodes)
-    while damping <= _MOST_DAMPING:
+
+    def propose(damping: float) -> tuple[FloatArray, float] | None:
         try:
             factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(graph.dimension))
         except UnsolvableError:  # too little of the matrix is left under these weights
-            damping *= 10.0
-            continue
+            return None
         proposed = _unit(t + factor.solve(right))
         after = _cost(graph, information, proposed, steep)
-        if after < before:
-            return proposed, max(damping / 10.0, _LEAST_DAMPING), before, after
-        damping *= 10.0
-    return t, _FIRST_DAMPING, before, before
+        return (proposed, after) if after < before else None
+
+    found, damping = take_damped_step(propose, damping, DAMPING)
+    moved, after = (t, before) if found is None else found
+    return moved, damping, before, after
 
 
 def _unit(t: FloatArray) -> FloatArray:
@@ -316,7 +323,7 @@ def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool 
     return float(_sum_of_kernels(baselines, graph.directions, graph.weights, information, floor, steep))
 
 
-def _linearised(
+def _linearize(
     graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""

@@ -4,23 +4,41 @@ A step need not be exact, for the next one starts where it ends. The preconditio
 factor of the scalar Laplacian whose weights are the mean eigenvalues of the blocks.
 """
 
+from typing import Protocol
+
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver.program import adjoint, differences
-from sfm_shapefit.viewgraph import ViewGraph
 
-_REDUCTION = 1e-2  # of the residual of a step
+# A step is solved until its residual has fallen to this share.
+_REDUCTION = 1e-2
 _MAX_STEPS = 80
 _SEED = 1
+
+
+class GraphShape(Protocol):
+    """What the normal equations need to know of a graph; a `ViewGraph` is one."""
+
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes, n."""
+
+    @property
+    def edges(self) -> IntArray:
+        """(m, 2) pairs of nodes."""
+
+    @property
+    def dimension(self) -> int:
+        """Size of the blocks, d."""
 
 
 class IterativeNormal:
     """What `angular.refine_angles` takes in place of a factor's plan; memory is linear in the edges."""
 
-    def __init__(self, graph: ViewGraph) -> None:
+    def __init__(self, graph: GraphShape) -> None:
         self._edges = graph.edges
         self._neighbours = adjacency(graph.num_nodes, graph.edges)
         self._blocks: FloatArray = np.zeros((0, graph.dimension, graph.dimension))

@@ -182,7 +182,7 @@ def _plan(
     """Return what the refinement solves its steps with, or None if its factor would be too large."""
     if groups is None:
         return plan_refinement(graph, max_bytes)
-    return ReducedFactor(graph.edges, groups.normalised())
+    return ReducedFactor(graph.edges, groups.normalize())
 
 
 def _second_start(

@@ -39,7 +39,7 @@ from sfm_shapefit.rotations.joint_refinement import (
     TurnPrior,
     at_state,
     camera_blocks,
-    minimised,
+    minimize,
     normal_equations,
     turn_vectors,
 )
@@ -90,14 +90,14 @@ def refine_rotations(
     state = State(start, centers / median_spread(centers))
     prior = TurnPrior(float(_FIRST_LEVEL_RAD), np.ones(n, dtype=np.bool_))
     for scale_px in _SCALES_PX if turns is None else _SCALES_PX[-1:]:
-        state = _without_common_turn(minimised(matches, state, scale_px, prior))
+        state = _without_common_turn(minimize(matches, state, scale_px, prior))
     prior = replace(prior, level=_level(state.turns))
-    state = _without_common_turn(minimised(matches, state, _FINAL_PX, prior))
+    state = _without_common_turn(minimize(matches, state, _FINAL_PX, prior))
     evidence, updated = _judged(matches, state, prior.level)
     if _median_gain(matches, state, prior) < _GOOD_GAIN:
         updated &= evidence > _ASKED_OF_GOOD
     kept = np.where(updated[:, None, None], state.turns, np.eye(3))
-    state = minimised(matches, State(kept, state.centers), _FINAL_PX, replace(prior, free=updated))
+    state = minimize(matches, State(kept, state.centers), _FINAL_PX, replace(prior, free=updated))
     angles = np.degrees(np.linalg.norm(turn_vectors(state.turns), axis=1))
     return RotationRefinement(
         turns=np.where(updated[:, None, None], state.turns, np.eye(3)),
@@ -147,7 +147,7 @@ def _median_gain(matches: RayMatches, state: State, prior: TurnPrior) -> float:
     """Return what the median pair gains over all given rotations, with centres placed for those."""
     n = len(state.centers)
     given = State(np.tile(np.eye(3), (n, 1, 1)), state.centers)
-    placed = minimised(matches, given, _FINAL_PX, replace(prior, free=np.zeros(n, dtype=np.bool_)))
+    placed = minimize(matches, given, _FINAL_PX, replace(prior, free=np.zeros(n, dtype=np.bool_)))
     kept, refined = (at_state(matches, one, _FINAL_PX).costs for one in (placed, state))
     return float(np.median(_gains(matches, kept, refined)))
 

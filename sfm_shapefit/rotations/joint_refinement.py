@@ -14,7 +14,7 @@ with sigma the angle of one pixel, as in `directions`. Its derivatives, all exac
 
 and d moves with C_i - C_j by (I - d d^T) / |C_i - C_j|. One pass over the matches sums, for each pair, the
 9 x 9 normal matrix of (w_i, w_j, C_i - C_j); memory is that of the pairs. The sum of Cauchy losses, its scale
-falling 8, 3, 1 px, plus a soft prior on the w_i, is minimised by Levenberg-Marquardt steps over 6 unknowns
+falling 8, 3, 1 px, plus a soft prior on the w_i, is minimized by Levenberg-Marquardt steps over 6 unknowns
 per camera. The prior fixes the common rotation; the damping takes care of shift and scale. Which of the
 refined rotations to believe is decided in `rotations`.
 
@@ -24,6 +24,7 @@ section 6; Cauchy weights: Zhang, "Parameter estimation techniques", IVC 1997, t
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
@@ -34,15 +35,20 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 
 _STEPS = 12
-_DAMPING = 1e-4  # of the diagonal, at the start
-_MAX_DAMPING = 1e4
-_ABSOLUTE_DAMPING = 1e-12  # of the largest diagonal entry: gauge directions stay put
-_SETTLED = 1e-6  # relative fall of the cost below which the steps end
+# The damping multiplies the diagonal of the normal matrix.
+_DAMPING = DampingRange(least=0.0, most=1e4)
+# This share of the largest diagonal entry is added as well, so that gauge directions stay put.
+_ABSOLUTE_DAMPING = 1e-12
+# The steps end where one lowers the cost by less than this share of it.
+_SETTLED = 1e-6
 _DENSE_UNKNOWNS = 900
-_OF_I, _OF_J = [0, 1, 2, 6, 7, 8], [3, 4, 5, 6, 7, 8]  # of a pair's 9 unknowns, those that move camera i, j
-_SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])  # C_j enters C_i - C_j with a minus
+# Of a pair's 9 unknowns, those that move camera i, and those that move camera j.
+_OF_I, _OF_J = [0, 1, 2, 6, 7, 8], [3, 4, 5, 6, 7, 8]
+# C_j enters C_i - C_j with a minus.
+_SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -229,9 +235,11 @@ def at_state(matches: RayMatches, state: State, scale_px: float) -> NormalEquati
     return normal_equations(matches, (state.turns[i], state.turns[j]), baselines, scale_px)
 
 
-def camera_blocks(
-    normal: NormalEquations, pairs: IntArray, num_cameras: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+Blocks = tuple[FloatArray, FloatArray, FloatArray]
+"""Normal equations of cameras; see `camera_blocks`."""
+
+
+def camera_blocks(normal: NormalEquations, pairs: IntArray, num_cameras: int) -> Blocks:
     """Return the normal equations of (w, C) of all cameras.
 
     Returns:
@@ -277,31 +285,48 @@ def turn_vectors(turns: FloatArray) -> FloatArray:
     return np.asarray(Rotation.from_matrix(turns).as_rotvec())
 
 
-def minimised(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> State:
+def minimize(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> State:
     """Return the state after Levenberg-Marquardt steps on all matches at one scale of the Cauchy loss."""
-    damping = _DAMPING
-    normal = at_state(matches, state, scale_px)
-    cost = float(normal.costs.sum()) + prior.cost(state)
+    fit, damping = _evaluate(matches, state, scale_px, prior), _DAMPING.first
     for _ in range(_STEPS):
-        system = camera_blocks(normal, matches.pairs, len(state.centers))
-        prior.add_to(state, system[0], system[2])
-        before = cost
-        while damping <= _MAX_DAMPING:
-            candidate = state.moved(_step(system, matches.pairs, prior.free, damping))
-            new = at_state(matches, candidate, scale_px)
-            new_cost = float(new.costs.sum()) + prior.cost(candidate)
-            if new_cost <= cost:
-                state, normal, cost, damping = candidate, new, new_cost, damping / 10.0
-                break
-            damping *= 10.0
-        if before - cost <= _SETTLED * cost:
+        before = fit.cost
+        better, damping = _improve(matches, fit, scale_px, prior, damping)
+        fit = fit if better is None else better
+        if before - fit.cost <= _SETTLED * fit.cost:
             break
-    return state
+    return fit.state
 
 
-def _step(
-    system: tuple[FloatArray, FloatArray, FloatArray], pairs: IntArray, free: BoolArray, damping: float
-) -> FloatArray:
+class _Fit(NamedTuple):
+    """A state, its normal equations without the prior, and its cost with it."""
+
+    state: State
+    normal: NormalEquations
+    cost: float
+
+
+def _evaluate(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> _Fit:
+    """Return the fit of a state."""
+    normal = at_state(matches, state, scale_px)
+    return _Fit(state, normal, float(normal.costs.sum()) + prior.cost(state))
+
+
+def _improve(
+    matches: RayMatches, fit: _Fit, scale_px: float, prior: TurnPrior, damping: float
+) -> tuple[_Fit | None, float]:
+    """Take a step that does not raise the cost; None if there is none, and the damping for the next one."""
+    system = camera_blocks(fit.normal, matches.pairs, len(fit.state.centers))
+    prior.add_to(fit.state, system[0], system[2])
+
+    def propose(damping: float) -> _Fit | None:
+        moved = fit.state.moved(_step(system, matches.pairs, prior.free, damping))
+        candidate = _evaluate(matches, moved, scale_px, prior)
+        return candidate if candidate.cost <= fit.cost else None
+
+    return take_damped_step(propose, damping, _DAMPING)
+
+
+def _step(system: Blocks, pairs: IntArray, free: BoolArray, damping: float) -> FloatArray:
     """Return the damped step (n, 6); cameras that are not free move without turning."""
     diagonal, coupling, gradient = (block.copy() for block in system)
     own = diagonal[:, range(6), range(6)]

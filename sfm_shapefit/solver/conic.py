@@ -14,25 +14,30 @@ for the program, and trusted: every other solver is tested against it.
 
 import contextlib
 import warnings
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, hstack
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.solver.program import scale_functional
-from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.viewgraph import ViewGraph
 
-_TIGHTEST = 1e-12  # tolerance that double precision can still serve
-_LOOSER = (1.0, 10.0, 100.0, 1000.0)  # factors on the tolerance, tried in turn
-_TIGHTER = 1e-3  # the cone solver's tolerance below ours: its gap is relative to an inexact dual
+if TYPE_CHECKING:  # rigs.solve calls this solver
+    from sfm_shapefit.solver.rigs.groups import RigidGroups
+
+# The least tolerance that double precision can still serve.
+_LEAST_CONE_TOL = 1e-12
+# The cone solver's tolerance per tolerance of ours: its own gap is relative to an inexact dual.
+_CONE_TOL_PER_TOL = 1e-3
+# Factors on the cone solver's tolerance, tried in turn until it returns a point.
+_LOOSER_FACTORS = (1.0, 10.0, 100.0, 1000.0)
 
 
 def solve_conic(
-    graph: ViewGraph, tol: float, max_iterations: int, groups: RigidGroups | None = None
+    graph: ViewGraph, tol: float, max_iterations: int, groups: "RigidGroups | None" = None
 ) -> tuple[FloatArray, FloatArray, int]:
     """Solve the program with cvxpy and Clarabel.
 
@@ -52,7 +57,11 @@ def solve_conic(
 
     bases = tangent_bases(graph.directions)
     m, d = graph.num_edges, graph.dimension
-    reduction = _reduction(separate(graph.num_nodes, d) if groups is None else groups)
+    reduction = (
+        _reduction(np.arange(graph.num_nodes), np.zeros((graph.num_nodes, d)))
+        if groups is None
+        else _reduction(groups.group_of, groups.offsets)
+    )
     matrix = _operator(graph, bases) @ reduction
     c = reduction.T @ scale_functional(graph).ravel()
 
@@ -64,7 +73,7 @@ def solve_conic(
         cp.Minimize(graph.weights @ s),
         [fits, cp.SOC(s, z, axis=0), c @ t == graph.weights.sum()],
     )
-    iterations = _run(program, max(_TIGHTER * tol, _TIGHTEST), max_iterations)
+    iterations = _run(program, max(_CONE_TOL_PER_TOL * tol, _LEAST_CONE_TOL), max_iterations)
     if t.value is None or fits.dual_value is None:
         raise UnsolvableError(
             f"the conic solver stopped with status {program.status!r} and no answer; "
@@ -89,13 +98,14 @@ def _operator(graph: ViewGraph, bases: FloatArray) -> csr_array:
     return coo_array((values, (row, column)), shape=(m * k, graph.num_nodes * d)).tocsr()
 
 
-def _reduction(groups: RigidGroups) -> csr_array:
+def _reduction(group_of: IntArray, offsets: FloatArray) -> csr_array:
     """Return A without the columns of group 0, which is grounded, and without that of s if it is 0."""
-    n, d = groups.offsets.shape
+    n, d = offsets.shape
     rows = np.arange(n * d)
-    columns = (groups.group_of[:, None] * d + np.arange(d)).ravel()
-    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, groups.num_groups * d)).tocsc()[:, d:]
-    scaled = [csr_array(groups.offsets.reshape(-1, 1))] if groups.offsets.any() else []
+    columns = (group_of[:, None] * d + np.arange(d)).ravel()
+    width = (int(group_of.max()) + 1) * d
+    moving = coo_array((np.ones(n * d), (rows, columns)), shape=(n * d, width)).tocsc()[:, d:]
+    scaled = [csr_array(offsets.reshape(-1, 1))] if offsets.any() else []
     return csr_array(hstack([moving, *scaled]))
 
 
@@ -107,7 +117,7 @@ def _run(program: Any, tolerance: float, max_iterations: int) -> int:
     """
     import cvxpy as cp
 
-    for looser in _LOOSER:
+    for looser in _LOOSER_FACTORS:
         limits = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), looser * tolerance)
         with warnings.catch_warnings(), contextlib.suppress(cp.error.SolverError):
             warnings.filterwarnings("ignore", message="Solution may be inaccurate")

@@ -34,7 +34,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
 _LARGEST_RESIDUAL = 1e-9  # of the dual's equality: beyond it the bound is not to be called rigorous
-_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
+ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 
 # Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
 # whatever the graph, and beyond the second the dense one takes seconds.
@@ -90,14 +90,10 @@ def solve(
     start = time.perf_counter()
     _refuse_undetermined(graph)
     choice = choose_method(graph, options)
-    limit = options.max_iterations or _LIMITS[choice.method]
-    watch = _Watch(on_iteration, limit)
+    limit = options.max_iterations or ITERATION_LIMITS[choice.method]
+    watch = Watch(on_iteration, limit)
     run = choice.run(graph, options, limit, watch if on_iteration else None)
-    centred = run.locations - run.locations.mean(axis=0)
-    length = projected_length(graph, centred)
-    if not (np.isfinite(centred).all() and length > 0.0):
-        raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
-    locations = centred * (float(graph.weights.sum()) / length)
+    locations = scaled_locations(graph, run.locations)
     certificate = certify(
         graph,
         locations,
@@ -106,9 +102,35 @@ def solve(
         uniqueness=options.uniqueness,
         threads=options.threads,
     )
+    status = judge_status(certificate, options.tol, run.iterations >= limit, watch.cancelled)
+    return describe_run(run, choice, certificate, locations, status, start)
+
+
+def scaled_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:
+    """Return a solver's locations centred and in the program's scale.
+
+    Raises:
+        UnsolvableError: if they are not finite or point against the directions.
+    """
+    centred = locations - locations.mean(axis=0)
+    length = projected_length(graph, centred)
+    if not (np.isfinite(centred).all() and length > 0.0):
+        raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
+    return np.asarray(centred * (float(graph.weights.sum()) / length))
+
+
+def describe_run(
+    run: Run,
+    choice: Choice,
+    certificate: Certificate,
+    locations: FloatArray,
+    status: Status,
+    start: float,
+) -> SolverResult:
+    """Return the result of a run that began at `start`, by `time.perf_counter()`."""
     return SolverResult(
         locations=frozen(locations),
-        status=_status(certificate, options.tol, run.iterations >= limit, watch.cancelled),
+        status=status,
         objective=certificate.objective,
         dual_bound=certificate.dual_bound,
         dual=certificate.dual,
@@ -217,7 +239,7 @@ def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnI
     return Run(*solve_conic(graph, options.tol, limit))
 
 
-class _Watch:
+class Watch:
     """Passes iterations on to the user's callback, with their limit, and remembers whether it cancelled."""
 
     def __init__(self, on_iteration: OnIteration | None, limit: int) -> None:
@@ -226,6 +248,7 @@ class _Watch:
         self.cancelled = False
 
     def __call__(self, info: IterationInfo) -> bool:
+        """Pass one iteration on; return whether to go on."""
         if self._on_iteration is not None:
             answer = self._on_iteration(replace(info, limit=self._limit))
             self.cancelled = answer is not None and not answer
@@ -251,7 +274,8 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
 
 
-def _status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
+def judge_status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
+    """Return what a certified run amounts to."""
     if certificate.gap <= tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
         return Status.CONVERGED
     if cancelled:

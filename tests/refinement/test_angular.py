@@ -167,7 +167,7 @@ def test_a_camera_without_any_pull_is_held_where_it_was():
     plan = plan_refinement(graph)
     assert plan is not None
     factor = angular.allocate_factor(plan, 3)
-    moved = angular._step(graph, information, factor, angular._unit(far), angular._LEAST_DAMPING)[0]
+    moved = angular._step(graph, information, factor, angular._unit(far), angular.DAMPING.least)[0]
     assert np.linalg.norm(moved - angular._unit(far), axis=1)[3] < 0.2
 
 
@@ -191,7 +191,7 @@ def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_leng
     floor = angular._SHORTEST * np.median(np.linalg.norm(differences(t, graph.edges), axis=1))
     t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = angular._information(graph, None, np.full(graph.num_edges, 0.05))
-    _, _, per_edge = angular._linearised(graph, information, t, steep)
+    _, _, per_edge = angular._linearize(graph, information, t, steep)
     gradient = angular.adjoint(per_edge, graph.edges, 12)
     h = 1e-9
     for camera, axis in [(0, 0), (1, 2), (5, 1)]:

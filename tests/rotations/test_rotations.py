@@ -148,7 +148,7 @@ def one_heavy_wrong_pair():
 def test_a_single_pair_turns_no_camera_however_many_matches_it_has():
     matches, centers = one_heavy_wrong_pair()
     found = refine_rotations(matches, centers)
-    free = epipolar.minimised(
+    free = epipolar.minimize(
         matches,
         State(np.tile(np.eye(3), (N, 1, 1)), centers),
         8.0,

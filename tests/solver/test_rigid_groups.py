@@ -9,12 +9,13 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.placement.rigs import place_groups
 from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.newton.reduction import factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.rigs import certify_groups, largest_tied, lud_over_groups, solve_groups
-from sfm_shapefit.solver.rigs import newton as groups_newton
+from sfm_shapefit.solver.rigs import solve as groups_solve
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor, factor_pinned
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
@@ -114,7 +115,7 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     between = outer(graph, groups)[0]
     edges, v, n = between.edges, between.directions, graph.num_nodes
     unit = (
-        groups.normalised() if metric else RigidGroups(group_of=groups.group_of, offsets=0.0 * groups.offsets)
+        groups.normalize() if metric else RigidGroups(group_of=groups.group_of, offsets=0.0 * groups.offsets)
     )
     rng = np.random.default_rng(2)
     roots = rng.normal(size=(len(edges), 3, 3))
@@ -148,7 +149,7 @@ def test_a_scale_that_nothing_holds_is_refused():
     graph, groups, _ = rig_problem(13, frames=5, wrong=0.0)
     between = outer(graph, groups)[0]
     edges, v = between.edges, between.directions
-    factor = ReducedFactor(edges, groups.normalised())
+    factor = ReducedFactor(edges, groups.normalize())
     with pytest.raises(UnsolvableError, match="do not determine a scale"):  # all may grow along the solution
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
@@ -276,9 +277,9 @@ def test_what_is_not_certified_is_not_called_converged(monkeypatch):
     early = solve_groups(graph, groups, SolverOptions(max_iterations=2))
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
-    certify = groups_newton.certify_groups
+    certify = groups_solve.certify_groups
     monkeypatch.setattr(
-        groups_newton, "certify_groups", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
+        groups_solve, "certify_groups", lambda *a, **k: replace(certify(*a, **k), equality_residual=1e-8)
     )
     assert solve_groups(graph, groups).status is Status.INACCURATE
 

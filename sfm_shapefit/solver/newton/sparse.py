@@ -1,26 +1,24 @@
 """Newton cycles with a sparse block Cholesky factor of M, whose analysis is done once on the n cameras.
 
-Lifting by c c^T would fill the matrix. But M must be kept away from T: the objective is homogeneous, so
-M T tends to 0 with mu, whatever the data. Instead one pair is pinned: with q = D^T of v_e at that pair,
+Lifting by c c^T would fill the matrix; one pair is pinned instead, see `newton.reduction`. Over rigid groups
+a step of the unknowns is a step of their nodes, dT = A dx, and everything per pair (residuals, the
+linearization, the dual y+, the two step lengths) stays as it is. Only the equations for the step differ:
 
-    M' = M + tau q q^T,    M dT = M' dT - tau q <q, dT>,
-
-so that with a = M'^-1 c and p = M'^-1 q the step is lambda a + sigma p + M'^-1 (right-hand side), where
-lambda and sigma = tau <q, dT> solve the two equations <c, dT> = what is wanted, <q, dT> = sigma / tau.
-Translations are taken away by grounding one camera.
+    (A^T M A) dx = lambda+ A^T c - A^T D^T g,    <A^T c, dx> = 0
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor
+from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorisation
+from sfm_shapefit.solver.newton.reduction import NodeUnknowns, Reduction, System, factor_pinned
 from sfm_shapefit.solver.newton.steps import (
     EDGE_WORK,
     REFINEMENTS,
@@ -83,14 +81,33 @@ def solve_newton_sparse(
     Raises:
         UnsolvableError: if the directions do not determine any locations.
     """
-    problem, iterate, model, step = allocate(graph)
     if plan is None:
         neighbours = adjacency(graph.num_nodes, graph.edges)
         plan = plan_factorisation(neighbours, graph.edges, tree or best_order(neighbours))
-    factor = allocate_factor(plan, graph.dimension)
+    nodes = NodeUnknowns(allocate_factor(plan, graph.dimension))
+    return solve_newton_reduced(graph, nodes, tol, max_iterations, on_iteration, start)
+
+
+def solve_newton_reduced(
+    graph: ViewGraph,
+    reduction: Reduction,
+    tol: float,
+    max_iterations: int,
+    on_iteration: OnIteration | None = None,
+    start: tuple[FloatArray, FloatArray] | None = None,
+) -> tuple[FloatArray, FloatArray, int]:
+    """Solve the program over the unknowns of a reduction; see `solve_newton_sparse`.
+
+    Args:
+        graph: a connected view graph whose pairs determine the unknowns.
+        reduction: of its locations, with memory for the factor.
+        tol, max_iterations, on_iteration, start: as in `solve_newton_sparse`.
+    """
+    problem, iterate, model, step = allocate(graph)
     if start is None:
-        system = _factorise(problem, model, factor, int(np.argmax(problem.w)))
-        if system is None or not start_from(problem, system.solve(0.0 * problem.c, 1.0)[1], iterate):
+        system = _factorise(problem, model, reduction, int(np.argmax(problem.w)))
+        first = None if system is None else system.solve(0.0 * reduction.reduce(problem.c), 1.0)[1]
+        if first is None or not start_from(problem, reduction.expand(first), iterate):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
         progress = measured(problem, iterate)
     else:
@@ -98,7 +115,7 @@ def solve_newton_sparse(
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
         before = progress.gap
-        progress = _cycle(problem, iterate, model, factor, step, progress, tol)
+        progress = _cycle(problem, iterate, model, reduction, step, progress, tol)
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
         count += 1
         if is_cancelled(on_iteration, count, progress):
@@ -115,32 +132,11 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     return measured(problem, iterate)
 
 
-class System(NamedTuple):
-    """The bordered system after a factorisation."""
-
-    factor: CholeskyFactor
-    """Of M'."""
-    a: FloatArray
-    """(n, d), M'^-1 c."""
-    p: FloatArray
-    """(n, d), M'^-1 q."""
-    rows: FloatArray
-    """(2, n * d), c and q."""
-    matrix: FloatArray
-    """(2, 2), of the equations for lambda and sigma."""
-
-    def solve(self, rhs: FloatArray, length: float) -> tuple[float, FloatArray]:
-        """Return lambda and x with M x = lambda c + rhs, <c, x> = length."""
-        z = self.factor.solve(rhs)
-        unknown = np.linalg.solve(self.matrix, np.array([length, 0.0]) - self.rows @ z.ravel())
-        return float(unknown[0]), unknown[0] * self.a + unknown[1] * self.p + z
-
-
 def _cycle(
     problem: Problem,
     iterate: Iterate,
     model: Model,
-    factor: CholeskyFactor,
+    reduction: Reduction,
     step: Step,
     progress: Progress,
     tol: float,
@@ -152,10 +148,10 @@ def _cycle(
     linearise(problem, iterate, mu, model)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
-    system = _factorise(problem, model, factor, longest)
+    system = _factorise(problem, model, reduction, longest)
     if system is None:
         return ended(iterate, progress, mu, first)
-    edge_work = EDGE_WORK * len(problem.w)
+    factor, edge_work = reduction.factor, EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.panels.size
     work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
     for _ in range(STEPS_PER_FACTOR):
@@ -174,47 +170,41 @@ def _cycle(
 def _propose(
     problem: Problem, iterate: Iterate, model: Model, system: System, step: Step, mu: float, gap: float
 ) -> tuple[float, bool]:
-    """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
+    """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
 
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
-    c = problem.c
+    reduction = system.reduction
+    c = reduction.reduce(problem.c)
     allowed = allowed_violation(problem, gap)
     set_gradient(problem, iterate, model, mu, step)
-    drift = problem.kappa - dot(c, iterate.t)
-    multiplier, dt = system.solve(-step.nodes, drift)
-    extend_step(problem, model, dt, step)
+    drift = problem.kappa - dot(problem.c, iterate.t)
+    multiplier, dx = system.solve(-reduction.reduce(step.nodes), drift)
+    extend_step(problem, model, reduction.expand(dx), step)
     for _ in range(REFINEMENTS):
-        violation = multiplier * c - step.nodes
+        violation = multiplier * c - reduction.reduce(step.nodes)
         if np.abs(violation).max() <= allowed:
             return multiplier, True
-        shift, dt = system.solve(violation, drift - dot(c, step.t))
+        shift, dx = system.solve(violation, drift - dot(problem.c, step.t))
         multiplier += shift
-        extend_step(problem, model, dt, step)
-    return multiplier, bool(np.abs(multiplier * c - step.nodes).max() <= allowed)
+        extend_step(problem, model, reduction.expand(dx), step)
+    return multiplier, bool(np.abs(multiplier * c - reduction.reduce(step.nodes)).max() <= allowed)
 
 
-def _factorise(problem: Problem, model: Model, factor: CholeskyFactor, pinned: int) -> System | None:
-    """Factor M'; None if it is not positive definite."""
+def _factorise(problem: Problem, model: Model, reduction: Reduction, pinned: int) -> System | None:
+    """Factor M' of the unknowns, with more ridge if it is not positive definite; None if it never is."""
     m, d = problem.v.shape
-    v = problem.v[pinned]
+    v, (i, j) = problem.v[pinned], problem.edges[pinned].tolist()
     blocks = np.empty((m, d, d))
-    q = np.zeros_like(problem.c)
-    q[problem.edges[pinned, 0]], q[problem.edges[pinned, 1]] = v, -v
+    c = reduction.reduce(problem.c)
     stiffness = float(np.mean(problem.w * model.inverse))
     for ridge in _RIDGES:
         _set_blocks(problem, model, ridge, blocks)
         blocks[pinned] += stiffness * np.outer(v, v)
-        try:
-            factor.refactor(blocks)
-        except UnsolvableError:
-            continue
-        both = factor.solve(np.stack([problem.c, q], axis=2))  # one pass over the factor
-        a, p = np.ascontiguousarray(both[:, :, 0]), np.ascontiguousarray(both[:, :, 1])
-        rows = np.stack([problem.c.ravel(), q.ravel()])
-        matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / stiffness])
-        return System(factor, a, p, rows, matrix) if abs(np.linalg.det(matrix)) > 0.0 else None
+        system = factor_pinned(reduction, blocks, c, ((i, j), v), stiffness)
+        if system is not None:
+            return system
     return None
 
 

@@ -32,8 +32,8 @@ pairs take no part, and have dual 0.
 
 from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.newton import solve_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.solve import solve_groups
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 __all__ = ["ReducedFactor", "certify_groups", "largest_tied", "lud_over_groups", "solve_groups"]

@@ -9,9 +9,10 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.solver.certificate import Certificate
+from sfm_shapefit.solver.newton.reduction import System, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
 from sfm_shapefit.solver.rigs.groups import RigidGroups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor, System, factor_pinned
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.viewgraph import ViewGraph
 
 _OFF_GROUPS = 1e-9  # distance of locations from those of rigid groups, of their extent, that is rounding
@@ -55,7 +56,7 @@ def certify_groups(
     value = objective(between, locations - locations.mean(axis=0))
     if not value < np.inf:
         raise InputError("the locations point against the directions (L(T) <= 0); negate them or solve again")
-    unit = groups.normalised()
+    unit = groups.normalize()
     c = unit.reduce(scale_functional(between))
     ends = unit.group_of[edges]
     degree = float(np.bincount(ends.ravel(), weights=np.repeat(w, 2)).max())

@@ -105,7 +105,7 @@ class RigidGroups:
         moved[sizes <= _COINCIDENT * largest] = 0.0
         return RigidGroups(group_of=self.group_of, offsets=moved)
 
-    def normalised(self) -> "RigidGroups":
+    def normalize(self) -> "RigidGroups":
         """Return the same groups centred, in a unit in which offsets have root mean square 1 unless all are
         0."""
         centred = self.centred()

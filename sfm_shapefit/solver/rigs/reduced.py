@@ -8,13 +8,7 @@ Over x = (f, s) the matrix of edge blocks S_e is
 
 K is factored in d x d blocks, sparse as the graph of groups is; what remains for s is the Schur complement
 eta - h^T K^-1 h. Translations are taken away by grounding one group.
-
-Along the solution itself the matrix tends to singular, whatever the data. `System` therefore works with the
-matrix of S_e + tau v v^T for one pinned pair and takes that term away again, exactly, as `newton.sparse`
-does.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
@@ -33,28 +27,57 @@ class ReducedFactor:
     works with groups.
     """
 
-    def __init__(self, edges: IntArray, groups: RigidGroups) -> None:
+    def __init__(
+        self, edges: IntArray, groups: RigidGroups, *, threads: int = 1, max_bytes: int | None = None
+    ) -> None:
         """Plan the factorisation.
 
         Args:
             edges: (m, 2) pairs of nodes, each of two different groups, which they connect.
             groups: of the nodes; offsets best centred.
+            threads: of the factor; its answers do not depend on it.
+            max_bytes: what the factor may take; predicted before it is allocated.
+
+        Raises:
+            UnsolvableError: if the factor would take more than `max_bytes`.
         """
         self.groups = groups
         self._ends = np.ascontiguousarray(groups.group_of[edges])
         self._offsets = groups.offsets[edges[:, 0]] - groups.offsets[edges[:, 1]]
         self._metric = bool(self._offsets.any())
         dimension = groups.offsets.shape[1]
-        self.factor: CholeskyFactor = allocate_factor(analyse(groups.num_groups, self._ends), dimension)
+        plan = analyse(groups.num_groups, self._ends)
+        needed = plan.num_bytes(dimension, np.float64, threads)
+        if max_bytes is not None and needed > max_bytes:
+            raise UnsolvableError(
+                f"the factor over {groups.num_groups} groups takes {needed / 1e6:.0f} MB, and only "
+                f"{max_bytes / 1e6:.0f} MB are allowed; allow more memory for a factor"
+            )
+        self.factor: CholeskyFactor = allocate_factor(plan, dimension, threads=threads)
         self.smallest_pivot = 0.0
         """Least pivot relative to its diagonal entry, that of s included; see `refactor`."""
 
-    def refactor(self, blocks: FloatArray) -> None:
-        """Factor the matrix of the blocks (m, d, d).
+    @property
+    def num_nodes(self) -> int:
+        """Number of nodes, n."""
+        return self.groups.num_nodes
+
+    def expand(self, x: FloatArray, /) -> FloatArray:
+        """Return A x, (n, d)."""
+        return self.groups.expand(x)
+
+    def reduce(self, g: FloatArray, /) -> FloatArray:
+        """Return A^T g, (B d + 1,), for g (n, d)."""
+        return self.groups.reduce(g)
+
+    def refactor(self, weights: FloatArray, /) -> None:
+        """Factor the matrix of the blocks (m, d, d), or of weights (m,) times the identity.
 
         Raises:
             UnsolvableError: if it is not positive definite to working precision.
         """
+        d = self._offsets.shape[1]
+        blocks = weights if weights.ndim > 1 else weights[:, None, None] * np.eye(d)
         self.factor.refactor(blocks)
         self.smallest_pivot = self.factor.smallest_pivot
         bent = np.einsum("eab,eb->ea", blocks, self._offsets)
@@ -69,13 +92,17 @@ class ReducedFactor:
             raise UnsolvableError("the offsets inside the groups do not determine a scale")
         self.smallest_pivot = min(self.smallest_pivot, self._schur / eta)
 
-    def solve_reduced(self, right: FloatArray) -> FloatArray:
+    def solve_reduced(self, right: FloatArray, /) -> FloatArray:
         """Return the x (B d + 1,) with (A^T D^T S D A) x = right; s stays 0 without offsets."""
         z = self.factor.solve(right[:-1].reshape(self._row.shape))
         s = (right[-1] - float(np.vdot(self._row, z))) / self._schur
         return np.append((z - s * self._column).ravel(), s)
 
-    def solve(self, right: FloatArray) -> FloatArray:
+    def solve_two_reduced(self, first: FloatArray, second: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+        """Return x for two right-hand sides."""
+        return self.solve_reduced(first), self.solve_reduced(second)
+
+    def solve(self, right: FloatArray, /) -> FloatArray:
         """Return A x for the x of the right-hand side A^T right, both (n, d)."""
         return self.groups.expand(self.solve_reduced(self.groups.reduce(right)))
 
@@ -88,61 +115,3 @@ class ReducedFactor:
             for column in values.T
         ]
         return np.stack(sums, axis=1)
-
-
-class System(NamedTuple):
-    """The matrix M' = M + tau q q^T factored, and what answers M x = lambda c + g, <c, x> = given."""
-
-    factor: ReducedFactor
-    a: FloatArray
-    """(B d + 1,) M'^-1 c."""
-    p: FloatArray
-    """(B d + 1,) M'^-1 q."""
-    rows: FloatArray
-    """(2, B d + 1), c and q, reduced."""
-    matrix: FloatArray
-    """(2, 2), of the equations for lambda and sigma."""
-
-    def solve(self, right: FloatArray, length: float) -> tuple[float, FloatArray]:
-        """Return lambda and x with M x = lambda c + right, <c, x> = length."""
-        z = self.factor.solve_reduced(right)
-        unknown = np.linalg.solve(self.matrix, np.array([length, 0.0]) - self.rows @ z)
-        return float(unknown[0]), np.asarray(unknown[0] * self.a + unknown[1] * self.p + z)
-
-    def balance(self, total: FloatArray) -> tuple[float, FloatArray]:
-        """Return lambda and h with M h = total - lambda c, <q, h> = 0."""
-        z = self.factor.solve_reduced(total)
-        multiplier = float(self.rows[1] @ z) / float(self.rows[1] @ self.a)
-        return multiplier, np.asarray(z - multiplier * self.a)
-
-
-def factor_pinned(
-    factor: ReducedFactor,
-    blocks: FloatArray,
-    c: FloatArray,
-    pin: tuple[tuple[int, int], FloatArray],
-    stiffness: float,
-) -> System | None:
-    """Factor the matrix of the blocks with one pair pinned; None if it is not positive definite.
-
-    Args:
-        factor: overwritten.
-        blocks: (m, d, d) S_e, with tau v v^T added to the pinned pair's.
-        c: (B d + 1,) A^T D^T (w v).
-        pin: the nodes of the pinned pair, and its v.
-        stiffness: tau.
-    """
-    (i, j), v = pin
-    at_nodes = np.zeros((factor.groups.num_nodes, len(v)))
-    at_nodes[i], at_nodes[j] = v, -v
-    q = factor.groups.reduce(at_nodes)
-    try:
-        factor.refactor(blocks)
-    except UnsolvableError:
-        return None
-    a, p = factor.solve_reduced(c), factor.solve_reduced(q)
-    rows = np.stack([c, q])
-    matrix = rows @ np.stack([a, p], axis=1) - np.diag([0.0, 1.0 / stiffness])
-    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 0.0):
-        return None
-    return System(factor, a, p, rows, matrix)

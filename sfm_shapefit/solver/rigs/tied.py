@@ -73,7 +73,7 @@ def largest_tied(
 
 def general_positions(groups: RigidGroups) -> FloatArray:
     """Return random locations of the groups, at distances comparable to the size of their offsets."""
-    unit = groups.normalised()
+    unit = groups.normalize()
     x = np.random.default_rng(_SEED).standard_normal(unit.num_unknowns)
     x[-1] = 1.0
     return unit.expand(x)

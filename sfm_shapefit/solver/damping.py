@@ -1,0 +1,39 @@
+"""The damping of Levenberg and Marquardt: how far a least-squares step is held back, in one place.
+
+A step is tried with the damping that the last one left, and with ten times as much until it helps; one that
+helps leaves a tenth of its own.
+
+Source: Marquardt, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11 (1963).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
+
+Point = TypeVar("Point")
+
+
+class DampingRange(NamedTuple):
+    """What the damping may be, relative to what it multiplies."""
+
+    first: float = 1e-4
+    least: float = 1e-9
+    most: float = 1e2
+
+
+def take_damped_step(
+    propose: Callable[[float], Point | None], damping: float, limits: DampingRange
+) -> tuple[Point | None, float]:
+    """Return the first proposal that helps, and the damping for the next step.
+
+    Args:
+        propose: returns the point that a step of this damping leads to; None if its equations are singular,
+            or the cost there is not low enough.
+        damping: that of the first attempt.
+        limits: of the damping. Where none of these helps the answer is None and the first damping.
+    """
+    while damping <= limits.most:
+        proposed = propose(damping)
+        if proposed is not None:
+            return proposed, max(damping / 10.0, limits.least)
+        damping *= 10.0
+    return None, limits.first

@@ -1,0 +1,105 @@
+"""The entry to the solvers over rigid groups: choose a method, solve, certify."""
+
+import time
+from functools import partial
+
+import numpy as np
+
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
+from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
+from sfm_shapefit.solver.program import scale_functional
+from sfm_shapefit.solver.rigs.certificate import certify_groups
+from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.solve import (
+    ITERATION_LIMITS,
+    Choice,
+    Run,
+    Watch,
+    describe_run,
+    judge_status,
+    scaled_locations,
+)
+from sfm_shapefit.viewgraph import ViewGraph
+
+# A^T c counts as 0 below this size, relative to the sum of weights.
+_DIRECTIONS_CANCEL = 1e-12
+
+
+@one_blas_thread()  # more would split, and round, the sums of long vectors differently
+def solve_groups(
+    graph: ViewGraph,
+    groups: RigidGroups,
+    options: SolverOptions | None = None,
+    on_iteration: OnIteration | None = None,
+) -> SolverResult:
+    """Solve ShapeFit over groups, with a certificate.
+
+    Args:
+        graph: a view graph; pairs inside a group take no part.
+        groups: of its nodes, tied to one another by the pairs between them (`largest_tied`).
+        options: solver settings; the methods are "newton", which "auto" means, and "conic".
+        on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
+
+    Returns:
+        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group. The equality
+        that holds for it is the balance per group and that for the scale; `equality_residual` is its largest
+        violation.
+
+    Raises:
+        InputError: if a method is asked for that does not exist over groups.
+        UnsolvableError: if no pair joins two groups, the pairs do not determine the groups, or a factor over
+            the groups would take more than `options.factor_memory`.
+    """
+    options = options or SolverOptions()
+    start = time.perf_counter()
+    outer = groups.joins(graph.edges)
+    if not outer.any():
+        raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
+    between = ViewGraph(graph.num_nodes, graph.edges[outer], graph.directions[outer], graph.weights[outer])
+    unit = groups.normalize()
+    c = unit.reduce(scale_functional(between))
+    if not np.linalg.norm(c) > _DIRECTIONS_CANCEL * between.weights.sum():
+        raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
+    choice = _choose_method(unit, options)
+    limit = options.max_iterations or ITERATION_LIMITS[choice.method]
+    watch = Watch(on_iteration, limit)
+    run = choice.run(between, options, limit, watch if on_iteration else None)
+    locations = scaled_locations(between, run.locations)
+    dual = np.zeros_like(graph.directions)
+    dual[outer] = run.dual
+    certificate = certify_groups(graph, groups, locations, dual, uniqueness=options.uniqueness)
+    status = judge_status(certificate, options.tol, run.iterations >= limit, watch.cancelled)
+    return describe_run(run, choice, certificate, locations, status, start)
+
+
+def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
+    """Return the solver that is asked for, if it knows groups."""
+    if options.method == "admm":
+        raise InputError(
+            "method 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
+        )
+    reason = "asked for"
+    if options.method == "auto":
+        reason = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    if options.method == "conic":
+        return Choice("conic", partial(_run_conic, groups), reason)
+    return Choice("newton", partial(_run_newton, groups), reason)
+
+
+def _run_newton(
+    groups: RigidGroups, graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None
+) -> Run:
+    factor = ReducedFactor(
+        graph.edges, groups, threads=options.threads, max_bytes=options.factor_memory * 1_000_000
+    )
+    return Run(*solve_newton_reduced(graph, factor, options.tol, limit, watch))
+
+
+def _run_conic(
+    groups: RigidGroups, graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None
+) -> Run:
+    return Run(*solve_conic(graph, options.tol, limit, groups))
