@@ -46,7 +46,7 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorise
-from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, routine_addresses, work_integers
+from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency, apply_incidence_transposed
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
@@ -504,11 +504,10 @@ def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
     with one_blas_thread():
         if n * d >= _SINGLE_FROM:
             matrix = np.zeros((n * d) ** 2, np.float32)
-            lapack = routine_addresses(np.float32), FLAGS, work_integers()
-            if _least_pivot(graph.edges, blocks, diagonal, matrix, *lapack) > _REGULAR_SINGLE:
+            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float32)) > _REGULAR_SINGLE:
                 return True
-        lapack = routine_addresses(np.float64), FLAGS, work_integers()
-        return bool(_least_pivot(graph.edges, blocks, diagonal, np.zeros((n * d) ** 2), *lapack) > _REGULAR)
+        matrix = np.zeros((n * d) ** 2)
+        return bool(_least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float64)) > _REGULAR)
 
 
 @kernel(exact=True)
@@ -530,9 +529,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
 
 
 @kernel(exact=True)
-def _least_pivot(
-    edges: Any, blocks: Any, diagonal: Any, matrix: Any, routines: Any, flags: Any, integers: Any
-) -> float:
+def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any) -> float:
     """Factor the Laplacian of the blocks, its last node grounded; return the least pivot per diagonal entry.
 
     0 if a pivot is not positive. `matrix` is zero, column-major, and `diagonal` is scratch (n, d, d).
@@ -559,7 +556,7 @@ def _least_pivot(
         for k in range(d):
             for q in range(k, d):
                 matrix[(i * d + k) * order + i * d + q] = diagonal[i, k, q]
-    if potrf(routines, flags, integers, matrix, 0, order, order) != 0:
+    if potrf(blas, (matrix, 0, order), order) != 0:
         return 0.0
     least = np.inf
     for i in range(n):
