@@ -47,10 +47,10 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorise
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
-from sfm_shapefit.laplacian.operators import Workers, adjacency, apply_incidence_transposed
+from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
-from sfm_shapefit.solver.program import along, differences, objective
+from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -181,7 +181,7 @@ def _proved(
             return None
         allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
         worst = _restore_exactly(repair, c, t, degree * allowed)
-        total = apply_incidence_transposed(graph.edges, y, n)
+        total = adjoint(y, graph.edges, n)
     scale = 1.0 / max(1.0, worst)
     if scale < 1.0:
         with np.errstate(invalid="ignore"):  # sums that overflowed prove nothing below
@@ -325,7 +325,7 @@ def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: flo
 
 def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, FloatArray]:
     """Return lambda and D^T y - lambda c, (n, d)."""
-    total = apply_incidence_transposed(metric.edges, metric.y, len(c))
+    total = adjoint(metric.y, metric.edges, len(c))
     multiplier = _multiplier(total, c, t)
     return multiplier, total - multiplier * c
 
@@ -506,8 +506,8 @@ def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
             matrix = np.zeros((n * d) ** 2, np.float32)
             if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float32)) > _REGULAR_SINGLE:
                 return True
-        matrix = np.zeros((n * d) ** 2)
-        return bool(_least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float64)) > _REGULAR)
+        double, blas = np.zeros((n * d) ** 2), blas_of(np.float64)
+        return bool(_least_pivot(graph.edges, blocks, diagonal, double, blas) > _REGULAR)
 
 
 @kernel(exact=True)

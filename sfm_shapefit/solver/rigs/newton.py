@@ -75,7 +75,7 @@ def solve_groups(graph: ViewGraph, groups: RigidGroups, options: SolverOptions |
     outer = groups.joins(graph.edges)
     if not outer.any():
         raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
-    between = ViewGraph(graph.num_nodes, graph.edges[outer], graph.directions[outer], graph.weights[outer])
+    between = graph.subset(outer)
     limit = options.max_iterations or _MAX_ITERATIONS
     locations, dual, iterations = _solve(between, groups.normalised(), options.tol, limit)
     if not (np.isfinite(locations).all() and projected_length(between, locations) > 0.0):
