@@ -9,9 +9,21 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 
-_NUM_SAMPLES = 256  # where half of the points are good, 1 draw of 3 in 8 is: none in 256 has odds 1e-15
+SIGMA_PER_MEDIAN = 1.4826
+"""Standard deviation of a normal x over the median of |x|."""
+
+MEDIAN_NORMAL_LENGTH = 1.538
+"""Median length of a vector of three normal components of variance 1."""
+
+FLIP_YZ = np.diag([1.0, -1.0, -1.0])
+"""From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
+
+# Where half of the points are good, so is 1 draw of 3 in 8: none in 256 has odds 1e-15.
+_NUM_SAMPLES = 256
 _NUM_REFINED_SAMPLES = 4
-_ROUNDING = 1e-14  # of distances, as a share of the largest
+
+# Rounding of distances, as a share of the largest.
+_ROUNDING = 1e-14
 
 
 def normalized(vectors: FloatArray) -> FloatArray:
@@ -87,7 +99,7 @@ def fit_similarity(
     x, y = source - source_mean, target - target_mean
     spread = float(w @ np.sum(x * x, axis=1))
     cross = (w[:, None] * y).T @ x
-    rotation = _nearest_rotation(cross) if rotate else np.eye(source.shape[1])
+    rotation = nearest_rotations(cross) if rotate else np.eye(source.shape[1])
     scale = max(0.0, float(np.sum(rotation * cross)) / spread) if spread > 0.0 else 1.0
     return Similarity(
         scale=scale, rotation=rotation, translation=target_mean - scale * rotation @ source_mean
@@ -195,20 +207,20 @@ def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray
     candidates = np.random.default_rng(0).permutation(count)[:100]
     centre = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
     nearest = np.argsort(distances(centre), kind="stable")[: count // 2 + 1]
-    best = _nearest_rotation(rotations[nearest].sum(axis=0))
+    best = nearest_rotations(rotations[nearest].sum(axis=0))
     for _ in range(iterations):
         weights = floor / np.maximum(distances(best), floor)
-        candidate = _nearest_rotation(np.einsum("k,kij->ij", weights, rotations))
+        candidate = nearest_rotations(np.einsum("k,kij->ij", weights, rotations))
         if distances(candidate).sum() >= distances(best).sum() * (1.0 - 1e-12):
             break
         best = candidate
     return best
 
 
-def _nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """Return the rotation R that maximises trace(R^T matrix)."""
-    u, _, vt = np.linalg.svd(matrix)
-    flip = np.ones(len(matrix))
-    flip[-1] = np.sign(np.linalg.det(u) * np.linalg.det(vt)) or 1.0
-    rotation: FloatArray = (u * flip) @ vt
-    return rotation
+def nearest_rotations(matrices: FloatArray) -> FloatArray:
+    """Return the rotations R that maximize trace(R^T M) for matrices M, (..., d, d)."""
+    u, _, vt = np.linalg.svd(matrices)
+    flip = np.ones(matrices.shape[:-1])
+    flip[..., -1] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
+    rotations: FloatArray = (u * flip[..., None, :]) @ vt
+    return rotations

@@ -136,6 +136,14 @@ def array_address(array: Any) -> int:
     return address
 
 
+@kernel(exact=True)
+def mix_bits(z: Any) -> Any:
+    """Return a hash of 64 bits, uint64: the finalizer of splitmix64 (Steele, Lea, Flood 2014)."""
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return z ^ (z >> np.uint64(31))
+
+
 @lru_cache(maxsize=32)
 def _compiled_leaf(function: Callable[..., None], dtype: str, num_arrays: int) -> Any:
     """Compile a leaf for one type, or load it from the disk cache."""

@@ -32,11 +32,11 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.viewgraph import connected_components
 
 Part = TypeVar("Part")
 
@@ -182,7 +182,7 @@ def graph_typicality(num_cameras: int, edges: IntArray) -> Typicality:
     codegrees = int(shared.data.min()) if full else 0, int(shared.data.max(initial=0.0))
     lowest, highest = int(degrees.min()), int(degrees.max())
     return Typicality(
-        connected=int(connected_components(adjacency, directed=False)[0]) == 1,
+        connected=n > 0 and int(connected_components(n, edges).max()) == 0,
         degrees=(lowest, highest),
         codegrees=codegrees,
         p_low=max(highest / (2.0 * n), float(np.sqrt(codegrees[1] / (2.0 * n)))),

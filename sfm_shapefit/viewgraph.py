@@ -10,8 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse import coo_array, csgraph
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
@@ -88,10 +87,21 @@ class ViewGraph:
 
     def components(self) -> IntArray:
         """Return the connected component of each camera, shape (n,), numbered from 0 by first camera."""
-        i, j = self.edges.T
-        adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(self.num_nodes, self.num_nodes))
-        labels = connected_components(adjacency, directed=False)[1]
-        return np.asarray(labels, dtype=np.int64)
+        return connected_components(self.num_nodes, self.edges)
+
+    def name_of(self, node: int) -> str:
+        """Return the name of a node, or its number where the graph has no names."""
+        return str(node) if self.names is None else self.names[node]
+
+    def with_weights(self, weights: FloatArray) -> "ViewGraph":
+        """Return the graph with other weights, (m,)."""
+        return ViewGraph(self.num_nodes, self.edges, self.directions, weights, self.names)
+
+    def subset(self, rows: npt.NDArray[np.integer] | npt.NDArray[np.bool_]) -> "ViewGraph":
+        """Return the graph of the same nodes with the given edges, by index or by a mask (m,)."""
+        return ViewGraph(
+            self.num_nodes, self.edges[rows], self.directions[rows], self.weights[rows], self.names
+        )
 
     def restricted_to(self, edge_indices: npt.NDArray[np.integer]) -> tuple["ViewGraph", IntArray]:
         """Return the graph of the given edges and their cameras, renumbered.
@@ -112,6 +122,14 @@ class ViewGraph:
             names,
         )
         return graph, cameras.astype(np.int64)
+
+
+def connected_components(num_nodes: int, edges: IntArray) -> IntArray:
+    """Return the connected component of each of n nodes under edges (m, 2), numbered from 0 by first node."""
+    links = coo_array(
+        (np.ones(len(edges), np.int8), (edges[:, 0], edges[:, 1])), shape=(num_nodes, num_nodes)
+    )
+    return np.asarray(csgraph.connected_components(links, directed=False)[1], dtype=np.int64)
 
 
 def _checked_arrays(

@@ -14,6 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.operators import Int32Array, adjacency
 from sfm_shapefit.viewgraph import ViewGraph
 
 _AXES = 48
@@ -42,18 +43,25 @@ def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> Fl
     chosen = graph.directions[rng.integers(graph.num_edges, size=num_axes)]
     axes = normalized(chosen + _JITTER * rng.standard_normal(chosen.shape))
     scores = np.zeros(graph.num_edges)
+    arcs = adjacency(graph.num_nodes, graph.edges)
+    node = np.repeat(np.arange(graph.num_nodes), np.diff(arcs.pointers))
+    # The weight of an arc is positive where it leaves the node, that is, where the node comes first.
+    sign = np.where(graph.edges[arcs.edge_of, 0] == node, -1.0, 1.0)
     for axis in axes:
         ahead = graph.directions @ axis  # positive: camera i comes after camera j
-        place = _greedy_order(graph.num_nodes, graph.edges, ahead)
+        place = _greedy_order(arcs.pointers, arcs.neighbours, sign * ahead[arcs.edge_of])
         before = place[graph.edges[:, 0]] < place[graph.edges[:, 1]]
         scores += np.where(before == (ahead > 0.0), np.abs(ahead), 0.0)
     return scores / num_axes
 
 
 @kernel(exact=True)
-def _greedy_order(n: int, edges: IntArray, ahead: FloatArray) -> IntArray:
-    """Return the place (n,) of each camera in an order that most weight agrees with."""
-    start, other, weight = _arcs(n, edges, ahead)
+def _greedy_order(start: IntArray, other: Int32Array, weight: FloatArray) -> IntArray:
+    """Return the place (n,) of each camera in an order that most weight agrees with.
+
+    The arcs of each camera follow one another: where they start (n + 1,), their other end, and their weight.
+    """
+    n = len(start) - 1
     entering, leaving = np.zeros(n), np.zeros(n)
     for c in range(n):
         for k in range(start[c], start[c + 1]):
@@ -76,25 +84,3 @@ def _greedy_order(n: int, edges: IntArray, ahead: FloatArray) -> IntArray:
             else:
                 leaving[other[k]] += weight[k]
     return place
-
-
-@kernel(exact=True)
-def _arcs(n: int, edges: IntArray, ahead: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-    """Return the arcs of each camera, one camera after the other: start (n + 1,), other end, weight.
-
-    The weight is positive where the arc leaves the camera, that is, where the camera comes first.
-    """
-    start = np.zeros(n + 1, dtype=np.int64)
-    for e in range(len(edges)):
-        start[edges[e, 0] + 1] += 1
-        start[edges[e, 1] + 1] += 1
-    start = np.cumsum(start)
-    fill = start[:-1].copy()
-    other, weight = np.empty(2 * len(edges), dtype=np.int64), np.empty(2 * len(edges))
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        other[fill[i]], weight[fill[i]] = j, -ahead[e]
-        other[fill[j]], weight[fill[j]] = i, ahead[e]
-        fill[i] += 1
-        fill[j] += 1
-    return start, other, weight

@@ -12,8 +12,6 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
@@ -29,6 +27,7 @@ from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results import LocateResult
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.viewgraph import connected_components
 
 _DRAFT_WIDENING = 4.0  # of the reprojection limit: a draft is a few pixels off, and would lose long tracks
 _ALARMING_SHARE = 0.7  # of a model's pairs that agree with its rotations: castle-P30 0.97, lego100 0.89
@@ -194,9 +193,7 @@ class _Run:
 
 def _connected(num_images: int, pairs: IntArray) -> list[IntArray]:
     """Return the connected components, ascending, the largest first; single images are components too."""
-    ones = np.ones(len(pairs), dtype=np.int8)
-    graph = coo_array((ones, (pairs[:, 0], pairs[:, 1])), shape=(num_images, num_images))
-    labels = connected_components(graph.tocsr(), directed=False)[1]
+    labels = connected_components(num_images, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
 

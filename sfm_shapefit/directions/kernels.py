@@ -7,13 +7,13 @@ normals, the cross products in pixels. Lengths and residuals are in pixels.
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.jit import kernel
 
 MIN_MATCHES = 5  # two fix a direction; below this a robust fit means nothing
 MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual_px", "parallax_rad")
 """What is counted and measured of a pair, in this order."""
 
-_MEDIAN_TO_SIGMA = 1.4826  # of |x| for a normal x
 _MIN_NOISE_PX = 1e-3  # exact matches still get a finite information
 _WIDTH = 4.0  # of the kernel, in standard deviations of the noise: 95 % efficient, as simulated
 _MIN_WIDTH_PX = 0.5  # the width stays in this range: matches are never better, inliers never worse
@@ -201,7 +201,7 @@ def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tupl
     count = len(near)
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
-    noise_px = _MEDIAN_TO_SIGMA * np.median(np.abs(residuals[near])) * count / (count - 2.0)
+    noise_px = SIGMA_PER_MEDIAN * np.median(np.abs(residuals[near])) * count / (count - 2.0)
     noise_px = max(noise_px, _MIN_NOISE_PX)
     parallaxes, seen = np.empty(count), 0
     for row in range(count):

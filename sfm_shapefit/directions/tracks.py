@@ -14,14 +14,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions import PairDirections
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
 _PER_CAMERA = 20  # about 3 tracks started per camera, of 6 views each: what determines a straight road
 _IN_ALL, _PER_CAMERA_OF_FEW = 800, 60  # observations that a small scene can afford
@@ -147,10 +145,7 @@ def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
     `rays` are those of the observations, (2 k, 3) in all, in parts.
     """
     keys, first, index = np.unique(ends.ravel(), return_index=True, return_inverse=True)
-    index = index.reshape(-1, 2)
-    present = np.ones(len(index), dtype=np.int8)
-    links = coo_array((present, (index[:, 0], index[:, 1])), shape=(len(keys), len(keys)))
-    track = connected_components(links, directed=False)[1]  # numbered by first observation: keys are sorted
+    track = connected_components(len(keys), index.reshape(-1, 2))  # by first observation: keys are sorted
     camera = keys // _KEYPOINTS
     order = np.lexsort((camera, track))
     track, camera, seen = track[order], camera[order], first[order]

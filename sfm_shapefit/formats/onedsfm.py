@@ -32,13 +32,12 @@ from sfm_shapefit.formats.lines import (
     refuse,
     repeated,
 )
-from sfm_shapefit.geometry import normalized, rotation_angles_deg
+from sfm_shapefit.geometry import FLIP_YZ, nearest_rotations, normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
 _PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
 _ROTATION_TOLERANCE = 1e-3  # of R R^T and of |t|; the published files have six digits
-_FLIP = np.diag([1.0, -1.0, -1.0])
 """From Bundler's camera axes to COLMAP's, and back."""
 
 
@@ -123,8 +122,8 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
     found = EpipolarGeometries(
         names=tuple(names),
         pairs=pairs,
-        rotations=_FLIP @ _nearest_rotations(rotations).swapaxes(1, 2) @ _FLIP,
-        to_second=normalized(translations) @ _FLIP,
+        rotations=FLIP_YZ @ nearest_rotations(rotations).swapaxes(1, 2) @ FLIP_YZ,
+        to_second=normalized(translations) @ FLIP_YZ,
     )
     component = path / _COMPONENT_FILE
     return _restricted(found, component) if path.is_dir() and component.is_file() else found
@@ -151,7 +150,7 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
         raise InputError(f"{file} has a rotation of none of the {len(names)} cameras; check its ids")
     found, known = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros(len(names), dtype=np.bool_)
     where = [index[ids[k]] for k in inside]
-    found[where] = _FLIP @ _nearest_rotations(rotations[inside])
+    found[where] = FLIP_YZ @ nearest_rotations(rotations[inside])
     known[where] = True
     return found, known
 
@@ -167,14 +166,14 @@ def onedsfm_files(
         cameras: (k,) those that are placed, which alone stand in the last three files.
         locations: (k, 3) of these.
     """
-    relative = _FLIP @ found.rotations.swapaxes(1, 2) @ _FLIP
-    pair_rows = np.concatenate([relative.reshape(-1, 9), found.to_second @ _FLIP], axis=1)
+    relative = FLIP_YZ @ found.rotations.swapaxes(1, 2) @ FLIP_YZ
+    pair_rows = np.concatenate([relative.reshape(-1, 9), found.to_second @ FLIP_YZ], axis=1)
     ids = [f"{found.names[i]} {found.names[j]}" for i, j in found.pairs.tolist()]
     placed = [found.names[k] for k in cameras.tolist()]
     return {
         _PAIRS_FILE: _text(ids, pair_rows),
         _COMPONENT_FILE: "".join(f"{name}\n" for name in placed),
-        "rots.txt": _text(placed, (_FLIP @ rotations[cameras]).reshape(-1, 9)),
+        "rots.txt": _text(placed, (FLIP_YZ @ rotations[cameras]).reshape(-1, 9)),
         "soln.txt": _text(placed, locations),
     }
 
@@ -206,9 +205,3 @@ def _is_no_rotation(matrices: FloatArray) -> BoolArray:
         off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
         bad: BoolArray = ~((off <= _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0.0))
     return bad
-
-
-def _nearest_rotations(matrices: FloatArray) -> FloatArray:
-    """Return the rotations nearest to (k, 3, 3) matrices that are rotations but for rounding."""
-    u, _, vt = np.linalg.svd(matrices)
-    return np.asarray(u @ vt)

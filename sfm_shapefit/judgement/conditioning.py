@@ -16,12 +16,11 @@ import enum
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import median_spread, normalized
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.viewgraph import connected_components
 
 LOOSE_SHARE = 0.05
 """Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
@@ -131,9 +130,7 @@ def _narrowness(locations: FloatArray, edges: IntArray) -> FloatArray:
 
 def _groups(n: int, edges: IntArray, loose: BoolArray) -> IntArray:
     """Return the connected component of each node among the loose ones."""
-    i, j = edges[loose[edges].all(axis=1)].T
-    found = connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[1]
-    return np.asarray(found, dtype=np.int64)
+    return connected_components(n, edges[loose[edges].all(axis=1)])
 
 
 def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:

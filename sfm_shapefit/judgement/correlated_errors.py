@@ -20,7 +20,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import tangent_bases
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import kernel, mix_bits
 
 NUM_SAMPLES = 96
 """Standard deviations from so many samples are right to 7 %."""
@@ -141,11 +141,7 @@ def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -
 
 @kernel(exact=True)
 def _hash(image: int, keypoint: int, sample: int) -> Any:
-    """Return 64 random bits of a keypoint (the finaliser of SplitMix64: Steele et al. 2014)."""
+    """Return 64 random bits of a keypoint."""
     x = np.uint64(image) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(keypoint)
     x = x * np.uint64(0xD1B54A32D192ED03) + np.uint64(sample + 1) * np.uint64(0x9E3779B97F4A7C15)
-    for _ in range(2):
-        x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        x ^= x >> np.uint64(31)
-    return x
+    return mix_bits(mix_bits(x))

@@ -11,9 +11,8 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
-from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import selected_inverse
-from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 _RIDGE = 1e-12  # of each block's trace
@@ -88,6 +87,6 @@ def _with_fixed_mean(factor: CholeskyFactor, nodes: FloatArray, share: FloatArra
 def _moved(factor: CholeskyFactor, ends: IntArray, forces: FloatArray, share: FloatArray) -> FloatArray:
     """Return S K^-1 D^T f for each of the samples in the forces f (m, d, s), shape (B, d, s)."""
     count, d = len(share), forces.shape[1]
-    flat = apply_incidence_transposed(ends, np.ascontiguousarray(forces.reshape(len(ends), -1)), count)
+    flat = adjoint(np.ascontiguousarray(forces.reshape(len(ends), -1)), ends, count)
     moved = factor.solve(np.ascontiguousarray(flat.reshape(count, d, -1)))
     return np.asarray(moved - np.einsum("n,nas->as", share, moved))

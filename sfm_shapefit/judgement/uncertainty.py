@@ -35,10 +35,9 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
-from sfm_shapefit.laplacian.operators import apply_incidence_transposed
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
-from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.program import adjoint, differences
 
 _RIDGES = (1e-12, 1e-10, 1e-8)  # of each block's trace: what nothing holds becomes large, not singular
 _LOOSE = 0.2  # standard deviation, in spreads, from which a camera may not decide the gauge
@@ -127,7 +126,7 @@ def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray]
     for part in errors:
         stop = start + len(part)
         forces = pulls[start:stop] @ part.transpose(0, 2, 1)
-        flat = apply_incidence_transposed(edges[start:stop], forces.reshape(len(part), -1), n)
+        flat = adjoint(forces.reshape(len(part), -1), edges[start:stop], n)
         total = total + flat.reshape(n, *forces.shape[1:])
         start = stop
     return total

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
 _DIVERGED = 1e6  # times the least residual so far: rounding leads, and no longer the system
@@ -77,14 +77,6 @@ class ApproximateCholesky:
         return out
 
 
-def jacobi(graph: Adjacency, weights: FloatArray) -> JacobiPreconditioner:
-    """Return the Jacobi preconditioner of the graph Laplacian with edge weights (m,)."""
-    owner = np.repeat(np.arange(graph.num_nodes), np.diff(graph.pointers))
-    degree: FloatArray = np.zeros(graph.num_nodes)
-    degree += np.bincount(owner, weights=weights[graph.edge_of], minlength=graph.num_nodes)
-    return JacobiPreconditioner(frozen(degree))
-
-
 def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> ApproximateCholesky:
     """Return a sampled Cholesky factor of the graph Laplacian.
 
@@ -107,13 +99,9 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
 
 @kernel(exact=True)
 def _uniform(state: Any) -> float:
-    """Return the next draw from [0, 1) (splitmix64: Steele, Lea, Flood 2014)."""
+    """Return the next draw from [0, 1), by splitmix64."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
-    z = state[0]
-    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    z = z ^ (z >> np.uint64(31))
-    return (z >> np.uint64(11)) * (1.0 / 9007199254740992.0)  # type: ignore[no-any-return]
+    return (mix_bits(state[0]) >> np.uint64(11)) * (1.0 / 9007199254740992.0)  # type: ignore[no-any-return]
 
 
 @kernel(exact=True)

@@ -24,7 +24,7 @@ ratio, `smallest_pivot`, is of the order of the rounding unit where the graph is
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -32,26 +32,46 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
-from sfm_shapefit.laplacian.dense import (
-    FLAGS,
-    one_blas_thread,
-    potrf,
-    routine_addresses,
-    syrk,
-    trsm,
-    work_integers,
-    work_scalars,
-)
-from sfm_shapefit.laplacian.operators import Workers, adjacency, checked_edges
+from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
+from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, checked_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
 
 PIVOT_TOLERANCE = 64.0
 """Pivots below this many rounding units of their diagonal entry count as zero."""
 
-_GEMM = 3  # its place in the table of `routine_addresses`
-_STRIP = 256  # columns of a front that are factored at a time
-_LARGE_FRONT = 768  # rows from which a front above the tasks is factored by strips
+# A front above the tasks of so many rows or more is factored by strips of so many columns.
+_LARGE_FRONT, _STRIP = 768, 256
+
+
+class _Panels(NamedTuple):
+    """The panels as the kernels take them: the parts of the plan that say where each is, and the numbers."""
+
+    b: int
+    first: IntArray
+    row_pointers: IntArray
+    rows: Int32Array
+    pointers: IntArray
+    entries: npt.NDArray[Any]
+
+
+class _Parts(NamedTuple):
+    """What fronts are assembled from: children's updates by the plan, edges by their slots, the diagonal."""
+
+    relative: Int32Array
+    child_pointers: IntArray
+    children: IntArray
+    update_offsets: IntArray
+    edge_pointers: IntArray
+    edge_index: Int32Array
+    edge_row: Int32Array
+    edge_column: Int32Array
+    weights: FloatArray
+    """(m, b^2)"""
+    diagonal: FloatArray
+    """(n, b^2) in elimination order."""
+    stack: npt.NDArray[Any]
+    """Update matrices that wait for their parents, arenas behind them."""
 
 
 @dataclass(slots=True, eq=False)
@@ -166,13 +186,13 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
         raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
     w = np.ascontiguousarray(weights, dtype=np.float64).reshape(plan.num_edges, b * b)
     diagonal = factor._diagonal
-    _sum_at_nodes(plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
-                  plan.first, plan.row_pointers, plan.rows, w, diagonal)  # fmt: skip
+    panels, parts = _panels(factor), _parts(factor, w)
+    _sum_at_nodes(panels, parts)
     traces = diagonal[:, :: b + 1]
     grounding = float(traces.mean()) if ground is None else ground
     traces[-1] += grounding
     with one_blas_thread():
-        failed, pivot = _factor_all(factor, w)
+        failed, pivot = _factor_all(factor, panels, parts)
     factor.smallest_pivot = float(pivot[0])
     factor.weakest_node = int(plan.permutation[int(pivot[1]) // b])
     if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(factor.dtype).eps:
@@ -182,11 +202,26 @@ def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None)
         )
 
 
-def _factor_all(factor: CholeskyFactor, w: FloatArray) -> tuple[bool, FloatArray]:
-    """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
-    plan, area = factor.symbolic, factor.block**2
+def _panels(factor: CholeskyFactor) -> _Panels:
+    plan = factor.symbolic
+    return _Panels(factor.block, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels)
+
+
+def _parts(factor: CholeskyFactor, weights: FloatArray) -> _Parts:
+    plan = factor.symbolic
     arenas = min(factor.workers.threads, len(plan.tasks))
-    stack = np.empty((plan.stack_size + arenas * plan.arena_size) * area, dtype=factor.dtype)
+    stack_size = (plan.stack_size + arenas * plan.arena_size) * factor.block**2
+    return _Parts(
+        plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
+        plan.edge_index, plan.edge_row, plan.edge_column, weights, factor._diagonal,
+        np.empty(stack_size, dtype=factor.dtype),
+    )  # fmt: skip
+
+
+def _factor_all(factor: CholeskyFactor, panels: _Panels, parts: _Parts) -> tuple[bool, FloatArray]:
+    """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
+    plan = factor.symbolic
+    arenas = min(factor.workers.threads, len(plan.tasks))
     free = SimpleQueue[int]()
     for k in range(arenas):
         free.put(plan.stack_size + k * plan.arena_size)
@@ -198,7 +233,7 @@ def _factor_all(factor: CholeskyFactor, w: FloatArray) -> tuple[bool, FloatArray
             begin, end = plan.tasks[k]
             arena = free.get()
             try:
-                failed[k] = _run(factor, w, begin, end, stack, arena, pivots[k])
+                failed[k] = _factorise(begin, end, panels, parts, arena, pivots[k], blas_of(factor.dtype))
             finally:
                 free.put(arena)
 
@@ -209,29 +244,14 @@ def _factor_all(factor: CholeskyFactor, w: FloatArray) -> tuple[bool, FloatArray
         ready = int(np.searchsorted(plan.tasks[:, 0], begin))
         factor.workers.run([task(k) for k in range(done, ready)])
         done = ready
-        failed[-1] = failed.any() or _factor_above(factor, w, begin, end, stack, pivots[-1])
+        failed[-1] = failed.any() or _factor_above(factor, panels, parts, begin, end, pivots[-1])
         if failed[-1]:
             break
     return bool(failed.any()), pivots[np.argmin(pivots[:, 0])]
 
 
-def _run(
-    factor: CholeskyFactor, w: FloatArray, begin: int, end: int, stack: Any, arena: int, pivot: Any
-) -> bool:
-    """Call the kernel on the supernodes begin..end-1 with everything that it needs."""
-    plan, b, diagonal = factor.symbolic, factor.block, factor._diagonal
-    failed: bool = _factorise(
-        begin, end, b, plan.first, plan.row_pointers, plan.relative,
-        plan.panel_pointers, plan.child_pointers, plan.children, plan.update_offsets, arena,
-        plan.edge_pointers, plan.edge_index, plan.edge_row, plan.edge_column,
-        w, diagonal, factor.panels, stack, pivot,
-        routine_addresses(factor.dtype), FLAGS, work_integers(), work_scalars(factor.dtype),
-    )  # fmt: skip
-    return failed
-
-
 def _factor_above(
-    factor: CholeskyFactor, w: FloatArray, begin: int, end: int, stack: Any, pivot: Any
+    factor: CholeskyFactor, panels: _Panels, parts: _Parts, begin: int, end: int, pivot: Any
 ) -> bool:
     """Factor a run of supernodes above the tasks: the large ones by strips, the others as in a task."""
     plan = factor.symbolic
@@ -239,86 +259,67 @@ def _factor_above(
     large = np.flatnonzero(heights * factor.block >= _LARGE_FRONT) + begin
     at = begin
     for s in [*large.tolist(), end]:
-        if at < s and _run(factor, w, at, s, stack, 0, pivot):
+        if at < s and _factorise(at, s, panels, parts, 0, pivot, blas_of(factor.dtype)):
             return True
-        if s < end and _factor_large(factor, w, s, stack, pivot):
+        if s < end and _factor_large(factor, panels, parts, s, pivot):
             return True
         at = s + 1
     return False
 
 
-def _factor_large(factor: CholeskyFactor, w: FloatArray, s: int, stack: Any, pivot: Any) -> bool:
+def _factor_large(factor: CholeskyFactor, panels: _Panels, parts: _Parts, s: int, pivot: Any) -> bool:
     """Factor one front by strips of columns, each strip's update of the rest as parallel jobs."""
-    plan, b, panels = factor.symbolic, factor.block, factor.panels
+    plan, b, workers = factor.symbolic, factor.block, factor.workers
     width = int(plan.first[s + 1] - plan.first[s]) * b
     height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
     offset, update = int(plan.panel_pointers[s]) * b * b, int(plan.update_offsets[s]) * b * b
     below = height - width
-    routines, scalars = routine_addresses(factor.dtype), work_scalars(factor.dtype)
-    _assemble_front(
-        s, b, plan.first, plan.row_pointers, plan.relative, plan.panel_pointers, plan.child_pointers,
-        plan.children, plan.update_offsets, plan.edge_pointers, plan.edge_index, plan.edge_row,
-        plan.edge_column, w, factor._diagonal, panels, stack,
-    )  # fmt: skip
+    _assemble_front(s, panels, parts, 0)
+
+    def block(row: int, column: int) -> tuple[Any, int, int]:
+        return factor.panels, offset + column * height + row, height
 
     def divide(j: int, end: int, row: int) -> Callable[[], object]:
-        return lambda: trsm(
-            routines, FLAGS, work_integers(), scalars, panels, offset + j * (height + 1),
-            offset + j * height + row, min(_STRIP, height - row), end - j, height,
-        )  # fmt: skip
+        rows = min(_STRIP, height - row)
+        return lambda: trsm(blas_of(factor.dtype), block(j, j), block(row, j), rows, end - j)
 
     def subtract(j: int, end: int, row: int, last: int) -> Callable[[], object]:
-        return lambda: _subtract_strip(
-            routines, FLAGS, work_integers(), scalars, panels, offset + j * height + row, height,
-            height - row, last - row, end - j, panels, offset + row * (height + 1), height, True,
-        )  # fmt: skip
+        shape = height - row, last - row, end - j
+        return lambda: _subtract_strip(blas_of(factor.dtype), block(row, j), shape, block(row, row), True)
 
     def leave(row: int) -> Callable[[], object]:
-        return lambda: _subtract_strip(
-            routines, FLAGS, work_integers(), scalars, panels, offset + width + row, height,
-            below - row, min(_STRIP, below - row), width, stack, update + row * (below + 1), below, False,
-        )  # fmt: skip
+        shape = below - row, min(_STRIP, below - row), width
+        target = parts.stack, update + row * (below + 1), below
+        return lambda: _subtract_strip(blas_of(factor.dtype), block(width + row, 0), shape, target, False)
 
     for j in range(0, width, _STRIP):
         end = min(j + _STRIP, width)
-        info = potrf(routines, FLAGS, work_integers(), panels, offset + j * (height + 1), end - j, height)
+        info = potrf(blas_of(factor.dtype), block(j, j), end - j)
         if info != 0:
             pivot[:] = 0.0, plan.first[s] * b + j + info - 1
             return True
-        factor.workers.run([divide(j, end, row) for row in range(end, height, _STRIP)])
+        workers.run([divide(j, end, row) for row in range(end, height, _STRIP)])
         rows = range(end, width, _STRIP)
-        factor.workers.run([subtract(j, end, row, min(row + _STRIP, width)) for row in rows])
-    panel = panels[offset : offset + width * height]
-    _check_pivots(panel, height, width, b, int(plan.first[s]), factor._diagonal, pivot)
-    factor.workers.run([leave(row) for row in range(0, below, _STRIP)])
-    _pass_on(
-        s, b, plan.first, plan.row_pointers, plan.relative, plan.child_pointers, plan.children,
-        plan.update_offsets, 0, stack, update,
-    )  # fmt: skip
+        workers.run([subtract(j, end, row, min(row + _STRIP, width)) for row in rows])
+    _check_pivots(s, panels, parts, pivot)
+    workers.run([leave(row) for row in range(0, below, _STRIP)])
+    _pass_on(s, panels, parts, 0, update)
     return False
 
 
 @kernel(exact=True)
-def _sum_at_nodes(
-    edge_pointers: Any,
-    edge_index: Any,
-    edge_row: Any,
-    edge_column: Any,
-    first: Any,
-    row_pointers: Any,
-    rows: Any,
-    weights: Any,
-    diagonal: Any,
-) -> None:
+def _sum_at_nodes(panels: Any, parts: Any) -> None:
     """Write the diagonal blocks of the Laplacian, in elimination order: sums over incident edges."""
+    first, row_pointers, rows = panels.first, panels.row_pointers, panels.rows
+    begin, index, row, column = parts.edge_pointers, parts.edge_index, parts.edge_row, parts.edge_column
+    weights, diagonal = parts.weights, parts.diagonal
     diagonal[:] = 0.0
     for s in range(len(first) - 1):
         start, width = first[s], first[s + 1] - first[s]
-        for k in range(edge_pointers[s], edge_pointers[s + 1]):
-            position = edge_row[k]
-            i = start + edge_column[k]
-            j = start + position if position < width else rows[row_pointers[s] + position - width]
-            e = edge_index[k]
+        for k in range(begin[s], begin[s + 1]):
+            i = start + column[k]
+            j = start + row[k] if row[k] < width else rows[row_pointers[s] + row[k] - width]
+            e = index[k]
             for a in range(weights.shape[1]):
                 w = weights[e, a]
                 diagonal[i, a] += w
@@ -326,147 +327,90 @@ def _sum_at_nodes(
 
 
 @kernel(exact=True)
-def _factorise(
-    begin: int, end: int, b: int, first: Any, row_pointers: Any, relative: Any,
-    panel_pointers: Any, child_pointers: Any, children: Any, update_offsets: Any, arena: int,
-    edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
-    weights: Any, diagonal: Any, panels: Any, stack: Any, pivot: Any,
-    routines: Any, flags: Any, integers: Any, scalars: Any,
-) -> bool:  # fmt: skip
+def _factorise(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot: Any, blas: Any) -> bool:
     """Factor the supernodes begin..end-1; return True if a pivot was not positive.
 
     A task has its updates in its arena, all but the root's; above the tasks, `arena` is 0. `pivot` is lowered
     to the least relative pivot and the row it stands in.
     """
+    b = panels.b
     for s in range(begin, end):
-        start, width = first[s], (first[s + 1] - first[s]) * b
-        below = (row_pointers[s + 1] - row_pointers[s]) * b
+        width = (panels.first[s + 1] - panels.first[s]) * b
+        below = (panels.row_pointers[s + 1] - panels.row_pointers[s]) * b
         height = width + below
-        offset = panel_pointers[s] * b * b
-        panel = panels[offset : offset + width * height]
-        _assemble_front(
-            s, b, first, row_pointers, relative, panel_pointers, child_pointers, children,
-            update_offsets, edge_pointers, edge_index, edge_row, edge_column, weights, diagonal, panels,
-            stack[arena * b * b :],
-        )  # fmt: skip
-        info = potrf(routines, flags, integers, panels, offset, width, height)
+        offset = panels.pointers[s] * b * b
+        _assemble_front(s, panels, parts, arena)
+        square = (panels.entries, offset, height)
+        info = potrf(blas, square, width)
         if info != 0:
             pivot[0] = 0.0
-            pivot[1] = start * b + info - 1
+            pivot[1] = panels.first[s] * b + info - 1
             return True
-        _check_pivots(panel, height, width, b, start, diagonal, pivot)
+        _check_pivots(s, panels, parts, pivot)
         if below == 0:
             continue
-        trsm(routines, flags, integers, scalars, panels, offset, offset + width, below, width, height)
-        update = (update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
-        syrk(
-            routines, flags, integers, scalars, panels, offset + width, height, below, width,
-            stack, update, below, False,
-        )  # fmt: skip
-        _pass_on(
-            s,
-            b,
-            first,
-            row_pointers,
-            relative,
-            child_pointers,
-            children,
-            update_offsets,
-            arena,
-            stack,
-            update,
-        )
+        rest = (panels.entries, offset + width, height)
+        trsm(blas, square, rest, below, width)
+        update = (parts.update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
+        syrk(blas, rest, below, width, (parts.stack, update, below), False)
+        _pass_on(s, panels, parts, arena, update)
     return False
 
 
 @kernel(exact=True)
-def _assemble_front(
-    s: int, b: int, first: Any, row_pointers: Any, relative: Any, panel_pointers: Any, child_pointers: Any,
-    children: Any, update_offsets: Any, edge_pointers: Any, edge_index: Any, edge_row: Any, edge_column: Any,
-    weights: Any, diagonal: Any, panels: Any, stack: Any,
-) -> None:  # fmt: skip
+def _assemble_front(s: int, panels: Any, parts: Any, arena: int) -> None:
     """Write the panel of a supernode before it is factored: edges, diagonal, children's updates."""
-    width = (first[s + 1] - first[s]) * b
+    b, row_pointers = panels.b, panels.row_pointers
+    width = (panels.first[s + 1] - panels.first[s]) * b
     height = width + (row_pointers[s + 1] - row_pointers[s]) * b
-    offset = panel_pointers[s] * b * b
-    panel = panels[offset : offset + width * height]
+    offset = panels.pointers[s] * b * b
+    panel = panels.entries[offset : offset + width * height]
     panel[:] = 0.0
-    _assemble_edges(
-        panel, height, b, edge_pointers[s], edge_pointers[s + 1], edge_index, edge_row, edge_column, weights
-    )
-    _assemble_diagonal(panel, height, b, first[s], first[s + 1], diagonal)
-    for c in range(child_pointers[s], child_pointers[s + 1]):
+    _assemble_edges(panel, height, b, s, parts)
+    _assemble_diagonal(panel, height, b, panels.first[s], panels.first[s + 1], parts.diagonal)
+    children, relative, offsets, stack = parts.children, parts.relative, parts.update_offsets, parts.stack
+    for c in range(parts.child_pointers[s], parts.child_pointers[s + 1]):
         child = children[c]
         there = relative[row_pointers[child] : row_pointers[child + 1]]
         size = len(there) * b
-        update = stack[update_offsets[child] * b * b :][: size * size]
+        update = stack[(offsets[child] + arena) * b * b :][: size * size]
         _add_update(update, there, b, 0, width // b, panel, height)
 
 
 @kernel(exact=True)
-def _pass_on(
-    s: int, b: int, first: Any, row_pointers: Any, relative: Any, child_pointers: Any, children: Any,
-    update_offsets: Any, arena: int, stack: Any, update: int,
-) -> None:  # fmt: skip
+def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
     """Add what the children leave for later fronts to the update of s, which starts at `update`."""
-    width = first[s + 1] - first[s]
+    b, row_pointers = panels.b, panels.row_pointers
+    width = panels.first[s + 1] - panels.first[s]
     below = row_pointers[s + 1] - row_pointers[s]
+    children, relative, offsets, stack = parts.children, parts.relative, parts.update_offsets, parts.stack
     mine = stack[update : update + (below * b) ** 2]
-    for c in range(child_pointers[s], child_pointers[s + 1]):
+    for c in range(parts.child_pointers[s], parts.child_pointers[s + 1]):
         child = children[c]
         there = relative[row_pointers[child] : row_pointers[child + 1]]
         size = len(there) * b
-        theirs = stack[(update_offsets[child] + arena) * b * b :][: size * size]
+        theirs = stack[(offsets[child] + arena) * b * b :][: size * size]
         _add_update(theirs, there, b, width, width + below, mine, below * b)
 
 
 @kernel(exact=True)
-def _subtract_strip(
-    routines: Any, flags: Any, integers: Any, scalars: Any, a: Any, offset: int, leading: int, rows: int,
-    strip: int, columns: int, c: Any, offset_c: int, leading_c: int, accumulate: bool,
-) -> None:  # fmt: skip
-    """Subtract a a^T from the first `strip` columns of the lower triangle of c, or store -a a^T there.
+def _subtract_strip(blas: Any, a: Any, shape: Any, c: Any, accumulate: bool) -> None:
+    """Subtract a a^T from the first columns of the lower triangle of the block c, or store -a a^T there.
 
-    `a` has so many rows and columns; its first `strip` rows belong to the strip's own columns.
+    `shape` holds the rows of `a`, how many of them, the first, belong to these columns of c, and its columns.
     """
-    syrk(
-        routines, flags, integers, scalars, a, offset, leading, strip, columns, c, offset_c, leading_c,
-        accumulate,
-    )  # fmt: skip
+    rows, strip, columns = shape
+    syrk(blas, a, strip, columns, c, accumulate)
     if rows > strip:
-        _multiply(
-            routines, flags, integers, scalars, a, offset + strip, offset, leading, rows - strip, strip,
-            columns, c, offset_c + strip, leading_c, accumulate,
-        )  # fmt: skip
+        lower = (a[0], a[1] + strip, a[2])
+        gemm(blas, lower, a, (rows - strip, strip, columns), (c[0], c[1] + strip, c[2]), accumulate)
 
 
 @kernel(exact=True)
-def _multiply(
-    routines: Any, flags: Any, integers: Any, scalars: Any, a: Any, left: int, right: int, leading: int,
-    rows: int, columns: int, depth: int, c: Any, offset_c: int, leading_c: int, accumulate: bool,
-) -> None:  # fmt: skip
-    """Subtract the product of two blocks of a, left right^T, from a block of c, or store it negated."""
-    integers[0] = rows
-    integers[1] = columns
-    integers[2] = depth
-    integers[3] = leading
-    integers[4] = leading_c
-    text, ints, one = array_address(flags), array_address(integers), array_address(scalars)
-    size = a.itemsize
-    beta = one if accumulate else one + 2 * size
-    pointers = (
-        text + 3, text + 2, ints, ints + 4, ints + 8, one + size, array_address(a) + left * size, ints + 12,
-        array_address(a) + right * size, ints + 12, beta, array_address(c) + offset_c * size, ints + 16,
-    )  # fmt: skip
-    call_address(routines[_GEMM], pointers)
-
-
-@kernel(exact=True)
-def _assemble_edges(
-    panel: Any, height: int, b: int, begin: int, end: int, index: Any, row: Any, column: Any, weights: Any
-) -> None:
-    """Subtract the edges' weights from a panel at their slots."""
-    for k in range(begin, end):
+def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None:
+    """Subtract the edges' weights from the panel of a supernode at their slots."""
+    index, row, column, weights = parts.edge_index, parts.edge_row, parts.edge_column, parts.weights
+    for k in range(parts.edge_pointers[s], parts.edge_pointers[s + 1]):
         e = index[k]
         for c in range(b):
             at = (column[k] * b + c) * height + row[k] * b
@@ -485,8 +429,12 @@ def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, d
 
 
 @kernel(exact=True)
-def _check_pivots(panel: Any, height: int, width: int, b: int, start: int, diagonal: Any, pivot: Any) -> None:
+def _check_pivots(s: int, panels: Any, parts: Any, pivot: Any) -> None:
     """Lower pivot[0] to the least ratio of a squared pivot to its diagonal entry, and note its row."""
+    b, start = panels.b, panels.first[s]
+    width = (panels.first[s + 1] - start) * b
+    height = width + (panels.row_pointers[s + 1] - panels.row_pointers[s]) * b
+    panel, diagonal = panels.entries[panels.pointers[s] * b * b :], parts.diagonal
     for k in range(width):
         root = panel[k * height + k]
         ratio = root * root / diagonal[start + k // b, (k % b) * (b + 1)]

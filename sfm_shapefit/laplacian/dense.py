@@ -1,9 +1,8 @@
 """Dense Cholesky steps inside kernels: BLAS and LAPACK through scipy's exported C functions.
 
-All matrices are column-major blocks inside a flat array: (array, offset, leading dimension), and only
-lower triangles are read or written. float32 and float64 share one code: a kernel is handed the
-`routine_addresses` of its type. Addresses are arguments, so the compiled kernels stay cached on disk
-(`sfm_shapefit.jit`).
+All matrices are column-major blocks inside a flat array, tuples (array, offset, leading dimension), and only
+lower triangles are read or written. float32 and float64 share one code: a kernel is handed the `blas_of` its
+type. Addresses are arguments, so the compiled kernels stay cached on disk (`sfm_shapefit.jit`).
 
 BLAS with two threads splits, and hence rounds, differently from BLAS with one. `one_blas_thread` holds it to
 one, so that results do not depend on the number of cores.
@@ -13,7 +12,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +23,11 @@ from sfm_shapefit.jit import array_address, call_address, function_address, kern
 
 _POTRF, _TRSM, _SYRK, _GEMM, _TRSV = range(5)
 
-FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
-"""Character arguments of the Fortran routines, in one array: "L", "R", "T", "N"."""
+_FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
 
-
+# One entry per thread of Python inside `one_blas_thread`; the first holds the limit.
+_limits: list[Any] = []
 _lock = threading.Lock()
-_limits: list[Any] = []  # one entry per thread of Python inside `one_blas_thread`; the first holds the limit
 
 
 @lru_cache(maxsize=1)
@@ -61,101 +59,109 @@ def _addresses(letter: str) -> tuple[int, ...]:
     return tuple(function_address(module, letter + name) for module, name in routines)
 
 
-def routine_addresses(dtype: npt.DTypeLike) -> IntArray:
-    """Return the table that the kernels below take as `routines`, for float32 or float64."""
-    return np.array(_addresses("s" if np.dtype(dtype) == np.float32 else "d"), dtype=np.int64)
+class Blas(NamedTuple):
+    """What the kernels below need to call BLAS and LAPACK; one per thread, for the integers are scratch."""
+
+    routines: IntArray
+    """Addresses of the routines for one type, float32 or float64."""
+    flags: npt.NDArray[np.uint8]
+    """Character arguments of the Fortran routines: "L", "R", "T", "N"."""
+    integers: npt.NDArray[np.int32]
+    """(8,) scratch that passes integers by reference."""
+    scalars: npt.NDArray[Any]
+    """1, -1, 0, which are passed by reference as alpha and beta."""
 
 
-def work_integers() -> npt.NDArray[np.int32]:
-    """Return the scratch that passes integers by reference to Fortran; one per thread."""
-    return np.zeros(8, dtype=np.int32)
-
-
-def work_scalars(dtype: npt.DTypeLike) -> npt.NDArray[Any]:
-    """Return the constants 1, -1, 0 that are passed by reference to BLAS as alpha and beta."""
-    return np.array([1.0, -1.0, 0.0], dtype=dtype)
+def blas_of(dtype: npt.DTypeLike) -> Blas:
+    """Return the routines for float32 or float64, with scratch of their own."""
+    addresses = _addresses("s" if np.dtype(dtype) == np.float32 else "d")
+    return Blas(
+        routines=np.array(addresses, dtype=np.int64),
+        flags=_FLAGS,
+        integers=np.zeros(8, dtype=np.int32),
+        scalars=np.array([1.0, -1.0, 0.0], dtype=dtype),
+    )
 
 
 @kernel(exact=True)
-def potrf(routines: Any, flags: Any, integers: Any, a: Any, offset: int, order: int, leading: int) -> int:
+def potrf(blas: Any, a: Any, order: int) -> int:
     """Factor the block a = L L^T in place; return 0, or k if the leading minor of order k is not positive."""
+    entries, offset, leading = a
+    integers = blas.integers
     integers[0] = order
     integers[1] = leading
     integers[2] = 0
-    text, ints = array_address(flags), array_address(integers)
-    block = array_address(a) + offset * a.itemsize
-    call_address(routines[_POTRF], (text, ints, block, ints + 4, ints + 8))
+    text, ints = array_address(blas.flags), array_address(integers)
+    block = array_address(entries) + offset * entries.itemsize
+    call_address(blas.routines[_POTRF], (text, ints, block, ints + 4, ints + 8))
     return int(integers[2])
 
 
 @kernel(exact=True)
-def trsm(
-    routines: Any,
-    flags: Any,
-    integers: Any,
-    scalars: Any,
-    a: Any,
-    triangle: int,
-    below: int,
-    rows: int,
-    columns: int,
-    leading: int,
-) -> None:
-    """Replace the (rows, columns) block at `below` by block @ inv(triangle)^T; one leading dimension."""
+def trsm(blas: Any, triangle: Any, below: Any, rows: int, columns: int) -> None:
+    """Replace the (rows, columns) block `below` by below @ inv(triangle)^T."""
+    integers = blas.integers
     integers[0] = rows
     integers[1] = columns
-    integers[2] = leading
-    text, ints, one = array_address(flags), array_address(integers), array_address(scalars)
-    start = array_address(a)
-    triangle_address = start + triangle * a.itemsize
-    below_address = start + below * a.itemsize
+    integers[2] = triangle[2]
+    integers[3] = below[2]
+    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
+    triangle_address = array_address(triangle[0]) + triangle[1] * triangle[0].itemsize
+    below_address = array_address(below[0]) + below[1] * below[0].itemsize
     pointers = (
         text + 1, text, text + 2, text + 3,
-        ints, ints + 4, one, triangle_address, ints + 8, below_address, ints + 8,
+        ints, ints + 4, one, triangle_address, ints + 8, below_address, ints + 12,
     )  # fmt: skip
-    call_address(routines[_TRSM], pointers)
+    call_address(blas.routines[_TRSM], pointers)
 
 
 @kernel(exact=True)
-def syrk(
-    routines: Any,
-    flags: Any,
-    integers: Any,
-    scalars: Any,
-    a: Any,
-    offset: int,
-    leading_a: int,
-    rows: int,
-    columns: int,
-    c: Any,
-    offset_c: int,
-    leading_c: int,
-    accumulate: bool,
-) -> None:
-    """Subtract a a^T from the lower triangle of c, or store -a a^T there if not `accumulate`."""
+def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -> None:
+    """Subtract a a^T, a of so many rows and columns, from the lower triangle of c, or store -a a^T there."""
+    integers = blas.integers
     integers[0] = rows
     integers[1] = columns
-    integers[2] = leading_a
-    integers[3] = leading_c
-    text, ints, one = array_address(flags), array_address(integers), array_address(scalars)
-    size = a.itemsize
+    integers[2] = a[2]
+    integers[3] = c[2]
+    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
+    size = blas.scalars.itemsize
     beta = one if accumulate else one + 2 * size
     pointers = (
-        text, text + 3, ints, ints + 4, one + size, array_address(a) + offset * size, ints + 8,
-        beta, array_address(c) + offset_c * size, ints + 12,
+        text, text + 3, ints, ints + 4, one + size, array_address(a[0]) + a[1] * size, ints + 8,
+        beta, array_address(c[0]) + c[1] * size, ints + 12,
     )  # fmt: skip
-    call_address(routines[_SYRK], pointers)
+    call_address(blas.routines[_SYRK], pointers)
 
 
 @kernel(exact=True)
-def solve_factored(routines: Any, flags: Any, integers: Any, a: Any, order: int, b: Any) -> None:
-    """Solve L L^T x = b in place for one right-hand side; `a` holds L as one block.
+def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool) -> None:
+    """Subtract left right^T from a block c, or store it negated; shape: (rows, columns, depth)."""
+    integers = blas.integers
+    for k in range(3):
+        integers[k] = shape[k]
+    integers[3], integers[4], integers[5] = left[2], right[2], c[2]
+    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
+    size = blas.scalars.itemsize
+    beta = one if accumulate else one + 2 * size
+    pointers = (
+        text + 3, text + 2, ints, ints + 4, ints + 8, one + size,
+        array_address(left[0]) + left[1] * size, ints + 12,
+        array_address(right[0]) + right[1] * size, ints + 16,
+        beta, array_address(c[0]) + c[1] * size, ints + 20,
+    )  # fmt: skip
+    call_address(blas.routines[_GEMM], pointers)
+
+
+@kernel(exact=True)
+def solve_factored(blas: Any, a: Any, order: int, b: Any) -> None:
+    """Solve L L^T x = b in place for one right-hand side; the array `a` holds L as one block.
 
     By xtrsv: xpotrs packs L for blocks of right-hand sides, which for one costs more than the solve.
     """
+    integers = blas.integers
     integers[0] = order
     integers[1] = 1
-    text, ints = array_address(flags), array_address(integers)
+    text, ints = array_address(blas.flags), array_address(integers)
     matrix, right = array_address(a), array_address(b)
-    call_address(routines[_TRSV], (text, text + 3, text + 3, ints, matrix, ints, right, ints + 4))
-    call_address(routines[_TRSV], (text, text + 2, text + 3, ints, matrix, ints, right, ints + 4))
+    call_address(blas.routines[_TRSV], (text, text + 3, text + 3, ints, matrix, ints, right, ints + 4))
+    call_address(blas.routines[_TRSV], (text, text + 2, text + 3, ints, matrix, ints, right, ints + 4))

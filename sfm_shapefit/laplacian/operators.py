@@ -1,6 +1,5 @@
-"""Incidence operator and Laplacians of a graph, applied edge by edge or assembled by slots.
+"""Laplacians of a graph, assembled by slots or applied by rows; (D t)_e = t_i - t_j for e = (i, j).
 
-    (D t)_e = t_i - t_j        e = (i, j)              incidence, m x n
     L = D^T W D                W = diag(w)             graph Laplacian, n x n
     L = D^T diag(B_e) D        B_e symmetric, b x b    block Laplacian, nb x nb
 
@@ -88,53 +87,6 @@ def _adjacency(num_nodes: int, edges: Any) -> Any:
         fill[i] += 1
         fill[j] += 1
     return pointers, neighbours, edge_of
-
-
-def apply_incidence(edges: IntArray, t: FloatArray, out: FloatArray | None = None) -> FloatArray:
-    """Return D t: t_i - t_j for each edge (i, j).
-
-    Args:
-        edges: (m, 2) node indices.
-        t: (n, d) float64, C-contiguous.
-        out: (m, d), written and returned if given.
-    """
-    result = np.empty((len(edges), t.shape[1])) if out is None else out
-    _incidence(edges, t, result)
-    return result
-
-
-@kernel()
-def _incidence(edges: Any, t: Any, out: Any) -> None:
-    for e in range(edges.shape[0]):
-        i, j = edges[e, 0], edges[e, 1]
-        for k in range(t.shape[1]):
-            out[e, k] = t[i, k] - t[j, k]
-
-
-def apply_incidence_transposed(
-    edges: IntArray, y: FloatArray, num_nodes: int, out: FloatArray | None = None
-) -> FloatArray:
-    """Return D^T y: at each node the sum of signed y_e, + where the edge starts and - where it ends.
-
-    Args:
-        edges: (m, 2) node indices.
-        y: (m, d) float64, C-contiguous.
-        num_nodes: n.
-        out: (n, d), written and returned if given.
-    """
-    result = np.empty((num_nodes, y.shape[1])) if out is None else out
-    result[...] = 0.0
-    _incidence_transposed(edges, y, result)
-    return result
-
-
-@kernel(exact=True)
-def _incidence_transposed(edges: Any, y: Any, out: Any) -> None:
-    for e in range(edges.shape[0]):
-        i, j = edges[e, 0], edges[e, 1]
-        for k in range(y.shape[1]):
-            out[i, k] += y[e, k]
-            out[j, k] -= y[e, k]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -269,7 +221,9 @@ class Workers:
 
 
 _ROW_BLOCKS = 8
-_ENTRIES_WORTH_A_THREAD = 50_000  # below, handing work to a thread costs more than the work
+
+# On fewer entries, handing work to a thread costs more than the work.
+_ENTRIES_WORTH_A_THREAD = 50_000
 
 
 class LaplacianOperator:
@@ -358,42 +312,3 @@ def _apply_entries(
             for p in range(pointers[i], pointers[i + 1]):
                 total += np.float64(entries[p]) * (x[i, k] - x[neighbours[p], k])
             out[i, k] = total
-
-
-def apply_laplacian(graph: Adjacency, weights: FloatArray, x: FloatArray, out: FloatArray) -> FloatArray:
-    """Write L x into `out` and return it, without assembling L.
-
-    Args:
-        graph: the neighbours of each node.
-        weights: (m,) edge weights.
-        x: (n, k) float64, C-contiguous.
-        out: (n, k).
-    """
-    if x.shape[1] == 3:
-        _apply_laplacian_3(graph.pointers, graph.neighbours, graph.edge_of, weights, x, out)
-    else:
-        _apply_laplacian(graph.pointers, graph.neighbours, graph.edge_of, weights, x, out)
-    return out
-
-
-@kernel()
-def _apply_laplacian_3(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, x: Any, out: Any) -> None:
-    for i in range(len(pointers) - 1):
-        x0, x1, x2 = x[i, 0], x[i, 1], x[i, 2]
-        s0, s1, s2 = 0.0, 0.0, 0.0
-        for p in range(pointers[i], pointers[i + 1]):
-            j, w = neighbours[p], weights[edge_of[p]]
-            s0 += w * (x0 - x[j, 0])
-            s1 += w * (x1 - x[j, 1])
-            s2 += w * (x2 - x[j, 2])
-        out[i, 0], out[i, 1], out[i, 2] = s0, s1, s2
-
-
-@kernel()
-def _apply_laplacian(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, x: Any, out: Any) -> None:
-    for i in range(len(pointers) - 1):
-        out[i] = 0.0
-        for p in range(pointers[i], pointers[i + 1]):
-            j, w = neighbours[p], weights[edge_of[p]]
-            for k in range(x.shape[1]):
-                out[i, k] += w * (x[i, k] - x[j, k])

@@ -161,7 +161,7 @@ def diagnose(
         num_pairs=pairs.num_edges,
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
         pieces=_piece_diagnoses(graph, pieces, n),
-        left_out={_name(graph, camera): reason for camera, reason in outside.items() if camera < n},
+        left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
         weak=() if obstacle else _weak_cameras(graph, pieces[0], n, contradicted, against),
         corruption=_corruption(pairs, scores),
         plan=None if obstacle else _plan(graph.restricted_to(pieces[0].edges)[0], options),
@@ -198,7 +198,7 @@ def _piece_diagnoses(
     return tuple(
         PieceDiagnosis(
             num_cameras=int(np.sum(piece.nodes < num_cameras)),
-            hinges=tuple(_name(graph, k) for k in piece.hinges.tolist() if k < num_cameras),
+            hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < num_cameras),
         )
         for piece in pieces[: count_large(pieces, num_cameras)]
     )
@@ -245,7 +245,7 @@ def _weak_cameras(
         if reasons:
             weak.append(
                 WeakCamera(
-                    name=_name(graph, camera),
+                    name=graph.name_of(camera),
                     num_pairs=int(num_pairs[camera]),
                     spread=float(spread[camera]),
                     reasons=tuple(reasons),
@@ -339,7 +339,3 @@ def _granted_in_words(found: RecoveryConditions) -> str:
             f"than one pair of {found.num_cameras} cameras: the theorems promise nothing here"
         )
     return f"recovery is granted whatever {wrong} wrong pairs at every camera are (eps = {eps:.1e})"
-
-
-def _name(graph: ViewGraph, camera: int) -> str:
-    return str(camera) if graph.names is None else graph.names[camera]

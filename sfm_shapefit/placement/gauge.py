@@ -13,6 +13,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
+    MEDIAN_NORMAL_LENGTH,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
@@ -231,7 +232,7 @@ def _fit_to_priors(
     level = 0.0
     for _ in range(_REWEIGHTINGS):
         residuals = np.linalg.norm(found.apply(source) - target, axis=1)
-        level = float(np.median(residuals)) / 1.538  # of a 3-vector of unit variance per axis
+        level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
         spread = np.maximum(np.maximum(sigmas, level), 1e-12 * size)
         weights = 1.0 / (1.0 + (residuals / (_KERNEL_WIDTH * spread)) ** 4)
         found = fit_similarity(source, target, weights / spread**2, rotate=rotate)

@@ -185,9 +185,7 @@ def _without(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
     if len(dropped) == 0:
         return graph
     kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    return ViewGraph(
-        graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept], graph.names
-    )
+    return graph.subset(kept)
 
 
 def ordered_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH
 from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors
@@ -55,7 +56,7 @@ def _anchors(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anc
     """Return the priors in the input's axes; those of unknown covariance get that of their residuals."""
     positions = priors.positions @ axes
     residuals = np.linalg.norm(start[priors.cameras] - positions, axis=1)
-    level = float(np.median(residuals)) / 1.538  # of a 3-vector of unit variance per axis
+    level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
     covariances = priors.covariances.copy()
     covariances[~np.isfinite(covariances).all(axis=(1, 2))] = level**2 * np.eye(3)
     information = np.linalg.inv(axes.T @ covariances @ axes)

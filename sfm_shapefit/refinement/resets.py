@@ -18,13 +18,11 @@ far outside may have others that hang on it farther out: each tenfold radius is 
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.viewgraph import ViewGraph
+from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
 _REACH = 3.0  # times the largest distance of the start, both in median distances; a sound fit moves by shares
 _FARTHER = 10.0  # from one radius to the next
@@ -71,9 +69,8 @@ def _unheld(
 ) -> BoolArray:
     """Return those of the far nodes, (n,), whose group the others do not hold where it is."""
     is_far = far[graph.edges]
-    i, j = graph.edges[is_far.all(axis=1) & agreeing].T
-    adjacency = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_nodes, graph.num_nodes))
-    count, group = connected_components(adjacency, directed=False)
+    group = connected_components(graph.num_nodes, graph.edges[is_far.all(axis=1) & agreeing])
+    count = int(group.max()) + 1
     ends = group[graph.edges]
     leaving = (ends[:, 0] != ends[:, 1])[:, None] & is_far
     pairs = np.bincount(ends[leaving], minlength=count)

@@ -203,8 +203,7 @@ def _second_start(
 
 def _weighted(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
     """Return the graph with the weights that directions to points have in LUD."""
-    weights = np.where(classes > 0, point_weight, 1.0) * graph.weights
-    return ViewGraph(graph.num_nodes, graph.edges, graph.directions, weights)
+    return graph.with_weights(np.where(classes > 0, point_weight, 1.0) * graph.weights)
 
 
 def _as_located(graph: ViewGraph, solved: SolverResult, metric: Metric) -> Finish:

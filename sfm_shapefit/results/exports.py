@@ -5,13 +5,12 @@ import numpy as np
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import EpipolarGeometries, g2o_text, onedsfm_files
 from sfm_shapefit.results.result import GraphResult
-from sfm_shapefit.results.rows import name_of
 
 
 def positions_g2o(found: GraphResult) -> str:
     """Return the placed nodes as g2o vertices."""
     placement = found.placement
-    names = [name_of(placement.graph, camera) for camera in placement.cameras.tolist()]
+    names = [placement.graph.name_of(camera) for camera in placement.cameras.tolist()]
     rotations = None if found.rotations is None else found.rotations[placement.cameras]
     return g2o_text(names, placement.locations, rotations)
 
@@ -29,7 +28,7 @@ def agreeing_onedsfm(found: GraphResult) -> dict[str, str]:
     if geometries is None or rotations is None:
         rotations = np.tile(np.eye(3), (n, 1, 1))
         geometries = EpipolarGeometries(
-            names=tuple(name_of(graph, camera) for camera in range(n)),
+            names=tuple(graph.name_of(camera) for camera in range(n)),
             pairs=graph.edges,
             rotations=rotations[graph.edges[:, 0]],
             to_second=-graph.directions,

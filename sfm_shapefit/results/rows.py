@@ -44,7 +44,7 @@ def camera_rows(
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
     rows = [
         CameraRow(
-            name=name_of(graph, camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
+            name=graph.name_of(camera), piece=homes[camera], degree=degree, reason=reasons.get(camera, "")
         )
         for camera, degree in enumerate(degrees.tolist())
     ]
@@ -69,7 +69,7 @@ def own_camera_rows(
         trust, reason = float(assessment.trust[k]), assessment.reasons[k]
         rows.append(
             CameraRow(
-                name=name_of(graph, camera),
+                name=graph.name_of(camera),
                 placed=kept,
                 reason=reason if kept else f"not trusted ({trust:.2f}): {reason}",
                 piece=placement.piece,
@@ -110,8 +110,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     rows = []
     for edge, (i, j) in enumerate(graph.edges[: placement.num_pairs].tolist()):
         row = PairRow(
-            name1=name_of(graph, i),
-            name2=name_of(graph, j),
+            name1=graph.name_of(i),
+            name2=graph.name_of(j),
             direction=tuple(graph.directions[edge].tolist()),
             support=int(support[edge]),
             weight=float(graph.weights[edge]),
@@ -156,7 +156,7 @@ def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> 
             PieceRow(
                 num_cameras=int(np.sum(piece.nodes < placement.num_cameras)),
                 scale=scale,
-                hinges=[name_of(placement.graph, hinge) for hinge in hinges.tolist()],
+                hinges=[placement.graph.name_of(hinge) for hinge in hinges.tolist()],
                 folder=folder_of(k) if k in facts else "",
                 num_placed=num_placed,
             )
@@ -177,11 +177,6 @@ def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int,
             total = counter.total()
             reasons[camera] = f"no usable direction in {total} pairs, most often ({count}): {cause}"
     return reasons
-
-
-def name_of(graph: ViewGraph, camera: int) -> str:
-    """Return a camera's name, or its number where the graph has no names."""
-    return str(camera) if graph.names is None else graph.names[camera]
 
 
 def folder_of(piece: int) -> str:

@@ -12,7 +12,7 @@ from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.results.result import GraphResult, LocateResult, all_names
-from sfm_shapefit.results.rows import name_of, piece_rows
+from sfm_shapefit.results.rows import piece_rows
 from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION, PieceRow, solve_summary
 from sfm_shapefit.results.warnings import graph_warnings
 
@@ -124,7 +124,7 @@ def _not_trusted(found: LocateResult) -> dict[str, str]:
     """Return the reason for each camera that is left out because it is not trusted."""
     placement = found.placement
     return {
-        name_of(placement.graph, int(placement.cameras[k])): placement.assessment.reasons[k]
+        placement.graph.name_of(int(placement.cameras[k])): placement.assessment.reasons[k]
         for k in np.flatnonzero(~found.kept).tolist()
     }
 
@@ -133,7 +133,7 @@ def _loose_groups(placement: Placement) -> list[dict[str, Any]]:
     """Return the groups of cameras that are rigid by the graph but loose by the geometry."""
     return [
         {
-            "cameras": [name_of(placement.graph, int(placement.cameras[k])) for k in group.cameras.tolist()],
+            "cameras": [placement.graph.name_of(int(placement.cameras[k])) for k in group.cameras.tolist()],
             "cause": group.cause.value,
         }
         for group in placement.assessment.loose_groups

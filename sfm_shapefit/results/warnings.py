@@ -10,7 +10,6 @@ from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
 from sfm_shapefit.refinement.starts import Finish
-from sfm_shapefit.results.rows import name_of
 from sfm_shapefit.solver.options import Status
 
 _ALARMING_SHARE = 0.5  # of pairs that contradict the solution
@@ -64,7 +63,7 @@ def _uncertain_cameras(placement: Placement) -> Iterator[str]:
     if np.isnan(largest).any():
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if uncertain and len(placement.cameras) >= SMALLEST_PIECE:
-        worst = name_of(placement.graph, int(placement.cameras[np.argmax(largest)]))
+        worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
         yield (
             f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
             f"above all {worst}; see sigma and trust in cameras.csv"
@@ -121,6 +120,4 @@ def graph_warnings(placement: Placement) -> Iterator[str]:
 def _least_trusted(placement: Placement, rows: IntArray) -> str:
     """Return the name of the least trusted of some of the placed cameras, and why it is."""
     worst = int(rows[np.argmin(placement.assessment.trust[rows])])
-    return (
-        f"{name_of(placement.graph, int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"
-    )
+    return f"{placement.graph.name_of(int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"

@@ -8,6 +8,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.operators import Int32Array, adjacency
 from sfm_shapefit.rigidity.game import contract, play
 from sfm_shapefit.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.viewgraph import ViewGraph
@@ -71,8 +72,10 @@ def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     A single camera without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
     """
     checked = _checked_edges(num_nodes, edges, dimension)
-    if len(checked) and _grows_from_first_pair(num_nodes, checked):
-        return True
+    if len(checked):
+        graph = adjacency(num_nodes, checked)
+        if _grows_from_first_pair(checked, graph.pointers, graph.neighbours):
+            return True
     few = checked[_among_first_links(num_nodes, checked, _FEW_LINKS)]
     if 2 * len(few) <= len(checked) and _is_one_piece(num_nodes, few, dimension):
         return True  # more pairs only hold the cameras faster; the search takes memory by the pair
@@ -114,12 +117,12 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
 
 
 @kernel()
-def _grows_from_first_pair(num_nodes: int, edges: IntArray) -> bool:
+def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbours: Int32Array) -> bool:
     """Return whether the first pair grows to all cameras by cameras that are joined to two of its own.
 
     Sufficient for rigidity, and linear in the pairs: each such camera has 2 (d - 1) >= d new copies of edges.
     """
-    start, neighbour = _adjacency(num_nodes, edges)
+    num_nodes = len(start) - 1
     links = np.zeros(num_nodes, dtype=np.int64)
     last = np.full(num_nodes, -1)  # the member that linked last: a pair given twice is one link
     members = np.empty(num_nodes, dtype=np.int64)
@@ -130,7 +133,7 @@ def _grows_from_first_pair(num_nodes: int, edges: IntArray) -> bool:
         camera = members[done]
         done += 1
         for p in range(start[camera], start[camera + 1]):
-            other = neighbour[p]
+            other = neighbours[p]
             links[other] += last[other] != camera
             if links[other] == 2 and last[other] != camera:
                 members[size] = other
@@ -151,24 +154,6 @@ def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray
             kept[i] += 1
             kept[j] += 1
     return is_kept
-
-
-@kernel()
-def _adjacency(num_nodes: int, edges: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the neighbours of each camera, one camera after the other, and where each begins, (n + 1,)."""
-    start = np.zeros(num_nodes + 2, dtype=np.int64)
-    for e in range(len(edges)):
-        start[edges[e, 0] + 2] += 1
-        start[edges[e, 1] + 2] += 1
-    for camera in range(num_nodes):
-        start[camera + 2] += start[camera + 1]
-    neighbour = np.empty(2 * len(edges), dtype=np.int64)
-    for e in range(len(edges)):
-        for side in range(2):
-            camera = edges[e, side]
-            neighbour[start[camera + 1]] = edges[e, 1 - side]
-            start[camera + 1] += 1
-    return start[:-1], neighbour
 
 
 def _checked_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:

@@ -75,5 +75,5 @@ def _hinges_of(camera: int, home: int, pieces: list[RigidPiece], placed: BoolArr
 
 
 def _name(graph: ViewGraph, camera: int) -> str:
-    """Return the name of a camera for a report."""
-    return f"camera {camera}" if graph.names is None else graph.names[camera]
+    """Return the name of a node for a sentence."""
+    return graph.name_of(camera) if graph.names else f"camera {camera}"

@@ -31,7 +31,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.geometry import mean_rotation_l1, median_spread
+from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH, mean_rotation_l1, median_spread
 from sfm_shapefit.rotations.joint_refinement import (
     NormalEquations,
     RayMatches,
@@ -48,7 +48,6 @@ _SCALES_PX = (8.0, 3.0, 1.0)  # of the Cauchy loss, one after the other
 _FINAL_PX = _SCALES_PX[-1]
 _FIRST_LEVEL_RAD = np.radians(1.0)  # before anything is known of the turns
 _LEAST_LEVEL_RAD = np.radians(0.3)  # averaged rotations are off by that; most cameras less, a few more
-_MEDIAN_OF_LENGTH = 1.538  # of a vector of three unit normal components
 _FLOOR_PX = 0.05  # residuals below this are as good as any; keeps the ratios of exact matches sober
 _MIN_PAIRS = 3
 _MIN_GAINING_SHARE = 2.0 / 3.0
@@ -117,7 +116,7 @@ def _without_common_turn(state: State) -> State:
 def _level(turns: FloatArray) -> float:
     """Return the standard deviation per axis, in radians, that the turns speak of."""
     lengths = np.linalg.norm(turn_vectors(turns), axis=1)
-    return float(max(np.median(lengths) / _MEDIAN_OF_LENGTH, _LEAST_LEVEL_RAD))
+    return float(max(np.median(lengths) / MEDIAN_NORMAL_LENGTH, _LEAST_LEVEL_RAD))
 
 
 def _judged(matches: RayMatches, state: State, level: float) -> tuple[FloatArray, BoolArray]:

@@ -46,11 +46,11 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorise
-from sfm_shapefit.laplacian.dense import FLAGS, one_blas_thread, potrf, routine_addresses, work_integers
-from sfm_shapefit.laplacian.operators import Workers, adjacency, apply_incidence_transposed
+from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
+from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
-from sfm_shapefit.solver.program import along, differences, objective
+from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -181,7 +181,7 @@ def _proved(
             return None
         allowed = 0.5 * _exact(gap) if tol > 0.0 else _LEAST_EXACT
         worst = _restore_exactly(repair, c, t, degree * allowed)
-        total = apply_incidence_transposed(graph.edges, y, n)
+        total = adjoint(y, graph.edges, n)
     scale = 1.0 / max(1.0, worst)
     if scale < 1.0:
         with np.errstate(invalid="ignore"):  # sums that overflowed prove nothing below
@@ -325,7 +325,7 @@ def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: flo
 
 def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, FloatArray]:
     """Return lambda and D^T y - lambda c, (n, d)."""
-    total = apply_incidence_transposed(metric.edges, metric.y, len(c))
+    total = adjoint(metric.y, metric.edges, len(c))
     multiplier = _multiplier(total, c, t)
     return multiplier, total - multiplier * c
 
@@ -504,11 +504,10 @@ def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
     with one_blas_thread():
         if n * d >= _SINGLE_FROM:
             matrix = np.zeros((n * d) ** 2, np.float32)
-            lapack = routine_addresses(np.float32), FLAGS, work_integers()
-            if _least_pivot(graph.edges, blocks, diagonal, matrix, *lapack) > _REGULAR_SINGLE:
+            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float32)) > _REGULAR_SINGLE:
                 return True
-        lapack = routine_addresses(np.float64), FLAGS, work_integers()
-        return bool(_least_pivot(graph.edges, blocks, diagonal, np.zeros((n * d) ** 2), *lapack) > _REGULAR)
+        double, blas = np.zeros((n * d) ** 2), blas_of(np.float64)
+        return bool(_least_pivot(graph.edges, blocks, diagonal, double, blas) > _REGULAR)
 
 
 @kernel(exact=True)
@@ -530,9 +529,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
 
 
 @kernel(exact=True)
-def _least_pivot(
-    edges: Any, blocks: Any, diagonal: Any, matrix: Any, routines: Any, flags: Any, integers: Any
-) -> float:
+def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any) -> float:
     """Factor the Laplacian of the blocks, its last node grounded; return the least pivot per diagonal entry.
 
     0 if a pivot is not positive. `matrix` is zero, column-major, and `diagonal` is scratch (n, d, d).
@@ -559,7 +556,7 @@ def _least_pivot(
         for k in range(d):
             for q in range(k, d):
                 matrix[(i * d + k) * order + i * d + q] = diagonal[i, k, q]
-    if potrf(routines, flags, integers, matrix, 0, order, order) != 0:
+    if potrf(blas, (matrix, 0, order), order) != 0:
         return 0.0
     least = np.inf
     for i in range(n):

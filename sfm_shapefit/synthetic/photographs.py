@@ -16,8 +16,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.atomic_folder import atomic_folder
@@ -33,6 +31,7 @@ from sfm_shapefit.synthetic.rendering import (
     surface_points,
 )
 from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_model
+from sfm_shapefit.viewgraph import connected_components
 
 _CAMERA_ID = 1
 _LARGEST_ERROR_PX = 4.0  # of a right match: COLMAP's own limit for inliers
@@ -206,8 +205,7 @@ def _true_tracks(scene: RenderedScene, database: Path) -> _Tracks:
     first = np.cumsum([0] + [len(xy) for xy in keypoints])
     pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
     nodes = (judged.matches.keypoints + first[judged.matches.pairs[pair]])[judged.is_right]
-    links = coo_array((np.ones(len(nodes), dtype=np.int8), nodes.T), shape=(first[-1], first[-1]))
-    _, label = connected_components(links, directed=False)
+    label = connected_components(int(first[-1]), nodes)
     order = np.argsort(label, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
     surface = np.concatenate([surface_points(scene, k, xy) for k, xy in enumerate(keypoints)])

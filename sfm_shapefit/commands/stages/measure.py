@@ -19,6 +19,7 @@ from sfm_shapefit.directions import (
 )
 from sfm_shapefit.directions.tracks import JointGraph, build_tracks, covering_set, join_points
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
 from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.options import LocateOptions
@@ -129,7 +130,7 @@ def shared_errors(
             1.0 / source.model.focal_lengths_px[batch.pairs].min(axis=1),
             directions.directions[rows],
             directions.covariance[rows],
-            1.4826 * directions.median_residual_px[rows],
+            SIGMA_PER_MEDIAN * directions.median_residual_px[rows],
             options.inlier_threshold_px,
         )
     return errors[usable]

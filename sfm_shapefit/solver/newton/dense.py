@@ -4,17 +4,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.laplacian.dense import (
-    FLAGS,
-    one_blas_thread,
-    potrf,
-    routine_addresses,
-    solve_factored,
-    work_integers,
-)
+from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
     REFINEMENTS,
@@ -65,9 +58,7 @@ class DenseFactor(NamedTuple):
     """(n, d, d) scratch: the diagonal blocks of M."""
     half: FloatArray
     """(d, d - 1) scratch."""
-    routines: IntArray
-    flags: Any
-    integers: Any
+    blas: Blas
     ridge: tuple[float, float]
     """First and last multiple of the identity added to M, per mean eigenvalue."""
     refinements: int
@@ -125,9 +116,7 @@ def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFact
         right=np.empty(n * d, dtype),
         diagonal=np.empty((n, d, d)),
         half=np.empty((d, d - 1)),
-        routines=routine_addresses(dtype),
-        flags=FLAGS,
-        integers=work_integers(),
+        blas=blas_of(dtype),
         ridge=_RIDGES[size],
         refinements=_REFINEMENTS[size],
         patience=_PATIENCE[size],
@@ -205,7 +194,7 @@ def _factorise(problem: Any, model: Any, factor: Any) -> int:
     while info != 0 and ridge <= last:
         _lift(problem, factor, size, ridge * size)
         _add_edge_blocks(problem, model, factor)
-        info = potrf(factor.routines, factor.flags, factor.integers, factor.matrix, 0, order, order)
+        info = potrf(factor.blas, (factor.matrix, 0, order), order)
         ridge *= 100.0
     model.a[:] = problem.c
     if info == 0:
@@ -296,6 +285,6 @@ def _solve(factor: Any, nodes: Any) -> None:
     x = nodes.reshape(right.size)
     for k in range(len(right)):
         right[k] = x[k]
-    solve_factored(factor.routines, factor.flags, factor.integers, factor.matrix, right.size, right)
+    solve_factored(factor.blas, factor.matrix, right.size, right)
     for k in range(len(right)):
         x[k] = right[k]

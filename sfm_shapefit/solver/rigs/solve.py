@@ -59,7 +59,7 @@ def solve_groups(
     outer = groups.joins(graph.edges)
     if not outer.any():
         raise UnsolvableError("no pair joins two groups, so that nothing can be placed")
-    between = ViewGraph(graph.num_nodes, graph.edges[outer], graph.directions[outer], graph.weights[outer])
+    between = graph.subset(outer)
     unit = groups.normalize()
     c = unit.reduce(scale_functional(between))
     if not np.linalg.norm(c) > _DIRECTIONS_CANCEL * between.weights.sum():

@@ -14,8 +14,6 @@ are part of the problem and not general; whether they do at a solution, at its b
 """
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
@@ -23,6 +21,7 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.viewgraph import connected_components
 
 _EPSILON = 1e-10
 _STEPS = 4
@@ -81,8 +80,7 @@ def general_positions(groups: RigidGroups) -> FloatArray:
 
 def _components(ends: IntArray, count: int) -> list[IntArray]:
     """Return the connected components of the graph of groups."""
-    links = coo_array((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(count, count))
-    labels = connected_components(links, directed=False)[1]
+    labels = connected_components(count, ends)
     order = np.argsort(labels, kind="stable")
     return np.split(order.astype(np.int64), np.cumsum(np.bincount(labels))[:-1])
 
