@@ -221,7 +221,7 @@ def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
 
 
 def failing(error):
-    with console.reported():
+    with console.report_errors():
         raise error
 
 

@@ -344,7 +344,7 @@ def _traced(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple
         seconds.append(time.perf_counter() - start)
         objectives.append(info.objective)
 
-    options = SolverOptions(method=method, tol=tol, uniqueness=False, threads=threads)  # type: ignore[arg-type]
+    options = SolverOptions(solver=method, tol=tol, uniqueness=False, threads=threads)  # type: ignore[arg-type]
     start = time.perf_counter()
     found = solve(graph, options, note)
     total_s = time.perf_counter() - start

@@ -251,7 +251,7 @@ def solve_ours(graph: "ViewGraph", tol: float, method: str = "newton") -> "Solve
     """Solve and certify with our solver."""
     from sfm_shapefit import SolverOptions, solve
 
-    return solve(graph, SolverOptions(method=method, tol=tol, uniqueness=False))  # type: ignore[arg-type]
+    return solve(graph, SolverOptions(solver=method, tol=tol, uniqueness=False))  # type: ignore[arg-type]
 
 
 def solve_cvxpy(graph: "ViewGraph", tol: float) -> tuple["FloatArray", int]:

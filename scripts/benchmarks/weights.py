@@ -17,7 +17,7 @@ from benchmarks.record import table
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.directions import PairDirections
+    from sfm_shapefit.directions.pair_directions import PairDirections
 
 REAL = {
     "fountain-P11": "gt",
@@ -124,11 +124,11 @@ def comparison_of_real(name: str, folder: Path, truth: str) -> Comparison:
     from sfm_shapefit.colmap.database import open_database
     from sfm_shapefit.colmap.model import read_model
     from sfm_shapefit.commands.stages.execution import directions_of
-    from sfm_shapefit.directions import concatenate
+    from sfm_shapefit.directions.pair_directions import concatenate
     from sfm_shapefit.options import LocateOptions
 
     model = read_model(folder / "sparse" / "0")
-    wanted = LocateOptions().for_directions()
+    wanted = LocateOptions()
     with open_database(folder / "database.db", model) as database:
         parts = [directions_of(b, model.focal_lengths_px, wanted, 1) for b in database.iter_matches(1)]
     known = pycolmap.Reconstruction(folder / truth)
@@ -141,7 +141,7 @@ def comparison_of_made(shape: str, seed: int) -> Comparison:
     """Compare on a made scene of 30 cameras: a tenth of the pairs and a fifth of the matches are wrong."""
     import numpy as np
 
-    from sfm_shapefit.directions import estimate_directions
+    from sfm_shapefit.directions.estimate import estimate_directions
     from sfm_shapefit.geometry import normalized
     from sfm_shapefit.synthetic import SceneOptions, make_scene
 

@@ -23,7 +23,7 @@ def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
 
 
 def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return solve(graph, SolverOptions(method="conic", tol=1e-9, uniqueness=False)).locations
+    return solve(graph, SolverOptions(solver="conic", tol=1e-9, uniqueness=False)).locations
 
 
 def _refined(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:

@@ -18,8 +18,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions import PairDirections
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.viewgraph import ViewGraph
 
