@@ -40,7 +40,9 @@ def soak(base: Path, calls: int, *, show: bool = False) -> list[str]:
     sizes, descriptors, problems = [], [], []
     for call in range(calls + _WARM_UP):
         model, database = sources[call % 2]
-        found = locate(model, database, LocateOptions(directions="auto" if database else "tracks", threads=1))
+        found = locate(
+            model, database, options=LocateOptions(directions="auto" if database else "tracks", threads=1)
+        )
         write_result(found, base.parent / "out", overwrite=True)
         centers = np.array([row.center for row in found.cameras if row.placed]).tobytes()
         if answers.setdefault(call % 2, centers) != centers:

@@ -310,9 +310,9 @@ def measure(
         num_pairs=len(found.directions.pairs),
         num_pairs_used=len(found.placement.pairs),
         errors=_errors(found.reconstruction, folder / scene.truth),
-        gap=found.solve.gap,
-        converged=found.solve.status.name == "CONVERGED",
-        method=found.solve.method,
+        gap=found.certified.gap,
+        converged=found.certified.status.name == "CONVERGED",
+        method=found.certified.method,
         cold_s=cold_s,
         warm_s=tuple(run[1] for run in runs),
         cpu_s=tuple(run[2] for run in runs),
@@ -335,7 +335,7 @@ def _measure_averaged(folder: Path, truth: Path) -> "tuple[Averaged, ...]":
     measured = []
     for refine in (False, True):
         start = time.process_time()
-        found = locate(model, folder / "database.db", LocateOptions(refine_rotations=refine))
+        found = locate(model, folder / "database.db", options=LocateOptions(refine_rotations=refine))
         rotation = evaluate(found.reconstruction, truth).rotation_deg
         turned = 0 if found.turned_deg is None else int((found.turned_deg > 0.0).sum())
         measured.append(

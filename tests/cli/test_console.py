@@ -65,7 +65,7 @@ def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations
 @pytest.mark.slow
 def test_map_counts_the_pairs_whose_rotations_it_estimates():
     database = BUNDLED / "photographed" / "database.db"
-    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress))
+    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress=progress))
     steps = stages["relative rotations"]
     assert steps[:2] == [(0, 1), (1, 57)]
     assert steps[-2:] == [(57, 57), (1, 1)]

@@ -418,7 +418,7 @@ def test_the_callback_sees_every_iteration_and_can_cancel(method):
         seen.append(info)
         return len(seen) < 3
 
-    result = solve(graph, SolverOptions(solver=method, tol=1e-12), watch)
+    result = solve(graph, SolverOptions(solver=method, tol=1e-12), on_iteration=watch)
     assert result.status is Status.CANCELLED
     assert [info.iteration for info in seen] == [1, 2, 3]
     assert np.isfinite(result.locations).all()
