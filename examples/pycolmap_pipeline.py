@@ -59,7 +59,7 @@ def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycol
 
     # Averaged rotations are a few tenths of a degree off: let the matches refine them first.
     options = sfm_shapefit.LocateOptions(refine_rotations=True)
-    found = sfm_shapefit.locate(rotations, database, options)
+    found = sfm_shapefit.locate(rotations, database, options=options)
     sfm_shapefit.write_result(found, out / "located")
     for warning in found.warnings:
         print(f"warning: {warning}")

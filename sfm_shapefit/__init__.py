@@ -1,21 +1,27 @@
 """Places the cameras of a COLMAP model from known rotations: certified, explained, deterministic.
 
-    graph  = ViewGraph(num_cameras, edges, directions)      # directions of t_i - t_j
-    result = solve(graph)                                   # ShapeFit with a certificate of optimality
     found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
     write_result(found, "out")
     mapped = map_database("database.db")                    # the same from the matches alone
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     errors = evaluate(found.reconstruction, "truth")
 
-Names are imported when they are first used, so that importing the package is cheap.
+    graph  = ViewGraph(num_nodes, edges, directions)        # directions of t_i - t_j
+    placed = place(graph)                                   # what `sfm-shapefit place` does with it
+    result = solve(graph)                                   # ShapeFit alone, with a certificate of optimality
+
+Options are given as a value, `locate(model, options=LocateOptions(min_trust=0.0))`, or by name,
+`locate(model, min_trust=0.0)`. Names are imported when they are first used, so that importing the package is
+cheap.
 """
 
-import zlib  # noqa: F401  before pycolmap, whose own copy would take the place of the system's, see `jit`
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+import zlib as _zlib  # noqa: F401  before pycolmap, whose own copy would take the place of the system's, see `jit`
+from importlib import import_module as _import_module
+from typing import TYPE_CHECKING
+from typing import Any as _Any
 
 if TYPE_CHECKING:
+    from sfm_shapefit.colmap.quiet import hear_pycolmap
     from sfm_shapefit.commands.convert import convert
     from sfm_shapefit.commands.evaluate import evaluate
     from sfm_shapefit.commands.inspect import inspect
@@ -24,6 +30,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.write import write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.options import LocateOptions, MapOptions
+    from sfm_shapefit.placement.place import Placement, place
+    from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.results import LocateResult
     from sfm_shapefit.results.map_result import MapResult
     from sfm_shapefit.solver.certificate import Certificate, certify
@@ -32,6 +40,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.viewgraph import ViewGraph
 
 _HOMES = {
+    "colmap.quiet": ("hear_pycolmap",),
     "commands.convert": ("convert",),
     "commands.evaluate": ("evaluate",),
     "commands.inspect": ("inspect",),
@@ -40,6 +49,8 @@ _HOMES = {
     "commands.write": ("write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "options": ("LocateOptions", "MapOptions"),
+    "placement.place": ("Placement", "place"),
+    "refinement.options": ("PlacementOptions",),
     "results": ("LocateResult",),
     "results.map_result": ("MapResult",),
     "solver.certificate": ("Certificate", "certify"),
@@ -57,6 +68,8 @@ __all__ = [
     "LocateResult",
     "MapOptions",
     "MapResult",
+    "Placement",
+    "PlacementOptions",
     "ShapeFitError",
     "SolverOptions",
     "SolverResult",
@@ -66,21 +79,23 @@ __all__ = [
     "certify",
     "convert",
     "evaluate",
+    "hear_pycolmap",
     "inspect",
     "locate",
     "map_database",
+    "place",
     "solve",
     "write_map_result",
     "write_result",
 ]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> _Any:
     if name in _HOME_OF:
-        globals()[name] = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
+        globals()[name] = getattr(_import_module(f"{__name__}.{_HOME_OF[name]}"), name)
         return globals()[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME_OF})
+    return [*__all__, "__version__"]

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     Similarity,
@@ -24,6 +25,11 @@ from sfm_shapefit.geometry import (
     mean_rotation_l1,
     median_spread,
     rotation_angles_deg,
+)
+
+_ON_A_LINE = (
+    "the camera centres lie on a line, so the alignment's rotation about it is arbitrary; position errors "
+    "across the line are a lower bound"
 )
 
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
@@ -59,8 +65,8 @@ class Recall:
     """In [0, 1]; cameras that the model misses count as failures."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Evaluation:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Evaluation(Displayed):
     """Errors of a model's camera poses against a reference. Arrays are read-only."""
 
     names: tuple[str, ...]
@@ -83,10 +89,13 @@ class Evaluation:
     """Diagonal of the bounding box of all reference centres, in the reference's units."""
     recalls: tuple[Recall, ...]
     """Recall at the relative thresholds, then at the absolute ones that were asked for."""
-    degenerate: bool
-    """True if the centres lie on a line: the rotation of `ref_from_model` about it is arbitrary."""
     warnings: tuple[str, ...]
     """What a reader of the numbers must know; one sentence each."""
+
+    @property
+    def degenerate(self) -> bool:
+        """Whether the centres lie on a line: the rotation of `ref_from_model` about it is arbitrary."""
+        return _ON_A_LINE in self.warnings
 
     @property
     def position(self) -> ErrorSummary:
@@ -98,8 +107,8 @@ class Evaluation:
         """Statistics of the rotation errors, in degrees."""
         return _summary(self.rotation_errors_deg)
 
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures as plain Python values with stable keys, for JSON."""
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
         return {
             "num_reference": len(self.names) + len(self.missing),
             "num_model": len(self.names) + len(self.extra),
@@ -124,6 +133,10 @@ class Evaluation:
             "degenerate": self.degenerate,
             "warnings": list(self.warnings),
         }
+
+    def _headline(self) -> str:
+        median, worst = self.position.median, self.position.max
+        return f"{len(self.names)} cameras in common, position error {median:.3g} (median), {worst:.3g} (max)"
 
     def rows(self) -> list[dict[str, str | float]]:
         """Return one row per common camera, for a table: errors and the aligned centre."""
@@ -192,7 +205,6 @@ def evaluate_poses(
         rotation_ref_from_model=frozen(global_rotation),
         extent=extent,
         recalls=_recalls(errors, len(ref_names), extent, thresholds),
-        degenerate=degenerate,
         warnings=_warnings(degenerate, close, cap),
     )
 
@@ -302,10 +314,7 @@ def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]
     """Return the sentences that a reader of the figures must know."""
     found = []
     if degenerate:
-        found.append(
-            "the camera centres lie on a line, so the alignment's rotation about it is arbitrary;"
-            " position errors across the line are a lower bound"
-        )
+        found.append(_ON_A_LINE)
     if 2 * int(close.sum()) <= len(close):
         found.append(
             f"only {int(close.sum())} of {len(close)} common cameras lie within {cap:.3g} of the reference;"

@@ -12,7 +12,7 @@ PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
 # Bottom first; the modules of a folder, and rooms on one floor, may import each other.
 LAYERS = [
-    {"errors", "arrays", "atomic_folder"},
+    {"errors", "arrays", "atomic_folder", "settings", "display"},
     {"jit", "executors"},
     {"geometry"},
     {"viewgraph"},

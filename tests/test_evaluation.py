@@ -319,7 +319,7 @@ def test_a_threshold_that_is_no_positive_number_is_refused(threshold):
 def test_the_dictionary_survives_json_and_has_stable_keys():
     reference = scene(20)
     found = evaluate(reference.taken(np.arange(2, 20)), reference, thresholds=[1.0])
-    text = json.dumps(found.as_dict(), allow_nan=False)
+    text = json.dumps(found.summary(), allow_nan=False)
     parsed = json.loads(text)
     assert list(parsed) == [
         "num_reference",
@@ -368,7 +368,7 @@ def test_the_inputs_are_not_changed_and_the_answer_is_the_same_on_every_call():
     model = replace(reference, centers=reference.centers + rng.normal(size=(20, 3)))
     before = [a.copy() for a in (model.rotations, model.centers, reference.rotations, reference.centers)]
     first, second = evaluate(model, reference), evaluate(model, reference)
-    assert first.as_dict() == second.as_dict()
+    assert first.summary() == second.summary()
     for old, new in zip(
         before, (model.rotations, model.centers, reference.rotations, reference.centers), strict=True
     ):

@@ -171,7 +171,9 @@ def measure_case(case: Case, count: int) -> Calibration:
     """Estimate `count` pairs of one kind and compare errors with covariances."""
     import numpy as np
 
-    from sfm_shapefit.directions import DirectionOptions, DirectionStatus, estimate_directions
+    from sfm_shapefit.directions.estimate import estimate_directions
+    from sfm_shapefit.directions.options import DirectionOptions
+    from sfm_shapefit.directions.pair_directions import DirectionStatus
     from sfm_shapefit.geometry import angle_between_deg, tangent_bases
 
     rays_i, rays_j, truth = make_pairs(case, count, seed=1)
@@ -210,7 +212,7 @@ def measure_batches(pairs: int, threads: int) -> Speed:
     """Estimate one batch, a tenth of whose matches is wrong, again and again; drawing it is not timed."""
     import numpy as np
 
-    from sfm_shapefit.directions import estimate_directions
+    from sfm_shapefit.directions.estimate import estimate_directions
 
     rays_i, rays_j, _ = make_pairs(Case(name="speed", wrong=0.1), BATCH, seed=2)
     rays_i, rays_j = rays_i.reshape(-1, 3), rays_j.reshape(-1, 3)

@@ -286,7 +286,7 @@ def _trace(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple[
         objectives.append(info.objective)  # type: ignore[attr-defined]
 
     start = time.perf_counter()
-    found = ours.solve(graph, note=note, method=method, tol=tol, threads=threads)
+    found = ours.solve(graph, note=note, solver=method, tol=tol, threads=threads)
     return found, Trace(objectives=tuple(objectives), seconds=tuple(seconds))
 
 

@@ -5,7 +5,7 @@ given the same `ViewGraph` and run in turns of 50 ms or two runs, in one process
 change of the machine's load meets all of them. The median of all runs counts; that of each turn's first run,
 when the caches hold another contender's data, is told beside it.
 
-    ours      solve(graph, method="newton"), checks, rigidity and certificate included, to a certified 1e-8
+    ours      solve(graph, solver="newton"), checks, rigidity and certificate included, to a certified 1e-8
     cvxpy     the program as a user would write it (`solve_cvxpy`), cvxpy's own compilation included
     Clarabel  called directly on cones of 2 rows (`clarabel_direct`), building its matrices included
 
@@ -181,7 +181,7 @@ def first_solve() -> float:
 
 def solve_ours(graph: "ViewGraph", tol: float, method: str = "newton") -> "SolverResult":
     """Solve and certify with our solver."""
-    return ours.solve(graph, method=method, tol=tol)
+    return ours.solve(graph, solver=method, tol=tol)
 
 
 def solve_cvxpy(graph: "ViewGraph", tol: float) -> tuple["FloatArray", int]:

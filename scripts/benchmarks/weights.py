@@ -19,7 +19,7 @@ from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
-    from sfm_shapefit.directions import PairDirections
+    from sfm_shapefit.directions.pair_directions import PairDirections
 
 MADE = ("ring", "facade", "cloud", "courtyard")
 SEEDS = 3
@@ -104,7 +104,7 @@ def compare_made(shape: str, seed: int) -> Comparison:
     """Compare on a made scene of 30 cameras: a tenth of the pairs and a fifth of the matches are wrong."""
     import numpy as np
 
-    from sfm_shapefit.directions import estimate_directions
+    from sfm_shapefit.directions.estimate import estimate_directions
     from sfm_shapefit.geometry import normalized
     from sfm_shapefit.synthetic import SceneOptions, make_scene
 

@@ -22,7 +22,7 @@ def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
 
 
 def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return ours.solve(graph, method="conic", tol=1e-9).locations
+    return ours.solve(graph, solver="conic", tol=1e-9).locations
 
 
 def _refined(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:

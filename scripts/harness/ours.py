@@ -34,7 +34,7 @@ def solve(graph: "ViewGraph", *, note: Any = None, **options: Any) -> "SolverRes
     from sfm_shapefit import SolverOptions
     from sfm_shapefit import solve as solve_program
 
-    return solve_program(graph, SolverOptions(**{"uniqueness": False, **options}), note)
+    return solve_program(graph, SolverOptions(**{"uniqueness": False, **options}), on_iteration=note)
 
 
 def solve_lud(graph: "ViewGraph") -> "FloatArray":
@@ -86,11 +86,9 @@ def warns(placement: "Placement") -> bool:
 
 def locate(model: Any, database: Path | None = None, **options: Any) -> "LocateResult":
     """Locate the cameras of a model."""
-    from sfm_shapefit import LocateOptions
     from sfm_shapefit import locate as locate_cameras
 
-    progress = {"progress": options.pop("progress")} if "progress" in options else {}
-    return locate_cameras(model, database, LocateOptions(**options), **progress)
+    return locate_cameras(model, database, **options)
 
 
 def locate_and_write(model: Any, out: Path, **options: Any) -> "LocateResult":
@@ -106,7 +104,7 @@ def map_database(database: Path, **options: Any) -> Any:
     """Return the largest model of `map`."""
     import sfm_shapefit
 
-    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**options))
+    found = sfm_shapefit.map_database(database, **options)
     return found.models[0].located.reconstruction
 
 
@@ -116,10 +114,10 @@ def directions_of_set(folder: Path) -> Any:
     from sfm_shapefit.colmap.database import open_database
     from sfm_shapefit.colmap.model import read_model
     from sfm_shapefit.commands.stages.execution import directions_of
-    from sfm_shapefit.directions import concatenate
+    from sfm_shapefit.directions.pair_directions import concatenate
 
     model = read_model(folder / "sparse" / "0")
-    wanted = LocateOptions().for_directions()
+    wanted = LocateOptions()
     with open_database(folder / "database.db", model) as database:
         parts = [directions_of(b, model.focal_lengths_px, wanted, 1) for b in database.iter_matches(1)]
     return model.names, concatenate(parts)

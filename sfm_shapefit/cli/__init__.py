@@ -1,26 +1,10 @@
 """The commands: parse, call, write. The door to typer and rich.
 
-A module per command. Flags are the fields of the options dataclasses. Results go to stdout, progress and
-messages to stderr.
+A module per command, under its name. Flags are the fields of the settings classes. Results go to stdout,
+progress and messages to stderr.
 """
 
-from sfm_shapefit.cli import convert as conversion
-from sfm_shapefit.cli import evaluate, locate, synth
-from sfm_shapefit.cli import inspect as inspection
-from sfm_shapefit.cli import map as mapping
-from sfm_shapefit.cli import place as solve
-from sfm_shapefit.cli import report as pictures
+from sfm_shapefit.cli import convert, evaluate, inspect, locate, map, place, report, synth  # noqa: A004
 from sfm_shapefit.cli.app import app, main
 
-__all__ = [
-    "app",
-    "conversion",
-    "evaluate",
-    "inspection",
-    "locate",
-    "main",
-    "mapping",
-    "pictures",
-    "solve",
-    "synth",
-]
+__all__ = ["app", "convert", "evaluate", "inspect", "locate", "main", "map", "place", "report", "synth"]

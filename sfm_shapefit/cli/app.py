@@ -14,7 +14,7 @@ from sfm_shapefit.cli.console import (
     repeat_lost_interrupts,
 )
 
-_ORDER = ("locate", "map", "solve", "inspect", "evaluate", "report", "view", "convert", "synth")
+_ORDER = ("locate", "map", "place", "inspect", "evaluate", "report", "view", "convert", "synth")
 """Of the commands in the help, by importance."""
 
 

@@ -42,7 +42,7 @@ _received: list[int] = []
 
 
 @contextmanager
-def reported(out: Path | None = None) -> Iterator[None]:
+def report_errors(out: Path | None = None) -> Iterator[None]:
     """Turn every known error into one sentence on stderr and its exit code.
 
     Args:
@@ -52,6 +52,8 @@ def reported(out: Path | None = None) -> Iterator[None]:
     before = _identity(out)
     try:
         yield
+    except typer.Exit:
+        raise
     except (KeyboardInterrupt, Exception) as error:
         # Native code that a signal interrupts may turn the interrupt into an error of its own.
         if isinstance(error, KeyboardInterrupt) or _received:
@@ -130,16 +132,16 @@ def _fail(message: str, code: int) -> None:
 
 
 def _say(message: str) -> None:
-    print(f"sfm-shapefit: {printable(message)}", file=sys.stderr)  # noqa: T201
+    print(f"sfm-shapefit: {make_printable(message)}", file=sys.stderr)  # noqa: T201
 
 
-def printable(text: str) -> str:
+def make_printable(text: str) -> str:
     """Return text without control characters: names come from strangers, and may move the cursor."""
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
 @contextmanager
-def shown_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
+def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | None]":
     """Show stages on stderr: as bars if it is a terminal, or, verbose, a line where each begins.
 
     Bars are written to a copy of stderr, which nobody silences. They do not go with the messages that
@@ -213,10 +215,10 @@ def print_json(summary: dict[str, Any]) -> None:
 def _encodable(text: str) -> str:
     """Return printable text with escapes for what stdout, perhaps an ASCII one, cannot show."""
     encoding = sys.stdout.encoding or "utf-8"
-    return printable(text).encode(encoding, "backslashreplace").decode(encoding)
+    return make_printable(text).encode(encoding, "backslashreplace").decode(encoding)
 
 
-def shortened(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:
+def shorten(lines: Sequence[str], elsewhere: str = "see cameras.csv") -> str:
     """Return the first lines, and how many there are more and where."""
     more = [f"and {len(lines) - NAMES_SHOWN} more, {elsewhere}"] if len(lines) > NAMES_SHOWN else []
     return "\n".join([*lines[:NAMES_SHOWN], *more])

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import print_table, reported
+from sfm_shapefit.cli.console import print_table, report_errors
 from sfm_shapefit.cli.flags import InputPath, ModelArgument, OutputPath, Quiet, one_path
 
 _FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
@@ -35,9 +35,9 @@ def convert_command(
     target = one_path(out, output_path, "OUT")
     if target_format is not None and target_format not in _FORMATS:
         raise typer.BadParameter(f"--format must be one of {', '.join(_FORMATS)}, got {target_format!r}")
-    with reported(target):
+    with report_errors(target):
         from sfm_shapefit.commands.convert import convert
 
-        written = convert(source, target, target_format, overwrite=overwrite)  # type: ignore[arg-type]
+        written = convert(source, target, target_format=target_format, overwrite=overwrite)  # type: ignore[arg-type]
         if not quiet:
             print_table(str(source), [("format", written), ("written to", str(target))])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, print_json, print_table, reported, shortened
+from sfm_shapefit.cli.console import Rows, print_json, print_table, report_errors, shorten
 from sfm_shapefit.cli.flags import InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.errors import InputError
 
@@ -34,17 +34,17 @@ def evaluate_command(
     """Compare the camera poses of MODEL with those of REF, after a robust similarity alignment."""
     source = one_path(model, input_path, "MODEL")
     truth = one_path(reference, None, "REF")
-    with reported():
+    with report_errors():
         from sfm_shapefit.commands.evaluate import evaluate
         from sfm_shapefit.results.tables import write_records
 
-        errors = evaluate(source, truth, threshold or ())
+        errors = evaluate(source, truth, thresholds=threshold or ())
         if csv is not None:
             if csv.exists() and csv.suffix.lower() != ".csv":
                 raise InputError(f"{csv} exists and is no .csv file; choose another name")
             write_records(errors.rows(), csv)
         if as_json:
-            print_json(errors.as_dict())
+            print_json(errors.summary())
         else:
             print_table(f"{source} against {truth}", _evaluation_table(errors))
 
@@ -55,7 +55,7 @@ def _evaluation_table(errors: "Evaluation") -> Rows:
     recall = "\n".join(f"{r.recall:.1%} within {r.threshold:.4g}" for r in errors.recalls)
     return [
         ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
-        *([("missing", shortened(errors.missing))] if errors.missing else []),
+        *([("missing", shorten(errors.missing))] if errors.missing else []),
         (
             "position error",
             f"median {position.median:.4g}, mean {position.mean:.4g}, max {position.max:.4g} "

@@ -1,18 +1,18 @@
-"""Flags are the fields of the options dataclasses, and their help is the sentence under each field."""
+"""Flags are the fields of the settings classes, in their groups, and their help is each field's sentence."""
 
-import ast
 import inspect
-import textwrap
 import tomllib
 from collections.abc import Callable, Sequence
-from dataclasses import fields, is_dataclass
-from functools import cache
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_type_hints
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
-Options = TypeVar("Options")
+from sfm_shapefit.settings import Settings, groups_of, option
+
+Options = TypeVar("Options", bound=Settings)
 Command = TypeVar("Command", bound=Callable[..., None])
 
 # COLMAP's own names for paths are accepted beside the positional ones.
@@ -34,37 +34,61 @@ Database = Annotated[
         help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
     ),
 ]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier output of this command.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Verbose = Annotated[
-    bool,
-    typer.Option("--verbose", "-v", help="Let pycolmap's messages through, and list seconds per stage."),
-]
-Report = Annotated[
-    bool, typer.Option("--report/--no-report", help="Write report.html: one page that works offline.")
-]
 Scene = Annotated[
     bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
 ]
-ExecutorName = Annotated[
-    Literal["serial", "processes", "dask"],
-    typer.Option(
-        "--executor",
-        help="Who measures directions: this process, so many others as --threads says, or a cluster.",
-    ),
-]
-Scheduler = Annotated[
-    str | None, typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already.")
-]
-Config = Annotated[
-    Path | None,
-    typer.Option("--config", metavar="FILE.toml", help="Options from a TOML file; flags win over it."),
-]
+
+_SHORT = {"quiet": "-q", "verbose": "-v"}
+
+_EARLIER_NAMES: dict[str, str] = {}
+"""Flags that are taken beside their present names, without standing in any help."""
 
 
-def takes(options_type: type, only: Sequence[str] = ()) -> Callable[[Command], Command]:
-    """Give a command one flag per field of an options dataclass, None where the user says nothing.
+@dataclass(frozen=True, kw_only=True)
+class OutputFlags(Settings):
+    """What is written and shown."""
+
+    config: str = option("", "Options from a TOML file; flags win over it.")
+    overwrite: bool = option(False, "Replace an earlier output of this command.")
+    report: bool = option(True, "Write report.html: one page that works offline.")
+    scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
+    json: bool = option(False, "Print one JSON object on stdout and nothing else.")
+    quiet: bool = option(False, "Print nothing but errors.")
+    verbose: bool = option(False, "Let pycolmap's messages through, and list seconds per stage.")
+
+
+class GroupedCommand(TyperCommand):
+    """A command whose help lists its options by the group that they belong to."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write arguments first, then the command's own options, then each group under its title."""
+        groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
+        for parameter in self.get_params(ctx):
+            record = parameter.get_help_record(ctx)
+            own = "Arguments" if parameter.param_type_name == "argument" else "Options"
+            if record is not None:
+                title = getattr(parameter, "rich_help_panel", None) or own
+                groups.setdefault(title, []).append(record)
+        for title, records in groups.items():
+            if records:
+                with formatter.section(title):
+                    formatter.write_dl(records)
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse flags by their present names, where an earlier one is given."""
+        known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
+        renamed = []
+        for arg in args:
+            flag, equals, value = arg.partition("=")
+            present = _EARLIER_NAMES.get(flag, flag)
+            renamed.append(present + equals + value if flag not in known and present in known else arg)
+        return super().parse_args(ctx, renamed)
+
+
+def takes(*settings: type[Settings], only: Sequence[str] = ()) -> Callable[[Command], Command]:
+    """Give a command one flag per field of some settings classes, None where the user says nothing.
 
     `only` names the fields that matter to the command, if not all do.
     """
@@ -72,7 +96,7 @@ def takes(options_type: type, only: Sequence[str] = ()) -> Callable[[Command], C
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        flags = [flag for flag in _flags(options_type) if not only or flag.name in only]
+        flags = [flag for one in settings for flag in _flags(one) if not only or flag.name in only]
         parameters = own + flags
         command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}
@@ -81,69 +105,68 @@ def takes(options_type: type, only: Sequence[str] = ()) -> Callable[[Command], C
     return decorate
 
 
-def _flags(options_type: type) -> list[inspect.Parameter]:
+def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
     """Return a keyword parameter with a typer option for each field."""
-    hints, documentation = get_type_hints(options_type), _field_documentation(options_type)
-    parameters = []
-    for item in fields(options_type):
-        flag = f"--{item.name.replace('_', '-')}"
-        names = f"{flag}/--no{flag[1:]}" if hints[item.name] is bool else flag
-        shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
-        default = "" if item.default in (None, "") else f" [default: {shown}]"
-        text = f"{documentation[item.name]}{default}"
-        annotation: Any = Annotated[hints[item.name] | None, typer.Option(names, help=text)]
-        parameters.append(
-            inspect.Parameter(item.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-        )
+    kinds, parameters = get_type_hints(settings), []
+    for group in groups_of(settings):
+        for item in group.fields:
+            flag = _flag_of(item.name)
+            if item.metadata["also"]:
+                _EARLIER_NAMES[_flag_of(item.metadata["also"])] = flag
+            is_switch = settings is OutputFlags and item.default is False
+            has_opposite = kinds[item.name] is bool and not is_switch
+            names = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
+            names += [_SHORT[item.name]] if item.name in _SHORT else []
+            shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
+            default = "" if item.default in (None, "") or is_switch else f" [default: {shown}]"
+            flagged = typer.Option(*names, help=item.metadata["help"] + default, rich_help_panel=group.title)
+            annotation: Any = Annotated[kinds[item.name] | None, flagged]
+            kind = inspect.Parameter.KEYWORD_ONLY
+            parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
     return parameters
 
 
-@cache
-def _field_documentation(options_type: type) -> dict[str, str]:
-    """Return the sentence under each field of a dataclass and of those it inherits from."""
-    found: dict[str, str] = {}
-    for base in options_type.__bases__:
-        if is_dataclass(base):
-            found |= _field_documentation(base)
-    (definition,) = ast.parse(textwrap.dedent(inspect.getsource(options_type))).body
-    assert isinstance(definition, ast.ClassDef)
-    for statement, following in zip(definition.body, definition.body[1:], strict=False):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            is_text = isinstance(following, ast.Expr) and isinstance(following.value, ast.Constant)
-            found[statement.target.id] = " ".join(str(following.value.value).split()) if is_text else ""  # type: ignore[attr-defined]
-    return found
+def _flag_of(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
-def options_from(options_type: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
-    """Return options from a TOML file and the flags that were given, which win."""
-    known = {item.name for item in fields(options_type)}  # type: ignore[arg-type]
-    values = _read_toml(config, known) if config else {}
-    values |= {name: value for name, value in given.items() if value is not None}
+def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
+    """Return options from a TOML file and the flags that were given, which win.
+
+    Args:
+        settings: the class of the options.
+        given: what the flags say, None where the user says nothing; what is no field of the class is left
+            to others.
+        config: the TOML file, if there is one.
+
+    Raises:
+        InputError: if the file is none that may be read.
+        typer.BadParameter: if it is no TOML, or an option is unknown or has a wrong value.
+    """
+    earlier = {item.metadata["also"]: item.name for item in fields(settings)}
+    known = {item.name for item in fields(settings)}
+    values = _read_toml(config, known, earlier) if config else {}
+    values |= {name: value for name, value in given.items() if value is not None and name in known}
     try:
-        return options_type(**values)
+        return settings(**values)
     except (TypeError, ValueError) as error:
         raise typer.BadParameter(str(error)) from error
 
 
-def _read_toml(path: Path, known: set[str]) -> dict[str, Any]:
+def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options."""
     from sfm_shapefit.formats import refuse_irregular_file
 
     refuse_irregular_file(path)
     try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        read = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
+    values = {earlier.get(name, name): value for name, value in read.items()}
     for name in values:
         if name not in known:
             raise typer.BadParameter(f"{path}: {name!r} is no option; known are {', '.join(sorted(known))}")
     return values
-
-
-def fields_of(options_type: type, given: dict[str, Any]) -> dict[str, Any]:
-    """Return the given values that are fields of an options dataclass."""
-    names = {item.name for item in fields(options_type)}
-    return {name: value for name, value in given.items() if name in names}
 
 
 def one_path(positional: Path | None, flag: Path | None, name: str) -> Path:

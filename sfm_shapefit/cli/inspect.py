@@ -13,11 +13,11 @@ from sfm_shapefit.cli.console import (
     catch_termination,
     print_json,
     print_table,
-    reported,
-    shortened,
-    shown_progress,
+    report_errors,
+    shorten,
+    show_progress,
 )
-from sfm_shapefit.cli.flags import Database, InputPath, Json, one_path, options_from, takes
+from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.options import LocateOptions
 
@@ -39,7 +39,9 @@ _INSPECTED = (
 """The options of `locate` that decide what the view graph is and what becomes of it."""
 
 
-@app.command("inspect", short_help="Diagnose a model and say what locate would do; write nothing.")
+@app.command(
+    "inspect", cls=GroupedCommand, short_help="Diagnose a model and say what locate would do; write nothing."
+)
 @takes(LocateOptions, only=_INSPECTED)
 def inspect_command(
     model: Annotated[
@@ -58,16 +60,16 @@ def inspect_command(
 ) -> None:
     """Diagnose the view graph of MODEL and say what `locate` would do; solve and write nothing."""
     source = one_path(model, input_path, "MODEL")
-    with reported():
-        options = options_from(LocateOptions, given)
+    with report_errors():
+        options = read_options(LocateOptions, given)
 
         from sfm_shapefit.commands.inspect import inspect as inspect_model
 
         catch_termination()
-        with shown_progress(not as_json) as progress:
-            found = inspect_model(source, database, options, theory=theory, progress=progress)
+        with show_progress(not as_json) as progress:
+            found = inspect_model(source, database, options=options, theory=theory, progress=progress)
         if as_json:
-            print_json(found.as_dict())
+            print_json(found.summary())
         else:
             what = "nodes" if source.is_file() else "images"
             print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))
@@ -86,10 +88,10 @@ def _inspection_table(found: "Inspection") -> Rows:
         ("pairs", statuses),
         ("points as nodes", found.points),
         ("rigs", found.rigs),
-        ("components", _components_line(seen)),
-        *([("rigid pieces", shortened(_piece_lines(seen), SEE_JSON))] if seen.pieces else []),
-        *([("not placed", shortened(left_out, SEE_JSON))] if left_out else []),
-        *([("weak cameras", shortened(weak, SEE_JSON))] if weak else []),
+        ("components", _describe_components(seen)),
+        *([("rigid pieces", shorten(_describe_pieces(seen), SEE_JSON))] if seen.pieces else []),
+        *([("not placed", shorten(left_out, SEE_JSON))] if left_out else []),
+        *([("weak cameras", shorten(weak, SEE_JSON))] if weak else []),
         ("wrong pairs", seen.corruption.statement),
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
@@ -98,13 +100,13 @@ def _inspection_table(found: "Inspection") -> Rows:
     ]
 
 
-def _components_line(seen: "Diagnosis") -> str:
+def _describe_components(seen: "Diagnosis") -> str:
     sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
     more = ", ..." if len(seen.components) > NAMES_SHOWN else ""
     return f"{len(seen.components)} ({sizes}{more} cameras)"
 
 
-def _piece_lines(seen: "Diagnosis") -> list[str]:
+def _describe_pieces(seen: "Diagnosis") -> list[str]:
     """Say of each rigid piece how large it is and what it hangs by."""
     return [
         f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")

@@ -2,14 +2,15 @@
 
 from typing import TYPE_CHECKING, Any
 
-from sfm_shapefit.cli.console import Rows, shortened
+from sfm_shapefit.cli.console import Rows, shorten
+from sfm_shapefit.cli.flags import OutputFlags
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.adjustment import Adjusted
     from sfm_shapefit.solver.options import SolverResult
 
 
-def pieces_line(facts: dict[str, Any]) -> Rows:
+def further_piece_rows(facts: dict[str, Any]) -> Rows:
     """Return a row that says where the further pieces stand, if there are any."""
     lines = [
         f"{piece['folder']}: {piece['num_placed']} of {piece['num_cameras']} cameras, hinged at "
@@ -17,10 +18,10 @@ def pieces_line(facts: dict[str, Any]) -> Rows:
         for piece in facts["pieces"][1:]
         if piece["folder"]
     ]
-    return [("further pieces", shortened(lines))] if lines else []
+    return [("further pieces", shorten(lines))] if lines else []
 
 
-def objective_line(solve: "SolverResult") -> str:
+def describe_objective(solve: "SolverResult") -> str:
     """Say what the solver reached, how sure that is, and which solver it was."""
     chosen = f"{solve.method}: {solve.method_reason}"
     if not solve.status.has_certificate:
@@ -28,20 +29,20 @@ def objective_line(solve: "SolverResult") -> str:
     return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
 
 
-def time_line(timings_s: dict[str, float], detailed: bool = True) -> str:
+def describe_time(timings_s: dict[str, float], detailed: bool) -> str:
     """Say how long the command took, and, in detail, each stage."""
     total = f"{sum(timings_s.values()):.1f} s"
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
     return f"{total} ({stages})" if detailed else total
 
 
-def adjustment_line(adjusted: "Adjusted") -> str:
+def describe_adjustment(adjusted: "Adjusted") -> str:
     """Say how bundle adjustment went."""
     state = "converged" if adjusted.converged else "stopped at its limit"
     before, after = adjusted.initial_error_px, adjusted.final_error_px
     return f"{state} after {adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
 
 
-def pictures_line(report: bool, scene: bool) -> str:
+def name_pictures(flags: OutputFlags) -> str:
     """Name the pictures that were written, to follow the names of other files."""
-    return ", report.html" * report + ", scene.glb, scene.ply" * scene
+    return ", report.html" * flags.report + ", scene.glb, scene.ply" * flags.scene

@@ -1,48 +1,41 @@
 """`sfm-shapefit locate MODEL OUT`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import (
-    Rows,
-    catch_termination,
-    print_json,
-    print_table,
-    reported,
-    shortened,
-    shown_progress,
-)
+from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import (
-    Config,
     Database,
-    ExecutorName,
+    GroupedCommand,
     InputPath,
-    Json,
     ModelArgument,
     OutArgument,
+    OutputFlags,
     OutputPath,
-    Overwrite,
-    Quiet,
-    Report,
-    Scene,
-    Scheduler,
-    Verbose,
     one_path,
-    options_from,
     takes,
 )
-from sfm_shapefit.cli.lines import adjustment_line, objective_line, pictures_line, pieces_line, time_line
+from sfm_shapefit.cli.frame import command_run
+from sfm_shapefit.cli.lines import (
+    describe_adjustment,
+    describe_objective,
+    describe_time,
+    further_piece_rows,
+    name_pictures,
+)
 from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results import LocateResult
+    from sfm_shapefit.results.result import LocateResult
 
 
-@app.command("locate", short_help="Place the cameras of a model from its rotations and matches.")
-@takes(LocateOptions)
+@app.command(
+    "locate", cls=GroupedCommand, short_help="Place the cameras of a model from its rotations and matches."
+)
+@takes(LocateOptions, OutputFlags)
 def locate_command(
     model: ModelArgument = None,
     out: OutArgument = None,
@@ -58,74 +51,65 @@ def locate_command(
             help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
         ),
     ] = None,
-    executor: ExecutorName = "serial",
-    scheduler: Scheduler = None,
-    overwrite: Overwrite = False,
-    config: Config = None,
-    report: Report = True,
-    scene: Scene = False,
-    as_json: Json = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
+    executor: Annotated[
+        Literal["serial", "processes", "dask"],
+        typer.Option(
+            "--executor",
+            help="Who measures directions: this process, so many others as --threads says, or a cluster.",
+        ),
+    ] = "serial",
+    scheduler: Annotated[
+        str | None,
+        typer.Option("--scheduler", metavar="ADDRESS", help="Of a dask scheduler that runs already."),
+    ] = None,
     **given: Any,
 ) -> None:
     """Place the cameras of MODEL from its rotations and its matches; write a seeded model to OUT."""
     source = one_path(model, input_path, "MODEL")
     target = one_path(out, output_path, "OUT")
-    with reported(target):
-        from sfm_shapefit.atomic_folder import claimed_output
+    with command_run(LocateOptions, given, target, [source, database, priors]) as run:
+        from sfm_shapefit.commands.locate import locate
+        from sfm_shapefit.commands.stages.execution import open_executor
+        from sfm_shapefit.commands.write import write_result
 
-        options = options_from(LocateOptions, given, config)
-        names = Path(options.fix) if options.fix else None
-        protect = [path for path in (source, database, priors, names, config) if path is not None]
-        with claimed_output(target, overwrite=overwrite, protect=protect):
-            from sfm_shapefit.colmap.quiet import pycolmap_heard
-            from sfm_shapefit.commands.locate import locate
-            from sfm_shapefit.commands.stages.execution import open_executor
-            from sfm_shapefit.commands.write import write_result
-            from sfm_shapefit.results import summary
-
-            catch_termination()
-            with (
-                open_executor(executor, options.num_threads(), scheduler) as workers,
-                shown_progress(not quiet, verbose) as progress,
-                pycolmap_heard(verbose),
-            ):
-                found = locate(source, database, options, progress, priors, workers)
-                write_result(found, target, overwrite=overwrite, protect=protect, report=report, scene=scene)
-        if as_json:
-            print_json(summary(found))
-        elif not quiet:
-            table = _locate_table(found, target, pictures_line(report, scene), verbose=verbose)
-            print_table(f"{len(found.model.names)} images of {source}", table)
+        with open_executor(executor, run.options.num_threads(), scheduler) as workers:
+            found = locate(
+                source,
+                database,
+                options=run.options,
+                progress=run.progress,
+                priors=priors,
+                executor=workers,
+            )
+        write_result(found, target, **run.writing)
+        title = f"{len(found.model.names)} images of {source}"
+        run.show(title, found.summary(), lambda: _locate_table(found, target, run.flags))
 
 
-def _locate_table(found: "LocateResult", out: Path, pictures: str, *, verbose: bool) -> Rows:
+def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results import summary
-
-    facts = summary(found)
+    facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     return [
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
-        *([("not placed", shortened(left_out))] if left_out else []),
-        *_groups_line(facts),
-        *pieces_line(facts),
-        ("pairs", _pairs_line(facts)),
-        ("objective", objective_line(found.solve)),
+        *([("not placed", shorten(left_out))] if left_out else []),
+        *_group_rows(facts),
+        *further_piece_rows(facts),
+        ("pairs", _describe_pairs(facts)),
+        ("objective", describe_objective(found.certified)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
         ("centres", found.placement.finish.statement()),
         ("scale", found.gauge.statement),
-        ("points", _points_line(facts)),
-        *([("bundle adjustment", adjustment_line(found.adjusted))] if found.adjusted else []),
+        ("points", _describe_points(facts)),
+        *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
-        ("time", time_line(found.timings_s, verbose)),
-        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{pictures}"),
+        ("time", describe_time(found.timings_s, flags.verbose)),
+        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),
     ]
 
 
-def _groups_line(facts: dict[str, Any]) -> Rows:
+def _group_rows(facts: dict[str, Any]) -> Rows:
     groups = facts["rigid_groups"]
     if groups is None:
         return []
@@ -134,7 +118,7 @@ def _groups_line(facts: dict[str, Any]) -> Rows:
     return [("rigid groups", f"{groups['num_placed']} of {groups['num_groups']} placed{fixed}{inner}")]
 
 
-def _pairs_line(facts: dict[str, Any]) -> str:
+def _describe_pairs(facts: dict[str, Any]) -> str:
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
     others = "".join(f", {count} {status.replace('_', ' ')}" for status, count in counts.items())
@@ -146,7 +130,7 @@ def _pairs_line(facts: dict[str, Any]) -> str:
     )
 
 
-def _points_line(facts: dict[str, Any]) -> str:
+def _describe_points(facts: dict[str, Any]) -> str:
     if facts["num_points"] == 0:
         return "none"
     return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import reported
+from sfm_shapefit.cli.console import report_errors
 from sfm_shapefit.cli.flags import Scene, one_path
 
 Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
@@ -17,14 +17,17 @@ Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder tha
 def report_command(out: Output = None, *, scene: Scene = False) -> None:
     """Write OUT/report.html anew from the other files of OUT."""
     folder = one_path(out, None, "OUT")
-    with reported():
+    with report_errors():
         from sfm_shapefit.errors import InputError
-        from sfm_shapefit.report.files import write_pictures
+        from sfm_shapefit.report.mesh import write_meshes
+        from sfm_shapefit.report.page import write_report
         from sfm_shapefit.report.read_back import read_output
 
         drawn, facts = read_output(folder)
         try:
-            write_pictures(drawn, facts, folder, report=True, meshes=scene)
+            write_report(drawn, facts, folder / "report.html")
+            if scene:
+                write_meshes(drawn, folder)
         except OSError as error:
             what = f"{folder} cannot be written ({error.strerror})"
             raise InputError(f"{what}; copy it elsewhere first") from error
@@ -41,7 +44,7 @@ def view_command(
 ) -> None:
     """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
     folder = one_path(out, None, "OUT")
-    with reported():
+    with report_errors():
         from sfm_shapefit.report.read_back import read_output
         from sfm_shapefit.report.viewer import serve
 

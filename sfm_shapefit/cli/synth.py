@@ -6,8 +6,8 @@ from typing import Annotated, Any
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import print_table, reported
-from sfm_shapefit.cli.flags import OutArgument, OutputPath, fields_of, one_path, options_from, takes
+from sfm_shapefit.cli.console import print_table, report_errors
+from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputPath, one_path, read_options, takes
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
@@ -17,19 +17,17 @@ Images = Annotated[
 ]
 
 
-@app.command("synth", short_help="Make a synthetic workspace with known truth.")
-@takes(SceneOptions)
-@takes(WorkspaceOptions)
-@takes(RenderOptions)
+@app.command("synth", cls=GroupedCommand, short_help="Make a synthetic workspace with known truth.")
+@takes(SceneOptions, WorkspaceOptions, RenderOptions)
 def synth_command(
     out: OutArgument = None, *, output_path: OutputPath = None, images: Images = False, **given: Any
 ) -> None:
     """Make a synthetic COLMAP workspace in OUT: a database, a model, the exact truth, and images if asked."""
     target = one_path(out, output_path, "OUT")
-    with reported(target):
-        scene = options_from(SceneOptions, fields_of(SceneOptions, given))
-        workspace = options_from(WorkspaceOptions, fields_of(WorkspaceOptions, given))
-        render = options_from(RenderOptions, fields_of(RenderOptions, given))
+    with report_errors(target):
+        scene = read_options(SceneOptions, given)
+        workspace = read_options(WorkspaceOptions, given)
+        render = read_options(RenderOptions, given)
         if not images and render != RenderOptions():
             raise InputError("the options of drawing need --images; add it, or leave them out")
         rows = _write_drawn(scene, render, target, workspace) if images else _write(scene, target, workspace)

@@ -28,7 +28,8 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
-from sfm_shapefit.colmap.structure import StructureOptions, TrackSource, filtered, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, filtered, triangulate
+from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.errors import UnsolvableError
 
 

@@ -7,7 +7,7 @@ have no level at all. So three things are silenced, each only as long as a call 
     quiet_stderr    file descriptor 2                bundle adjustment, estimation
     quiet_output    file descriptors 1 and 2         rotation averaging: CHOLMOD writes to stdout
 
-The one switch for all is `pycolmap_heard`; it holds for the code that runs inside it, and not for other
+The one switch for all is `hear_pycolmap`; it holds for the code that runs inside it, and not for other
 threads. Errors arrive as exceptions either way.
 """
 
@@ -21,11 +21,11 @@ from contextvars import ContextVar
 import pycolmap
 
 _QUIET = 3  # glog's FATAL
-_heard = ContextVar("pycolmap_heard", default=False)
+_heard = ContextVar("pycolmap_is_heard", default=False)
 
 
 @contextmanager
-def pycolmap_heard(enabled: bool = True) -> Iterator[None]:
+def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
     """Let pycolmap's messages through while the block runs, or, with False, silence them as by default."""
     token = _heard.set(enabled)
     try:

@@ -30,6 +30,7 @@ import pycolmap
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
 from sfm_shapefit.colmap.seed import without_points
+from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import answers
@@ -44,36 +45,6 @@ _TRACKS_A_TASK = 1000  # about half a second of work
 _RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
 _IMAGES_OF_A_CHECKED_TRACK = 3
 _CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StructureOptions:
-    """What a 3D point must satisfy to stand in the output."""
-
-    max_reprojection_error_px: float = 4.0
-    """Observations with a larger reprojection error are removed, and points that lose all but one."""
-    min_triangulation_angle_deg: float = 1.5
-    """Points that no two cameras see under at least this angle are removed; their depth means little."""
-    min_track_length: int = 2
-    """Points seen in fewer images than this are removed; 2 or more."""
-    ignore_two_view_tracks: bool = True
-    """Leave out matches that only two images share: a wrong one is not noticed, since one epipolar
-    constraint is all that checks it. Concerns matches of a database, not a model's own tracks, and only
-    models of three images or more: two have no other matches."""
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.max_reprojection_error_px < math.inf:
-            raise ValueError(
-                "StructureOptions.max_reprojection_error_px must be positive and finite, "
-                f"got {self.max_reprojection_error_px}"
-            )
-        if not 0.0 <= self.min_triangulation_angle_deg < 90.0:
-            raise ValueError(
-                "StructureOptions.min_triangulation_angle_deg must lie in [0, 90), "
-                f"got {self.min_triangulation_angle_deg}"
-            )
-        if self.min_track_length < 2:
-            raise ValueError(f"StructureOptions.min_track_length must be > 1, got {self.min_track_length}")
 
 
 def correspondence_graph(

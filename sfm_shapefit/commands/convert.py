@@ -40,8 +40,8 @@ _TEXTS = {"nerf": nerf_text, "tum": tum_text, "csv": poses_csv}
 def convert(
     source: "pycolmap.Reconstruction | Path | str",
     target: Path | str,
-    target_format: Format | None = None,
     *,
+    target_format: Format | None = None,
     overwrite: bool = False,
 ) -> Format:
     """Write the posed images of a model in another format.

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 def evaluate(
     reconstruction: "pycolmap.Reconstruction | Path | str",
     reference: "pycolmap.Reconstruction | Path | str",
+    *,
     thresholds: Sequence[float] = (),
 ) -> Evaluation:
     """Return position and rotation errors of a model against a reference, after robust alignment.

@@ -11,19 +11,21 @@ from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import evidence_of, joint_graph, measure_directions, view_graph
 from sfm_shapefit.commands.stages.memory import Forecast, forecast, measure_speed
 from sfm_shapefit.commands.stages.rigs import rigs_statement
-from sfm_shapefit.directions import DirectionStatus
+from sfm_shapefit.directions.pair_directions import DirectionStatus
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
 from sfm_shapefit.formats.models import is_model_file
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.diagnosis import Diagnosis, Theory, diagnose, theory_of
+from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
     import pycolmap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Inspection:
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Inspection(Displayed):
     """All that `inspect` reports."""
 
     directions: str
@@ -42,7 +44,7 @@ class Inspection:
     rigs: str = "none: every image is a frame of its own"
     """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
 
-    def as_dict(self) -> dict[str, Any]:
+    def summary(self) -> dict[str, Any]:
         """Return plain values for JSON."""
         facts = asdict(self)
         if self.expected is not None:
@@ -56,14 +58,19 @@ class Inspection:
             }
         return facts
 
+    def _headline(self) -> str:
+        obstacle = self.diagnosis.obstacle
+        return f"{self.num_images} images, {obstacle or 'which can be placed'}"
+
 
 def inspect(
     source: "pycolmap.Reconstruction | Path | str",
     database: Path | str | None = None,
-    options: LocateOptions | None = None,
     *,
+    options: LocateOptions | None = None,
     theory: bool = False,
     progress: Progress | None = None,
+    **overrides: Any,
 ) -> Inspection:
     """Diagnose a model's view graph, or a bare one, without solving: what `locate` would do, and why.
 
@@ -71,18 +78,19 @@ def inspect(
         source: a reconstruction or a model folder as for `locate`, or the text file of a bare graph.
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
+        **overrides: single options by name.
         theory: also compute the constants of the recovery theorems at the model's centres.
         progress: called as stages advance.
 
     Returns:
         Where directions come from and what becomes of the pairs; `diagnosis` with components, rigid pieces,
-        hinges, weak cameras, the share of wrong pairs and the plan of the solve. `as_dict()` has all of it.
+        hinges, weak cameras, the share of wrong pairs and the plan of the solve. `summary()` has all of it.
 
     Raises:
         InputError, UnsolvableError: as `locate`, if there is not even a view graph. One that cannot be placed
             is diagnosed; `diagnosis.obstacle` says why.
     """
-    options = options or LocateOptions()
+    options = merge_options(options, LocateOptions, overrides)
     if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
@@ -104,7 +112,7 @@ def inspect(
                 points=options.points_statement(model.num_images, joint.num_points),
                 diagnosis=diagnose(
                     joint.graph,
-                    options.for_placement(),
+                    options,
                     joint.num_cameras,
                     evidence_of(directions).contradicting,
                 ),
@@ -124,6 +132,6 @@ def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspe
         num_images=graph.num_nodes,
         statuses={DirectionStatus.USABLE.value: graph.num_edges},
         points="no: a bare graph has no matches",
-        diagnosis=diagnose(graph, options.for_placement()),
+        diagnosis=diagnose(graph, options),
         theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
     )

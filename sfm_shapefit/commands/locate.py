@@ -6,7 +6,7 @@ Each stage is one function from values to a new value; the input is never change
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
@@ -24,12 +24,13 @@ from sfm_shapefit.commands.stages.measure import (
 from sfm_shapefit.commands.stages.rigs import placed, rigid_gauge, rigid_parts
 from sfm_shapefit.commands.stages.rotations import refined_rotations
 from sfm_shapefit.commands.stages.seed import further_pieces, seeded_model, trusted
-from sfm_shapefit.directions import PairDirections
+from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pulled
 from sfm_shapefit.results import LocateResult, match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
     import pycolmap
@@ -38,10 +39,12 @@ if TYPE_CHECKING:
 def locate(
     reconstruction: "pycolmap.Reconstruction | Path | str",
     database: Path | str | None = None,
+    *,
     options: LocateOptions | None = None,
     progress: Progress | None = None,
     priors: Path | str | None = None,
     executor: Executor | None = None,
+    **overrides: Any,
 ) -> LocateResult:
     """Place the cameras of a model whose rotations and intrinsics are known.
 
@@ -55,7 +58,8 @@ def locate(
             OpenSfM; nothing of it is changed, and its camera centres never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
-        options: settings; defaults if None.
+        options: settings, see `help(LocateOptions)`; defaults if None.
+        **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
         priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
             serve if the scale is "prior" and there is no table.
@@ -64,43 +68,16 @@ def locate(
 
     Returns:
         `reconstruction`, the seeded model: cameras placed, points triangulated, all else unregistered;
-        `cameras` and `pairs`, a row each with trust, standard deviation, residual and verdict; `solve`, the
-        optimum with its certificate; `warnings`, a sentence each; `gauge`, `further` pieces, `timings_s`.
+        `cameras` and `pairs`, a row each with trust, standard deviation, residual and verdict; `certified`,
+        the optimum with its certificate; `warnings`, a sentence each; `gauge`, `further` pieces, `timings_s`.
 
     Raises:
         InputError: if the model or the database cannot be used; the message says what to do.
         UnsolvableError: if no pair has a usable direction, or the directions determine nothing.
 
-    The options, fields of `LocateOptions`; each is a flag of `sfm-shapefit locate` too:
-
-        option                          default     what it decides
-        directions                      'auto'      from matches, relative-poses (stored), or tracks
-        solver                          'auto'      newton, admm or conic; by size and predicted fill
-        objective                       'auto'      shapefit and lud refined, the better kept; or one of
-                                                    shapefit, lud, least-squares, linf
-        filter                          'none'      1dsfm or triangles: pairs dropped before the solve
-        refine                          True        refine the start robustly in angles
-        points                          'auto'      3D points as extra nodes: never, always
-        tol                             1e-08       certified gap at which the solve has converged
-        scale                           'auto'      input, unit, prior, distance or rig
-        known_distance                  None        (name, name, distance) in the output's units
-        fix                             ''          file of names that stay where they are, or 'solved'
-        refine_with_priors              False       position priors pull the cameras, robustly
-        min_inliers                     15          inlier matches that a pair needs
-        min_inlier_ratio                0.5         share of its matches that must agree with the rotations
-        inlier_threshold_px             2.0         largest Sampson error of an inlier
-        refine_rotations                False       for rotations from averaging, not from adjustment
-        max_reprojection_error_px       4.0         filter of observations of points
-        min_triangulation_angle_deg     1.5         filter of points
-        bundle_adjust                   False       adjust poses and points; intrinsics stay
-        min_trust                       0.6         cameras of less trust are left out; 0 keeps all
-        factor_memory                   2000        MB that one sparse factor may take, or it is left out
-        max_memory                      0           peak memory in MB to stay below; 0 for no limit
-        threads                         0           one per core; the answer does not depend on it
-
     Source of the program: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
-    options = options or LocateOptions()
+    options = merge_options(options, LocateOptions, overrides)
     clock = Clock(progress) if progress else Clock()
     with clock("read"):
         model = read_model(reconstruction)
@@ -111,7 +88,7 @@ def locate(
     if options.refine_rotations:
         with clock("rotations"):
             model, turned_deg = refined_rotations(model, inputs, options, clock)
-    with open_source(model, inputs, options.max_memory) as opened:
+    with open_source(model, inputs, options.max_memory_mb) as opened:
         with clock("directions"):
             directions = measure_directions(opened, options, clock, executor)
         with clock("solve"):
@@ -163,7 +140,7 @@ def _warnings(
     if gauge.warning:
         yield gauge.warning
     if source.economy.statement:
-        yield f"to stay below max_memory, {source.economy.statement}"
+        yield f"to stay below max_memory_mb, {source.economy.statement}"
     if num_points == 0:
         yield "no 3D point could be triangulated; bundle adjustment has nothing to start from"
     if source.database is not None and source.database.unmatched_names:

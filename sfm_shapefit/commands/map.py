@@ -10,6 +10,7 @@ final adjustment. Images that the averaging drops form components of their own.
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,7 @@ from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results import LocateResult
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
 
 _DRAFT_WIDENING = 4.0  # of the reprojection limit: a draft is a few pixels off, and would lose long tracks
@@ -36,13 +38,18 @@ _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other i
 
 
 def map_database(
-    database: Path | str, options: MapOptions | None = None, progress: Progress | None = None
+    database: Path | str,
+    options: MapOptions | None = None,
+    *,
+    progress: Progress | None = None,
+    **overrides: Any,
 ) -> MapResult:
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
 
     Args:
         database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
-        options: settings; defaults if None.
+        options: settings, see `help(MapOptions)`; defaults if None.
+        **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
 
     Returns:
@@ -53,7 +60,7 @@ def map_database(
         InputError: if the database cannot be used; the message says what to do.
         UnsolvableError: if no component of three images or more can be placed.
     """
-    options = options or MapOptions()
+    options = merge_options(options, MapOptions, overrides)
     path, clock = Path(database), Clock(progress) if progress else Clock()
     run = _Run(options, clock)
     with clock("read"):
@@ -64,7 +71,7 @@ def map_database(
             path,
             unposed,
             LEAST_MATCHES,
-            options.relative,
+            options.relative_rotations,
             options.num_threads(),
             clock.advance,
         )
@@ -155,7 +162,7 @@ class _Run:
             settings["refine_rotations"] = False
         with self.clock("locate"):
             model = posed_at_origin(images.reconstruction, image_ids, rotations)
-            return locate(model, path, LocateOptions(**settings), self.clock.progress)
+            return locate(model, path, options=LocateOptions(**settings), progress=self.clock.progress)
 
     def _drafted(
         self,
@@ -174,12 +181,12 @@ class _Run:
             "max_reprojection_error_px": limit,
         }
         model = posed_at_origin(images.reconstruction, image_ids, rotations)
-        draft = locate(model, path, LocateOptions(**draft_settings))  # type: ignore[arg-type]
+        draft = locate(model, path, options=LocateOptions(**draft_settings))  # type: ignore[arg-type]
         try:
             adjusted = bundle_adjust(
                 draft.reconstruction,
                 draft.reconstruction,
-                self.options.for_structure(),
+                self.options,
                 AdjustmentOptions(rounds=1),
             )
         except UnsolvableError:

@@ -5,17 +5,16 @@ Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded mod
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.colmap.seed import write_model
-from sfm_shapefit.report.files import write_pictures
-from sfm_shapefit.report.read_back import scene_of_graph, scene_of_model
+from sfm_shapefit.report.mesh import write_meshes
+from sfm_shapefit.report.page import write_report
+from sfm_shapefit.report.read_back import draw_graph, draw_model
 from sfm_shapefit.results.exports import agreeing_onedsfm, positions_g2o
-from sfm_shapefit.results.map_result import MapResult, map_summary
+from sfm_shapefit.results.map_result import MapResult
 from sfm_shapefit.results.result import GraphResult, LocateResult
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
-from sfm_shapefit.results.summary import graph_summary, summary
 from sfm_shapefit.results.tables import CameraRow, PairRow, write_json, write_rows
 
 
@@ -44,12 +43,12 @@ def write_result(
     inputs = [path for path in (found.inputs.folder, found.inputs.database) if path is not None]
     with atomic_folder(out, overwrite=overwrite, protect=[*inputs, *protect]) as folder:
         write_model(found.reconstruction, folder)
-        _write_tables(found, summary(found), folder, report=report, scene=scene)
+        _write_tables(found, folder, report=report, scene=scene)
         for piece in found.further:
             subfolder = folder / folder_of(piece.placement.piece)
             subfolder.mkdir(parents=True)
             write_model(piece.reconstruction, subfolder)
-            write_rows(piece.cameras, CameraRow, 3, subfolder / "cameras.csv")
+            write_rows(piece.camera_rows, CameraRow, 3, subfolder / "cameras.csv")
 
 
 def write_graph_result(
@@ -81,7 +80,7 @@ def write_graph_result(
             (folder / "1dsfm").mkdir()
             for name, text in agreeing_onedsfm(found).items():
                 (folder / "1dsfm" / name).write_text(text, encoding="utf-8")
-        _write_tables(found, graph_summary(found), folder, report=report, scene=scene)
+        _write_tables(found, folder, report=report, scene=scene)
         for piece in found.further:
             subfolder = folder / folder_of(piece.piece)
             subfolder.mkdir(parents=True)
@@ -89,20 +88,18 @@ def write_graph_result(
             write_rows(rows, CameraRow, piece.graph.dimension, subfolder / "cameras.csv")
 
 
-def _write_tables(
-    found: LocateResult | GraphResult, facts: dict[str, Any], folder: Path, *, report: bool, scene: bool
-) -> None:
+def _write_tables(found: LocateResult | GraphResult, folder: Path, *, report: bool, scene: bool) -> None:
     dimension = found.placement.graph.dimension
-    cameras, pairs = found.cameras, found.pairs
-    write_rows(cameras, CameraRow, dimension, folder / "cameras.csv")
-    write_rows(pairs, PairRow, dimension, folder / "pairs.csv")
+    write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
+    write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    facts = found.summary()
     write_json(facts, folder / MARKER)
     if report or scene:
-        if isinstance(found, GraphResult):
-            drawn = scene_of_graph(found, cameras, pairs)
-        else:
-            drawn = scene_of_model(found, cameras, pairs)
-        write_pictures(drawn, facts, folder, report=report, meshes=scene)
+        drawing = draw_graph(found) if isinstance(found, GraphResult) else draw_model(found)
+        if report:
+            write_report(drawing, facts, folder / "report.html")
+        if scene:
+            write_meshes(drawing, folder)
 
 
 def write_map_result(
@@ -129,4 +126,4 @@ def write_map_result(
     with atomic_folder(out, overwrite=overwrite, protect=[found.database, *protect]) as folder:
         for number, model in enumerate(found.models):
             write_result(model.located, folder / str(number), report=report, scene=scene)
-        write_json(map_summary(found), folder / MAP_MARKER)
+        write_json(found.summary(), folder / MAP_MARKER)

@@ -27,23 +27,3 @@ Geman-McClure weights: Zhang, "Parameter estimation techniques", IVC 1997, table
 M-estimator and weights by leverage: Huber and Ronchetti, "Robust Statistics", 2nd ed., sections 3.2 and 7.9;
 the bias of noise in the normals: Kanatani, "Statistical Optimization for Geometric Computation", 1996, ch. 9.
 """
-
-from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.pair_directions import (
-    CONTRADICTIONS,
-    DirectionOptions,
-    DirectionStatus,
-    PairDirections,
-    concatenate,
-)
-from sfm_shapefit.directions.relative_poses import from_relative_poses
-
-__all__ = [
-    "CONTRADICTIONS",
-    "DirectionOptions",
-    "DirectionStatus",
-    "PairDirections",
-    "concatenate",
-    "estimate_directions",
-    "from_relative_poses",
-]

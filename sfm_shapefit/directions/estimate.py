@@ -6,7 +6,8 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.kernels import MEASURES, MIN_MATCHES, estimate_pairs
-from sfm_shapefit.directions.pair_directions import DirectionOptions, DirectionStatus, PairDirections
+from sfm_shapefit.directions.options import DirectionOptions
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.geometry import tangent_bases
 
 

@@ -1,4 +1,4 @@
-"""What is asked of a pair before its direction is believed, and what is known of it afterwards."""
+"""What is known of the direction of each pair."""
 
 import enum
 from collections import Counter
@@ -30,44 +30,6 @@ CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MIS
 
 _FLOOR_DEG = 0.05  # what good rotations leave in any direction; matches that promise more are no better
 _MIN_WEIGHT = 0.02  # keeps the program well conditioned; a camera may have nothing better
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DirectionOptions:
-    """What a pair must show before its direction is believed."""
-
-    min_inliers: int = 15
-    """Least number of inlier matches with parallax whose point lies in front of both cameras."""
-    min_inlier_ratio: float = 0.5
-    """Least share of inliers among the pair's matches; repeated facades show up below it."""
-    max_rival_share: float = 0.5
-    """Largest number of matches that speak for a second direction only, per match that speaks for the first
-    only; repeated facades and moving things show up above it."""
-    min_sign_majority: float = 5.0
-    """Points in front of both cameras must outnumber those behind both by this factor."""
-    max_sigma_deg: float = 10.0
-    """Largest standard deviation of the direction; beyond it there is no parallax to speak of."""
-    inlier_threshold_px: float = 2.0
-    """Largest Sampson error of an inlier; a Sampson error of 2 px allows 2.8 px off the epipolar line."""
-    max_rotation_error_deg: float = 10.0
-    """Largest angle between a stored relative rotation and the given ones (relative poses only)."""
-    num_hypotheses: int = 200
-    """Two-match hypotheses per pair."""
-
-    def __post_init__(self) -> None:
-        for name, low, high in (
-            ("min_inliers", 2, np.inf),
-            ("min_inlier_ratio", 0.0, 1.0),
-            ("max_rival_share", 0.0, np.inf),
-            ("min_sign_majority", 1.0, np.inf),
-            ("max_sigma_deg", 1e-6, 90.0),
-            ("inlier_threshold_px", 1e-3, np.inf),
-            ("max_rotation_error_deg", 1e-6, 180.0),
-            ("num_hypotheses", 1, 10_000),
-        ):
-            value = getattr(self, name)
-            if not low <= value <= high:
-                raise ValueError(f"DirectionOptions.{name} must lie in [{low}, {high}], got {value}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -3,7 +3,8 @@
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.pair_directions import DirectionOptions, DirectionStatus, PairDirections
+from sfm_shapefit.directions.options import DirectionOptions
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.geometry import normalized
 
 

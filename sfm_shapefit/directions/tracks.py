@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions import PairDirections
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 

@@ -114,7 +114,7 @@ def assess(
     groups: RigidGroups | None = None,
     held: int | None = None,
     unheld: IntArray | None = None,
-    factor_memory: int = 2000,
+    factor_memory_mb: int = 2000,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
@@ -130,7 +130,7 @@ def assess(
         held: the group that stays where it is; the mean of the cameras does if None.
         unheld: nodes that stand where they do for want of anything better, such as those that the finish put
             back: their standard deviations are infinite, and they hold no others; none if None.
-        factor_memory: MB that the factor for standard deviations may take; of groups it is small.
+        factor_memory_mb: what the factor for standard deviations may take; of groups it is small.
     """
     freedom = graph.dimension - 1
     k = graph.num_nodes if num_cameras is None else num_cameras
@@ -151,7 +151,7 @@ def assess(
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
     errors = None if evidence is None else evidence.errors
     sampled = None if errors is None else _Sampled(errors, excess, scale)
-    separately = partial(_propagated, factor_memory * 1_000_000)
+    separately = partial(_propagated, factor_memory_mb * 1_000_000)
     propagated = separately if groups is None else partial(_propagated_over, groups, held)
     holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
     covariances, leverages = propagated(graph, locations, holding, information, k, sampled)

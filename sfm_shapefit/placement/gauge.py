@@ -20,8 +20,7 @@ from sfm_shapefit.geometry import (
     median_spread,
     rotation_angles_deg,
 )
-
-Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
+from sfm_shapefit.refinement.options import Scale
 
 _CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
 _ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread

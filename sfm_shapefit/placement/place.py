@@ -236,8 +236,8 @@ def _place_piece(
 
     solved, finished = _solved(piece, options, known, classes, watch)
     placed = int(np.sum(nodes < num_cameras))
-    memory, back = options.factor_memory, finished.put_back
-    assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory=memory)
+    memory, back = options.factor_memory_mb, finished.put_back
+    assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory_mb=memory)
     rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
     return Placement(
         graph=graph,
@@ -262,7 +262,7 @@ def _solved(
 ) -> tuple[SolverResult, Finish]:
     """Solve and finish a rigid graph."""
     if options.solves_shapefit:
-        solved = solve(piece, options, watch if piece.num_edges <= _MOST_WATCHED else None)
+        solved = solve(piece, options, on_iteration=watch if piece.num_edges <= _MOST_WATCHED else None)
     else:
         solved = solve_baseline(piece, options.objective)
     return solved, finish(piece, solved, options, covariance, classes)

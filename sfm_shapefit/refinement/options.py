@@ -1,35 +1,39 @@
 """How a view graph is placed: the solver's options, and what follows the certified solve. Pure data."""
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
+from sfm_shapefit.settings import explained, option
 from sfm_shapefit.solver.options import SolverOptions
 
 Filter = Literal["none", "1dsfm", "triangles"]
+Scale = Literal["auto", "input", "unit", "prior", "distance", "rig"]
 Objective = Literal["auto", "shapefit", "lud", "least-squares", "linf"]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@explained
+@dataclass(frozen=True, kw_only=True)
 class PlacementOptions(SolverOptions):
-    """Settings of a placement."""
+    """What follows the certified solve."""
 
-    objective: Objective = "auto"
-    """Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which does not
-    collapse on long chains, refines both and keeps the one that fits the angles better; "shapefit" is the
-    certified answer itself, unrefined; "lud" takes LUD whatever its fit. "least-squares" and "linf" are
-    those baselines' own answers, unrefined and without any certificate, for comparison."""
-    filter: Filter = "none"
-    """What drops pairs before anything is solved: "1dsfm", those that contradict the order of the cameras
-    along random axes; "triangles", those that contradict their triangles. Goes with every objective."""
-    refine: bool = True
-    """Refine the start robustly in the angles of the directions; only for "auto" and "lud"."""
-
-    def __post_init__(self) -> None:
-        super(PlacementOptions, self).__post_init__()
-        for name, kind in (("objective", Objective), ("filter", Filter)):
-            choices, value = get_args(kind), getattr(self, name)
-            if value not in choices:
-                raise ValueError(f"PlacementOptions.{name} must be one of {choices}, got {value!r}")
+    objective: Objective = option(
+        "auto",
+        'Which program the locations come from. "auto" solves ShapeFit, certified, and LUD, which '
+        "does not collapse on long chains, refines both and keeps the one that fits the angles "
+        'better; "shapefit" is the certified answer itself, unrefined; "lud" takes LUD whatever its '
+        'fit. "least-squares" and "linf" are those baselines\' own answers, unrefined and without any '
+        "certificate, for comparison.",
+    )
+    filter: Filter = option(
+        "none",
+        'What drops pairs before anything is solved: "1dsfm", those that contradict the order of the '
+        'cameras along random axes; "triangles", those that contradict their triangles. Goes with '
+        "every objective.",
+    )
+    refine: bool = option(
+        True,
+        'Refine the start robustly in the angles of the directions; only for "auto" and "lud".',
+    )
 
     @property
     def solves_shapefit(self) -> bool:

@@ -142,8 +142,8 @@ def finish(
     metric = Metric(covariance, classes)
     if solved.status is Status.NOT_SOLVED:
         return _as_located(graph, solved, metric)
-    lud, second = _second_start(graph, classes, options.threads, groups)
-    plan = _plan(graph, groups, options.factor_memory * 1_000_000) if options.refines else None
+    lud, second = _second_start(graph, classes, options.num_threads(), groups)
+    plan = _plan(graph, groups, options.factor_memory_mb * 1_000_000) if options.refines else None
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
     candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])

@@ -1,6 +1,6 @@
 """What is drawn of a result: cameras, pairs and points as plain arrays. Page, meshes and viewer share it.
 
-Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a scene can be
+Rows of `Cameras` and `Pairs` are those of cameras.csv and pairs.csv, in their order, so that a drawing can be
 made of a result in memory or of its files. Positions are in the output's units and axes; what has no
 position holds NaN. Bare graphs of two dimensions lie in the plane z = 0, of more than three dimensions the
 first three are drawn.
@@ -113,7 +113,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class Drawing:
     """Everything that is drawn."""
 
     cameras: Cameras
@@ -137,7 +137,7 @@ class Scene:
         return float(np.linalg.norm(np.ptp(placed, axis=0))) if len(placed) else 0.0
 
 
-def build_scene(
+def build_drawing(
     cameras: Sequence[CameraRow],
     pairs: Sequence[PairRow],
     *,
@@ -149,8 +149,8 @@ def build_scene(
     input_is_aligned: bool = False,
     dimension: int = 3,
     history: Sequence[tuple[int, float, float | None]] = (),
-) -> Scene:
-    """Return the scene of a result's rows.
+) -> Drawing:
+    """Return the drawing of a result's rows.
 
     Args:
         cameras, pairs: rows of the tables.
@@ -173,7 +173,7 @@ def build_scene(
     own = _cameras(cameras, names, poses)
     positions = own.centers[own.placed]
     drawn = _points(points, positions)
-    return Scene(
+    return Drawing(
         cameras=own,
         pairs=_pairs(pairs, own, certified),
         points=drawn,
@@ -204,19 +204,19 @@ def poses_of(model: "PosedModel", names: Sequence[str]) -> Poses:
     return found
 
 
-def frustum_corners(scene: Scene, rows: IntArray, centers: FloatArray) -> FloatArray:
+def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> FloatArray:
     """Return the picture corners of cameras in the world's axes, shape (k, 4, 3), around each picture.
 
     Args:
-        scene: rotations, pictures and depth.
+        drawing: rotations, pictures and depth.
         rows: (k,) cameras with a rotation.
         centers: (k, 3) where they stand.
     """
     signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    halves = scene.cameras.poses.half_sizes[rows]
+    halves = drawing.cameras.poses.half_sizes[rows]
     in_camera = np.concatenate([signs * halves[:, None, :], np.ones((len(rows), 4, 1))], axis=2)
-    rotations = scene.cameras.poses.rotations[rows]
-    corners: FloatArray = centers[:, None, :] + scene.frustum_depth * in_camera @ rotations
+    rotations = drawing.cameras.poses.rotations[rows]
+    corners: FloatArray = centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations
     return corners
 
 

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.report.drawing import PairClass, Scene, frustum_corners
+from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners
 
 if TYPE_CHECKING:
     import trimesh
@@ -35,16 +35,18 @@ _MARKER_FACES = np.array(
 _MAX_PAIRS = 20_000
 
 
-def write_meshes(scene: Scene, folder: Path) -> None:
+def write_meshes(drawing: Drawing, folder: Path) -> None:
     """Write scene.glb and scene.ply into a folder."""
     import trimesh
 
-    vertices, faces, colors = _camera_mesh(scene)
-    ends, line_colors = _lines(scene)
-    _write_ply(scene, (vertices, faces, colors), (ends, line_colors), folder / "scene.ply")
+    vertices, faces, colors = _camera_mesh(drawing)
+    ends, line_colors = _lines(drawing)
+    _write_ply(drawing, (vertices, faces, colors), (ends, line_colors), folder / "scene.ply")
 
-    middle = np.median(scene.cameras.centers[scene.cameras.placed], axis=0) if len(vertices) else np.zeros(3)
-    right, forward, up = scene.axes
+    middle = (
+        np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0) if len(vertices) else np.zeros(3)
+    )
+    right, forward, up = drawing.axes
     turn = np.stack([right, up, -forward])
 
     def turned(points: FloatArray) -> FloatArray:
@@ -54,10 +56,10 @@ def write_meshes(scene: Scene, folder: Path) -> None:
     shown = trimesh.Scene()
     if len(faces):
         shown.add_geometry(_mesh(turned(vertices), faces, colors), geom_name="cameras")
-    if len(scene.points.positions):
-        positions = turned(scene.points.positions)
+    if len(drawing.points.positions):
+        positions = turned(drawing.points.positions)
         shown.add_geometry(
-            trimesh.PointCloud(positions, colors=_opaque(scene.points.colors)), geom_name="points"
+            trimesh.PointCloud(positions, colors=_opaque(drawing.points.colors)), geom_name="points"
         )
     for kind in PairClass:
         mine = (line_colors == PAIR_COLORS[kind]).all(axis=1)
@@ -76,15 +78,15 @@ def trust_colors(trust: FloatArray) -> Colors:
     return colors.round().astype(np.uint8)
 
 
-def _camera_mesh(scene: Scene) -> tuple[FloatArray, IntArray, Colors]:
+def _camera_mesh(drawing: Drawing) -> tuple[FloatArray, IntArray, Colors]:
     """Return vertices, faces and vertex colours of all placed cameras: pyramids, or octahedra for nodes."""
-    cameras = scene.cameras
+    cameras = drawing.cameras
     rows = np.flatnonzero(cameras.placed)
     has_picture = np.isfinite(cameras.poses.rotations[rows]).all(axis=(1, 2))
     pictured, bare = rows[has_picture], rows[~has_picture]
     apexes = cameras.centers[pictured]
-    pyramids = np.concatenate([apexes[:, None, :], frustum_corners(scene, pictured, apexes)], axis=1)
-    markers = cameras.centers[bare][:, None, :] + scene.frustum_depth / 4 * _MARKER
+    pyramids = np.concatenate([apexes[:, None, :], frustum_corners(drawing, pictured, apexes)], axis=1)
+    markers = cameras.centers[bare][:, None, :] + drawing.frustum_depth / 4 * _MARKER
     first = _PYRAMID + 5 * np.arange(len(pictured))[:, None, None]
     second = _MARKER_FACES + 6 * np.arange(len(bare))[:, None, None] + 5 * len(pictured)
     colors = [
@@ -98,32 +100,37 @@ def _camera_mesh(scene: Scene) -> tuple[FloatArray, IntArray, Colors]:
     )
 
 
-def _lines(scene: Scene) -> tuple[FloatArray, Colors]:
+def _lines(drawing: Drawing) -> tuple[FloatArray, Colors]:
     """Return the ends (k, 2, 3) and colours (k, 3) of the pairs whose cameras are placed, at most 20,000."""
-    worst = scene.pairs.worst_first()
-    ends = scene.pairs.cameras[worst]
-    drawn = scene.cameras.placed[ends].all(axis=1) & (scene.pairs.classes[worst] != PairClass.NO_DIRECTION)
+    worst = drawing.pairs.worst_first()
+    ends = drawing.pairs.cameras[worst]
+    drawn = drawing.cameras.placed[ends].all(axis=1) & (
+        drawing.pairs.classes[worst] != PairClass.NO_DIRECTION
+    )
     chosen = worst[drawn][:_MAX_PAIRS]
-    return scene.cameras.centers[scene.pairs.cameras[chosen]], PAIR_COLORS[scene.pairs.classes[chosen]]
+    return drawing.cameras.centers[drawing.pairs.cameras[chosen]], PAIR_COLORS[drawing.pairs.classes[chosen]]
 
 
 def _write_ply(
-    scene: Scene, cameras: tuple[FloatArray, IntArray, Colors], lines: tuple[FloatArray, Colors], path: Path
+    drawing: Drawing,
+    cameras: tuple[FloatArray, IntArray, Colors],
+    lines: tuple[FloatArray, Colors],
+    path: Path,
 ) -> None:
     """Write one mesh: cameras, ribbons for pairs, and points as vertices without faces."""
     vertices, faces, colors = cameras
     ends, line_colors = lines
     along = ends[:, 1] - ends[:, 0]
-    side = np.cross(along, scene.axes[2])
+    side = np.cross(along, drawing.axes[2])
     lengths = np.linalg.norm(side, axis=1, keepdims=True)
-    side = np.where(lengths > 0.0, side / np.where(lengths > 0.0, lengths, 1.0), scene.axes[0])
-    side = 0.5 * _RIBBON * scene.frustum_depth * side[:, None, :]
+    side = np.where(lengths > 0.0, side / np.where(lengths > 0.0, lengths, 1.0), drawing.axes[0])
+    side = 0.5 * _RIBBON * drawing.frustum_depth * side[:, None, :]
     ribbons = np.concatenate([ends - side, ends + side], axis=1)  # (k, 4, 3)
     quads = np.array([[0, 1, 3], [0, 3, 2]]) + 4 * np.arange(len(ends))[:, None, None] + len(vertices)
     mesh = _mesh(
-        np.concatenate([vertices, ribbons.reshape(-1, 3), scene.points.positions]),
+        np.concatenate([vertices, ribbons.reshape(-1, 3), drawing.points.positions]),
         np.concatenate([faces, quads.reshape(-1, 3)]),
-        np.concatenate([colors, np.repeat(line_colors, 4, axis=0), scene.points.colors.astype(np.uint8)]),
+        np.concatenate([colors, np.repeat(line_colors, 4, axis=0), drawing.points.colors.astype(np.uint8)]),
     )
     path.write_bytes(mesh.export(file_type="ply"))
 

@@ -24,35 +24,35 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import MAX_POINTS, PairClass, Scene, frustum_corners
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, PairClass, frustum_corners
 from sfm_shapefit.report.sentences import Hint, first_looks, shortened, summary_sentences
 from sfm_shapefit.results.tables import IN_MEMORY
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
 _MAX_BARS = 400  # of the chart of trust
-_MARGIN = 0.03  # of the scene's size, around it
-_FLATTEST = 0.02  # least side of the box around the scene, of the largest
+_MARGIN = 0.03  # of the drawing's size, around it
+_FLATTEST = 0.02  # least side of the box around the drawing, of the largest
 _MAX_HINGES = 20  # that are named per piece
 _STARTING_ITERATIONS = 2  # whose objectives may be far out of scale
 _AXES = "xyz"
 _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
 
-def write_report(scene: Scene, facts: dict[str, Any], path: Path) -> None:
+def write_report(drawing: Drawing, facts: dict[str, Any], path: Path) -> None:
     """Write the report of a result.
 
     Args:
-        scene: what is drawn.
+        drawing: what is drawn.
         facts: the contents of locate.json.
         path: the file.
     """
-    path.write_text(report_html(scene, facts), encoding="utf-8", newline="\n")
+    path.write_text(report_html(drawing, facts), encoding="utf-8", newline="\n")
 
 
-def report_html(scene: Scene, facts: dict[str, Any]) -> str:
+def report_html(drawing: Drawing, facts: dict[str, Any]) -> str:
     """Return the page; arguments as of `write_report`."""
-    data = page_data(scene, facts)
+    data = page_data(drawing, facts)
     plotly, script = _plotly(), _asset("page.js")
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
@@ -66,44 +66,44 @@ def report_html(scene: Scene, facts: dict[str, Any]) -> str:
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], _asset("page.html"))
 
 
-def page_data(scene: Scene, facts: dict[str, Any]) -> dict[str, Any]:
+def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
-    trust = scene.cameras.trust
+    trust = drawing.cameras.trust
     cameras = np.lexsort((trust, np.isnan(trust)))  # NaN last
-    pairs = scene.pairs.worst_first()[:MAX_PAIRS]
+    pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)
     rank[cameras] = np.arange(len(cameras))
-    display = _Display(scene)
-    histogram = residual_histogram(scene.pairs)
+    display = _Display(drawing)
+    histogram = residual_histogram(drawing.pairs)
     return {
         "title": _title(facts),
         "subtitle": _subtitle(facts),
-        "tiles": _tiles(scene, facts),
-        "summary": summary_sentences(scene, facts),
-        "looks": [_look(hint, rank, pairs) for hint in first_looks(scene, facts)],
-        "dimension": scene.dimension,
-        "shownAxes": min(scene.dimension, len(_AXES)),
-        "frustum": scene.frustum_depth,
+        "tiles": _tiles(drawing, facts),
+        "summary": summary_sentences(drawing, facts),
+        "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
+        "dimension": drawing.dimension,
+        "shownAxes": min(drawing.dimension, len(_AXES)),
+        "frustum": drawing.frustum_depth,
         "box": [*display.low.tolist(), *display.high.tolist()],
-        "cameras": _cameras(scene, cameras, display, reasons),
-        "pairs": _pairs(scene, pairs, rank, reasons),
+        "cameras": _cameras(drawing, cameras, display, reasons),
+        "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
-            "positions": _packed(display(scene.points.positions), "f4"),
-            "colors": _packed(scene.points.colors, "u1"),
+            "positions": _packed(display(drawing.points.positions), "f4"),
+            "colors": _packed(drawing.points.colors, "u1"),
         },
         "reasons": [shortened(text) for text in reasons],
-        "sceneNote": _scene_note(scene),
-        "pairsNote": _pairs_note(scene),
-        "hasSupport": bool(np.any(scene.pairs.support > 0)),
+        "sceneNote": _scene_note(drawing),
+        "pairsNote": _pairs_note(drawing),
+        "hasSupport": bool(np.any(drawing.pairs.support > 0)),
         "trustOrder": list(range(min(int(np.isfinite(trust).sum()), _MAX_BARS))),
         "histogram": {
             "edges": histogram.edges_deg.tolist(),
             "counts": {state: values.tolist() for state, values in histogram.counts.items()},
         },
-        "matrix": _matrix(scene, rank),
-        "convergence": _convergence(scene),
-        "notes": _notes(scene, histogram.medians_deg),
+        "matrix": _matrix(drawing, rank),
+        "convergence": _convergence(drawing),
+        "notes": _notes(drawing, histogram.medians_deg),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts["pieces"])],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
         "options": [[name.replace("_", " "), _option(value)] for name, value in facts["options"].items()],
@@ -117,15 +117,15 @@ def page_data(scene: Scene, facts: dict[str, Any]) -> dict[str, Any]:
 class _Display:
     """The map to the page's axes: around the middle, x to the right and z up, and float32 is enough."""
 
-    def __init__(self, scene: Scene) -> None:
-        self._axes = scene.axes
-        centers = scene.cameras.centers[scene.cameras.placed]
-        drawn = np.concatenate([centers, scene.points.positions, np.zeros((int(len(centers) == 0), 3))])
+    def __init__(self, drawing: Drawing) -> None:
+        self._axes = drawing.axes
+        centers = drawing.cameras.centers[drawing.cameras.placed]
+        drawn = np.concatenate([centers, drawing.points.positions, np.zeros((int(len(centers) == 0), 3))])
         self._middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
         inside = self(drawn)
         low, high = inside.min(axis=0), inside.max(axis=0)
         largest = float((high - low).max()) or 1.0
-        half = np.maximum((high - low) / 2, _FLATTEST * largest) + _MARGIN * largest + scene.frustum_depth
+        half = np.maximum((high - low) / 2, _FLATTEST * largest) + _MARGIN * largest + drawing.frustum_depth
         self.low, self.high = (low + high) / 2 - half, (low + high) / 2 + half
 
     def __call__(self, points: FloatArray) -> FloatArray:
@@ -137,10 +137,10 @@ class _Display:
 # --- columns ---------------------------------------------------------------------------------------
 
 
-def _cameras(scene: Scene, order: IntArray, display: _Display, reasons: dict[str, int]) -> dict[str, Any]:
-    cameras = scene.cameras
-    corners = frustum_corners(scene, order, cameras.centers[order])
-    shown = display(cameras.poses.centers[order]) if scene.input_is_aligned else None
+def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict[str, int]) -> dict[str, Any]:
+    cameras = drawing.cameras
+    corners = frustum_corners(drawing, order, cameras.centers[order])
+    shown = display(cameras.poses.centers[order]) if drawing.input_is_aligned else None
     return {
         "names": [shortened(cameras.names[k]) for k in order.tolist()],
         "placed": _packed(cameras.placed[order], "u1"),
@@ -156,8 +156,8 @@ def _cameras(scene: Scene, order: IntArray, display: _Display, reasons: dict[str
     }
 
 
-def _pairs(scene: Scene, order: IntArray, rank: IntArray, reasons: dict[str, int]) -> dict[str, Any]:
-    pairs = scene.pairs
+def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str, int]) -> dict[str, Any]:
+    pairs = drawing.pairs
     ends = rank[pairs.cameras[order]]
     columns = {
         "residual": pairs.residuals_deg,
@@ -187,8 +187,8 @@ def _packed(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
     return {"type": kind, "bytes": base64.b64encode(raw).decode("ascii")}
 
 
-def _matrix(scene: Scene, rank: IntArray) -> dict[str, Any]:
-    matrix = view_graph_matrix(scene.pairs, len(rank))
+def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
+    matrix = view_graph_matrix(drawing.pairs, len(rank))
     return {
         "side": len(matrix.cells),
         "perCell": matrix.cameras_per_cell,
@@ -198,16 +198,16 @@ def _matrix(scene: Scene, rank: IntArray) -> dict[str, Any]:
     }
 
 
-def _convergence(scene: Scene) -> dict[str, Any]:
+def _convergence(drawing: Drawing) -> dict[str, Any]:
     """Return the history; the axis leaves out the first iterations where those are far out of scale."""
-    objectives = [objective for _, objective, _ in scene.history]
-    bounds = [bound for _, _, bound in scene.history if bound is not None]
+    objectives = [objective for _, objective, _ in drawing.history]
+    bounds = [bound for _, _, bound in drawing.history if bound is not None]
     shown = (objectives[_STARTING_ITERATIONS:] or objectives) + (bounds[_STARTING_ITERATIONS:] or bounds)
     margin = 0.1 * (max(shown) - min(shown)) if shown else 0.0
     return {
-        "iterations": [iteration for iteration, _, _ in scene.history],
+        "iterations": [iteration for iteration, _, _ in drawing.history],
         "objectives": objectives,
-        "bounds": [bound for _, _, bound in scene.history],
+        "bounds": [bound for _, _, bound in drawing.history],
         "range": [min(shown) - margin, max(shown) + margin] if margin > 0.0 else None,
     }
 
@@ -230,8 +230,8 @@ def _subtitle(facts: dict[str, Any]) -> str:
     return shortened(origin + f"{sum(facts['timings_s'].values()):.1f} s in all", 400)
 
 
-def _tiles(scene: Scene, facts: dict[str, Any]) -> list[list[str]]:
-    cameras, classes = scene.cameras, scene.pairs.classes
+def _tiles(drawing: Drawing, facts: dict[str, Any]) -> list[list[str]]:
+    cameras, classes = drawing.cameras, drawing.pairs.classes
     trust = cameras.trust[cameras.placed]
     tiles = [
         [f"{int(cameras.placed.sum()):,} / {len(cameras.names):,}", "cameras placed"],
@@ -241,10 +241,10 @@ def _tiles(scene: Scene, facts: dict[str, Any]) -> list[list[str]]:
     ]
     if np.isfinite(trust).any():
         tiles.append([f"{np.nanmin(trust):.2f}", f"least trust, median {np.nanmedian(trust):.2f}"])
-    if scene.points.num_all:
+    if drawing.points.num_all:
         error = facts.get("mean_reprojection_error_px")
         mean = f", mean error {error:.2f} px" if error is not None and np.isfinite(error) else ""
-        tiles.append([f"{scene.points.num_all:,}", f"points{mean}"])
+        tiles.append([f"{drawing.points.num_all:,}", f"points{mean}"])
     return tiles
 
 
@@ -258,22 +258,24 @@ def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
     }
 
 
-def _scene_note(scene: Scene) -> str:
-    notes = [f"Cameras span {scene.extent:.4g} units; frusta are drawn {scene.frustum_depth:.2g} units deep."]
-    if not np.isfinite(scene.cameras.poses.rotations[scene.cameras.placed]).any():
-        notes = [f"Nodes span {scene.extent:.4g} units."]
-    if scene.dimension > len(_AXES):
-        notes.append(f"The first three of {scene.dimension} dimensions are drawn.")
-    if scene.points.num_all > len(scene.points.positions):
+def _scene_note(drawing: Drawing) -> str:
+    notes = [
+        f"Cameras span {drawing.extent:.4g} units; frusta are drawn {drawing.frustum_depth:.2g} units deep."
+    ]
+    if not np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).any():
+        notes = [f"Nodes span {drawing.extent:.4g} units."]
+    if drawing.dimension > len(_AXES):
+        notes.append(f"The first three of {drawing.dimension} dimensions are drawn.")
+    if drawing.points.num_all > len(drawing.points.positions):
         notes.append(
-            f"{len(scene.points.positions):,} of {scene.points.num_all:,} points are drawn "
+            f"{len(drawing.points.positions):,} of {drawing.points.num_all:,} points are drawn "
             f"(at most {MAX_POINTS:,}, without those far outside)."
         )
-    return " ".join([*notes, _pairs_note(scene)]).strip()
+    return " ".join([*notes, _pairs_note(drawing)]).strip()
 
 
-def _pairs_note(scene: Scene) -> str:
-    total = len(scene.pairs.classes)
+def _pairs_note(drawing: Drawing) -> str:
+    total = len(drawing.pairs.classes)
     if total <= MAX_PAIRS:
         return ""
     return (
@@ -282,15 +284,15 @@ def _pairs_note(scene: Scene) -> str:
     )
 
 
-def _notes(scene: Scene, medians_deg: dict[str, float]) -> dict[str, str]:
+def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
-    known = int(np.isfinite(scene.cameras.trust).sum())
+    known = int(np.isfinite(drawing.cameras.trust).sum())
     return {
         "histogram": _histogram_note(medians_deg),
         "trust": f"The {_MAX_BARS} least trusted of {known:,} cameras." if known > _MAX_BARS else "",
-        "matrix": _matrix_note(-(-len(scene.cameras.names) // MOST_CELLS)),
-        "support": _support_note(scene),
-        "convergence": _convergence_note(scene),
+        "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
+        "support": _support_note(drawing),
+        "convergence": _convergence_note(drawing),
         "pieces": "Directions fix neither scale nor place of one piece against another; a hinge is a camera "
         "that two pieces share.",
     }
@@ -317,17 +319,17 @@ def _matrix_note(cameras_per_cell: int) -> str:
     return "Blue agrees, red contradicts, yellow cannot be judged, grey has no direction."
 
 
-def _support_note(scene: Scene) -> str:
-    if not np.any(scene.pairs.support > 0):
+def _support_note(drawing: Drawing) -> str:
+    if not np.any(drawing.pairs.support > 0):
         return "A bare graph does not say how many matches a pair has."
-    listed = " Shown are the listed pairs." if len(scene.pairs.classes) > MAX_PAIRS else ""
+    listed = " Shown are the listed pairs." if len(drawing.pairs.classes) > MAX_PAIRS else ""
     return f"Wrong pairs with many matches are repeated structure or wrong rotations.{listed}"
 
 
-def _convergence_note(scene: Scene) -> str:
-    if not scene.history:
+def _convergence_note(drawing: Drawing) -> str:
+    if not drawing.history:
         return "The iterations of this solve were not recorded."
-    if any(bound is not None for _, _, bound in scene.history):
+    if any(bound is not None for _, _, bound in drawing.history):
         return "The bound proves that no placement has a lower objective; it is certified anew at the end."
     return "The splitting method has no bound on the way; its certificate is computed at the end."
 

@@ -1,10 +1,10 @@
-"""Scenes of results in memory and of output folders."""
+"""Drawings of results in memory and of output folders."""
 
 import csv
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,39 +14,32 @@ from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import refuse_irregular_file
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.report.drawing import Scene, build_scene
+from sfm_shapefit.report.drawing import Drawing, build_drawing
+from sfm_shapefit.results.result import GraphResult, LocateResult
 from sfm_shapefit.results.tables import CameraRow, PairRow, axis_names
 
-if TYPE_CHECKING:
-    from sfm_shapefit.results import GraphResult, LocateResult
 
-
-def scene_of_model(found: "LocateResult", cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Scene:
-    """Return the scene of a placed model.
-
-    Args:
-        found: what `locate` returned.
-        cameras, pairs: its rows, which are costly to make again.
-    """
-    return build_scene(
-        cameras,
-        pairs,
+def draw_model(found: LocateResult) -> Drawing:
+    """Return the drawing of a placed model."""
+    return build_drawing(
+        found.cameras,
+        found.pairs,
         model=found.model,
         original=found.model,
         turn=found.gauge.axes,
         points=found.reconstruction,
-        certified=_certified(found.placement, len(cameras)),
+        certified=_certified(found.placement, len(found.cameras)),
         input_is_aligned=found.gauge.scale == "input",
         history=_history(found.placement),
     )
 
 
-def scene_of_graph(found: "GraphResult", cameras: Sequence[CameraRow], pairs: Sequence[PairRow]) -> Scene:
-    """Return the scene of a placed bare graph; arguments as of `scene_of_model`."""
-    return build_scene(
-        cameras,
-        pairs,
-        certified=_certified(found.placement, len(cameras)),
+def draw_graph(found: GraphResult) -> Drawing:
+    """Return the drawing of a placed bare graph."""
+    return build_drawing(
+        found.cameras,
+        found.pairs,
+        certified=_certified(found.placement, len(found.cameras)),
         dimension=found.placement.graph.dimension,
         history=_history(found.placement),
     )
@@ -64,8 +57,8 @@ def _history(placement: Placement) -> list[tuple[int, float, float | None]]:
     return [(info.iteration, info.objective, info.dual_bound) for info in placement.history]
 
 
-def read_output(folder: Path) -> tuple[Scene, dict[str, Any]]:
-    """Return the scene of an output folder, and the contents of its locate.json.
+def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
+    """Return the drawing of an output folder, and the contents of its locate.json.
 
     The convex optimum and its iterations are not in the files, and the input's centres only where the input
     still is where it was.
@@ -84,7 +77,7 @@ def read_output(folder: Path) -> tuple[Scene, dict[str, Any]]:
         cameras = [_camera_row(cells, axes) for cells in _read_csv(folder / "cameras.csv")]
         pairs = [_pair_row(cells, axes) for cells in _read_csv(folder / "pairs.csv")]
         model = None if "graph" in facts["inputs"] else read_model(folder)
-        scene = build_scene(
+        drawing = build_drawing(
             cameras,
             pairs,
             model=model,
@@ -97,7 +90,7 @@ def read_output(folder: Path) -> tuple[Scene, dict[str, Any]]:
         raise InputError(
             f"the files of {folder} are damaged or of another version ({error}); run locate again"
         ) from error
-    return scene, facts
+    return drawing, facts
 
 
 def _input_of(facts: dict[str, Any]) -> PosedModel | None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.report.drawing import PairClass, Scene
+from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -38,52 +38,52 @@ def shortened(text: str, limit: int = MAX_TEXT) -> str:
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)
 
 
-def summary_sentences(scene: Scene, facts: dict[str, Any]) -> list[str]:
+def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
     """Return what was placed and how certain it is, a sentence each.
 
     Args:
-        scene: what is drawn.
+        drawing: what is drawn.
         facts: the contents of locate.json.
     """
     return [
-        _placed(scene),
-        _pairs(scene, facts),
-        *_certainty(scene),
+        _placed(drawing),
+        _pairs(drawing, facts),
+        *_certainty(drawing),
         _optimum(facts["solve"]),
         f"Scale and origin: {shortened(_scale(facts), 2 * MAX_TEXT)}.",
     ]
 
 
-def first_looks(scene: Scene, facts: dict[str, Any]) -> list[Hint]:
+def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
     return [
         *(Hint(text=shortened(text, 2 * MAX_TEXT)) for text in facts["warnings"]),
-        *_left_out(scene),
-        *_least_trusted(scene),
-        *_contradictions(scene),
+        *_left_out(drawing),
+        *_least_trusted(drawing),
+        *_contradictions(drawing),
         *_loose(facts),
-        *_unchecked(scene),
+        *_unchecked(drawing),
     ]
 
 
-def _noun(scene: Scene) -> str:
-    return "images" if np.isfinite(scene.cameras.poses.rotations).any() else "nodes"
+def _noun(drawing: Drawing) -> str:
+    return "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
 
 
-def _placed(scene: Scene) -> str:
-    placed, total = int(scene.cameras.placed.sum()), len(scene.cameras.names)
+def _placed(drawing: Drawing) -> str:
+    placed, total = int(drawing.cameras.placed.sum()), len(drawing.cameras.names)
     if placed == total:
-        return f"All {total:,} {_noun(scene)} were placed."
-    elsewhere = int(np.sum(~scene.cameras.placed & (scene.cameras.pieces > 0)))
+        return f"All {total:,} {_noun(drawing)} were placed."
+    elsewhere = int(np.sum(~drawing.cameras.placed & (drawing.cameras.pieces > 0)))
     note = f" ({elsewhere:,} in smaller pieces)" if elsewhere else ""
     missing = f"{total - placed:,} {'is' if total - placed == 1 else 'are'} not in this model"
-    return f"{placed:,} of {total:,} {_noun(scene)} were placed; {missing}{note}."
+    return f"{placed:,} of {total:,} {_noun(drawing)} were placed; {missing}{note}."
 
 
-def _pairs(scene: Scene, facts: dict[str, Any]) -> str:
-    counts = np.bincount(scene.pairs.classes, minlength=len(PairClass)).tolist()
+def _pairs(drawing: Drawing, facts: dict[str, Any]) -> str:
+    counts = np.bincount(drawing.pairs.classes, minlength=len(PairClass)).tolist()
     text = (
-        f"Of {len(scene.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the solution "
+        f"Of {len(drawing.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the solution "
         f"(a standard deviation of {facts['residual_level_deg']:.2g} degrees per axis) and "
         f"{counts[PairClass.CONTRADICTS]:,} contradict it"
     )
@@ -95,17 +95,17 @@ def _pairs(scene: Scene, facts: dict[str, Any]) -> str:
     return text + "."
 
 
-def _certainty(scene: Scene) -> Iterator[str]:
-    sigmas = scene.cameras.sigmas[scene.cameras.placed]
+def _certainty(drawing: Drawing) -> Iterator[str]:
+    sigmas = drawing.cameras.sigmas[drawing.cameras.placed]
     known = np.isfinite(sigmas)
-    if not known.any() or scene.extent <= 0.0:
+    if not known.any() or drawing.extent <= 0.0:
         return
-    worst = int(np.argmax(np.where(scene.cameras.placed, np.nan_to_num(scene.cameras.sigmas), -1.0)))
+    worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     median = float(np.median(sigmas[known]))
     yield (
         f"The median standard deviation of a position is {median:.2g} units, "
-        f"{100.0 * median / scene.extent:.2g}% of the extent of {scene.extent:.4g} units; the largest is "
-        f"{scene.cameras.sigmas[worst]:.2g}, of {shortened(scene.cameras.names[worst])}."
+        f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
+        f"{drawing.cameras.sigmas[worst]:.2g}, of {shortened(drawing.cameras.names[worst])}."
     )
 
 
@@ -129,31 +129,31 @@ def _scale(facts: dict[str, Any]) -> str:
     return str(facts.get("scale") or "the solver's own units, the centroid at the origin")
 
 
-def _left_out(scene: Scene) -> Iterator[Hint]:
-    rows = np.flatnonzero(~scene.cameras.placed).tolist()
+def _left_out(drawing: Drawing) -> Iterator[Hint]:
+    rows = np.flatnonzero(~drawing.cameras.placed).tolist()
     for row in rows[:_SHOWN]:
-        name, reason = scene.cameras.names[row], scene.cameras.reasons[row]
+        name, reason = drawing.cameras.names[row], drawing.cameras.reasons[row]
         yield Hint(text=f"{shortened(name)} is not placed: {shortened(reason)}", camera=row)
     if len(rows) > _SHOWN:
         yield Hint(text=f"{len(rows) - _SHOWN:,} more are not placed; the table of cameras says why")
 
 
-def _least_trusted(scene: Scene) -> Iterator[Hint]:
-    trust = np.where(scene.cameras.placed, scene.cameras.trust, np.nan)
+def _least_trusted(drawing: Drawing) -> Iterator[Hint]:
+    trust = np.where(drawing.cameras.placed, drawing.cameras.trust, np.nan)
     low = np.flatnonzero(trust < _LOW_TRUST)
     for row in low[np.argsort(trust[low], kind="stable")][:_SHOWN].tolist():
-        reason = shortened(scene.cameras.reasons[row] or "its pairs speak against it")
+        reason = shortened(drawing.cameras.reasons[row] or "its pairs speak against it")
         yield Hint(
-            text=f"{shortened(scene.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row
+            text=f"{shortened(drawing.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row
         )
 
 
-def _contradictions(scene: Scene) -> Iterator[Hint]:
+def _contradictions(drawing: Drawing) -> Iterator[Hint]:
     """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
 
     Those that are off by little, if by more than the others, come together in a sentence.
     """
-    pairs = scene.pairs
+    pairs = drawing.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
     far = pairs.residuals_deg[against] >= _FAR_DEG
     if len(against) and not far.any():
@@ -164,7 +164,7 @@ def _contradictions(scene: Scene) -> Iterator[Hint]:
     against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
     for row in against[order][:_SHOWN].tolist():
-        first, second = (shortened(scene.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
+        first, second = (shortened(drawing.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
         matches = f" with {pairs.support[row]:,} matches" if pairs.support[row] else ""
         yield Hint(
             text=f"{first} to {second}{matches} contradicts the solution "
@@ -180,8 +180,8 @@ def _loose(facts: dict[str, Any]) -> Iterator[Hint]:
         yield Hint(text=f"{names}{more}: loose, {shortened(group['cause'])}")
 
 
-def _unchecked(scene: Scene) -> Iterator[Hint]:
-    count = int(np.sum(scene.pairs.classes == PairClass.UNDETERMINED))
+def _unchecked(drawing: Drawing) -> Iterator[Hint]:
+    count = int(np.sum(drawing.pairs.classes == PairClass.UNDETERMINED))
     if count:
         what = "1 pair" if count == 1 else f"{count:,} pairs"
         yield Hint(text=f"{what} cannot be judged: unchecked by others, or in a piece that is not solved")

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
-from sfm_shapefit.report.drawing import PairClass, Scene, frustum_corners
+from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
 from sfm_shapefit.report.sentences import shortened
 
@@ -55,9 +55,9 @@ class DrawnPairs:
     """By the threshold, not by the verdict."""
 
 
-def drawn_pairs(scene: Scene, thresholds: Thresholds) -> DrawnPairs:
+def drawn_pairs(drawing: Drawing, thresholds: Thresholds) -> DrawnPairs:
     """Return which pairs are drawn and how, the worst first."""
-    cameras, pairs = scene.cameras, scene.pairs
+    cameras, pairs = drawing.cameras, drawing.pairs
     shown = cameras.placed & ~(cameras.trust < thresholds.min_trust)
     kept = shown[pairs.cameras].all(axis=1) & np.isfinite(pairs.residuals_deg)
     kept &= pairs.support >= thresholds.min_support
@@ -68,16 +68,16 @@ def drawn_pairs(scene: Scene, thresholds: Thresholds) -> DrawnPairs:
     return DrawnPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
 
 
-def camera_at(scene: Scene, origin: FloatArray, direction: FloatArray) -> int | None:
+def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> int | None:
     """Return the placed camera whose centre is nearest to a ray in angle, within 2 degrees; None if none is.
 
     Args:
-        scene: what is drawn.
+        drawing: what is drawn.
         origin: (3,) of the ray, in the output's units and axes.
         direction: (3,) of any length.
     """
-    rows = np.flatnonzero(scene.cameras.placed)
-    towards = scene.cameras.centers[rows] - origin
+    rows = np.flatnonzero(drawing.cameras.placed)
+    towards = drawing.cameras.centers[rows] - origin
     if len(rows) == 0:
         return None
     angles = angle_between_deg(normalized(towards), normalized(np.broadcast_to(direction, towards.shape)))
@@ -85,11 +85,11 @@ def camera_at(scene: Scene, origin: FloatArray, direction: FloatArray) -> int | 
     return int(rows[nearest]) if angles[nearest] <= _PICKED_DEG else None
 
 
-def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
+def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
     """Start the viewer; it runs until its `stop` is called.
 
     Args:
-        scene: what is drawn.
+        drawing: what is drawn.
         facts: the contents of locate.json.
         host: the address to listen on; 127.0.0.1 can be reached from this machine only.
         port: the port; the next free one if it is taken.
@@ -105,55 +105,57 @@ def serve(scene: Scene, facts: dict[str, Any], host: str, port: int) -> "viser.V
         ) from error
     with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
         server = viser.ViserServer(host=host, port=port, verbose=False)
-    server.scene.set_up_direction(tuple(scene.axes[2].tolist()))
-    _View(server, scene, facts)
+    server.scene.set_up_direction(tuple(drawing.axes[2].tolist()))
+    _View(server, drawing, facts)
     return server
 
 
 class _View:
     """The controls and what they draw."""
 
-    def __init__(self, server: "viser.ViserServer", scene: Scene, facts: dict[str, Any]) -> None:
-        self._server, self._scene = server, scene
-        centers = scene.cameras.centers
-        self._middle = np.median(centers[scene.cameras.placed], axis=0) if scene.cameras.placed.any() else 0.0
-        self._by_trust = np.lexsort((scene.cameras.trust, np.isnan(scene.cameras.trust)))
+    def __init__(self, server: "viser.ViserServer", drawing: Drawing, facts: dict[str, Any]) -> None:
+        self._server, self._drawing = server, drawing
+        centers = drawing.cameras.centers
+        self._middle = (
+            np.median(centers[drawing.cameras.placed], axis=0) if drawing.cameras.placed.any() else 0.0
+        )
+        self._by_trust = np.lexsort((drawing.cameras.trust, np.isnan(drawing.cameras.trust)))
         self._add_points()
         self._add_input()
         self._add_controls(facts)
         self._draw()
 
     def _add_points(self) -> None:
-        points = self._scene.points
+        points = self._drawing.points
         if len(points.positions):
             self._server.scene.add_point_cloud(
                 "/points",
                 (points.positions - self._middle).astype(np.float32),
                 points.colors.astype(np.uint8),
-                point_size=0.02 * max(self._scene.frustum_depth, 1e-9),
+                point_size=0.02 * max(self._drawing.frustum_depth, 1e-9),
                 precision="float32",
             )
 
     def _add_input(self) -> None:
         """Draw the input's cameras in grey where they can be brought into the output's units."""
         self._input = None
-        centers = input_centers(self._scene)
+        centers = input_centers(self._drawing)
         if centers is not None:
             rows = np.flatnonzero(np.isfinite(centers).all(axis=1))
             self._input = self._frusta("/input", rows, centers[rows], np.tile(_GREY, (len(rows), 1)))
 
     def _add_controls(self, facts: dict[str, Any]) -> None:
-        gui, scene = self._server.gui, self._scene
-        placed = int(scene.cameras.placed.sum())
-        gui.add_markdown(f"**{placed:,} of {len(scene.cameras.names):,} cameras placed**")
+        gui, drawing = self._server.gui, self._drawing
+        placed = int(drawing.cameras.placed.sum())
+        gui.add_markdown(f"**{placed:,} of {len(drawing.cameras.names):,} cameras placed**")
         level = max(5.0 * float(facts["residual_level_deg"] or 0.0), _LEAST_DEG)
         start = float(np.clip(np.log10(level), np.log10(_LEAST_DEG), 2.25))
         self._residual = gui.add_slider("residual, log10 deg", -2.0, 2.26, 0.01, start)
-        top = int(scene.pairs.support.max(initial=0))
+        top = int(drawing.pairs.support.max(initial=0))
         self._support = gui.add_slider("least matches", 0, max(top, 1), 1, 0)
         self._trust = gui.add_slider("least trust", 0.0, 1.0, 0.01, 0.0)
         names = [
-            f"{k + 1}: {shortened(scene.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
+            f"{k + 1}: {shortened(drawing.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
         ]
         self._picked = gui.add_dropdown("pairs of", [_NOBODY, *names], initial_value=_NOBODY)
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
@@ -168,13 +170,13 @@ class _View:
     def _pick(self, event: "viser.SceneClickEvent") -> None:
         """Choose the camera under a click."""
         origin = np.asarray(event.ray_origin) + self._middle
-        row = camera_at(self._scene, origin, np.asarray(event.ray_direction))
+        row = camera_at(self._drawing, origin, np.asarray(event.ray_direction))
         if row is not None:
             self._picked.value = next(name for name, own in self._choices.items() if own == row)
 
     def _draw(self) -> None:
         """Draw cameras and pairs anew; a name that is drawn again replaces what it named."""
-        scene = self._scene
+        drawing = self._drawing
         chosen = self._choices.get(self._picked.value)
         thresholds = Thresholds(
             residual_deg=10.0**self._residual.value,
@@ -182,13 +184,13 @@ class _View:
             min_trust=float(self._trust.value),
             camera=chosen,
         )
-        rows = np.flatnonzero(scene.cameras.placed & ~(scene.cameras.trust < thresholds.min_trust))
-        colors = trust_colors(scene.cameras.trust[rows])
+        rows = np.flatnonzero(drawing.cameras.placed & ~(drawing.cameras.trust < thresholds.min_trust))
+        colors = trust_colors(drawing.cameras.trust[rows])
         colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
-        self._frusta("/cameras", rows, scene.cameras.centers[rows], colors)
-        drawn = drawn_pairs(scene, thresholds)
+        self._frusta("/cameras", rows, drawing.cameras.centers[rows], colors)
+        drawn = drawn_pairs(drawing, thresholds)
         kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
-        ends = scene.cameras.centers[scene.pairs.cameras[drawn.rows]]
+        ends = drawing.cameras.centers[drawing.pairs.cameras[drawn.rows]]
         self._lines("/pairs", ends, PAIR_COLORS[kinds])
         against = int(drawn.contradicts.sum())
         self._counts.value = f"{len(drawn.rows):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
@@ -197,10 +199,10 @@ class _View:
         self, name: str, rows: IntArray, centers: FloatArray, colors: Any
     ) -> "viser.LineSegmentsHandle | None":
         """Draw cameras as pyramids, those without a rotation as a cross."""
-        corners = frustum_corners(self._scene, rows, centers)
+        corners = frustum_corners(self._drawing, rows, centers)
         known = np.isfinite(corners).all(axis=(1, 2))
         pyramids = np.concatenate([centers[:, None, :], corners], axis=1)[known][:, _EDGES]
-        arms = self._scene.frustum_depth / 3 * np.stack([-np.eye(3), np.eye(3)], axis=1)
+        arms = self._drawing.frustum_depth / 3 * np.stack([-np.eye(3), np.eye(3)], axis=1)
         crosses = centers[~known][:, None, None, :] + arms
         segments = np.concatenate([pyramids.reshape(-1, 2, 3), crosses.reshape(-1, 2, 3)])
         shades = np.concatenate([np.repeat(colors[known], 8, axis=0), np.repeat(colors[~known], 3, axis=0)])
@@ -218,15 +220,15 @@ class _View:
         )
 
 
-def input_centers(scene: Scene) -> FloatArray | None:
+def input_centers(drawing: Drawing) -> FloatArray | None:
     """Return the input's centres (n, 3) in the output's units and axes, brought there by a fit if need be.
 
     None where the input has no centres, or they all coincide.
     """
-    before, after = scene.cameras.poses.centers, scene.cameras.centers
+    before, after = drawing.cameras.poses.centers, drawing.cameras.centers
     common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
     if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
         return None
-    if scene.input_is_aligned:
+    if drawing.input_is_aligned:
         return before
     return fit_similarity_l1(before[common], after[common]).apply(before)

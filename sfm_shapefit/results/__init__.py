@@ -2,7 +2,6 @@
 
 from sfm_shapefit.results.result import FurtherPiece, GraphResult, Inputs, LocateResult
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, piece_rows
-from sfm_shapefit.results.summary import graph_summary, summary
 from sfm_shapefit.results.warnings import graph_warnings, match_warnings, quality_warnings, trust_warnings
 
 __all__ = [
@@ -11,13 +10,11 @@ __all__ = [
     "Inputs",
     "LocateResult",
     "camera_rows",
-    "graph_summary",
     "graph_warnings",
     "match_warnings",
     "own_camera_rows",
     "pair_rows",
     "piece_rows",
     "quality_warnings",
-    "summary",
     "trust_warnings",
 ]

@@ -6,11 +6,12 @@ OUT/map.json        the averaging behind each, and the images in no model with t
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.options import MapOptions
+from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
-from sfm_shapefit.results.summary import summary
 from sfm_shapefit.results.tables import SCHEMA_VERSION
 from sfm_shapefit.rotations.averaged import AveragedRotations
 
@@ -25,8 +26,8 @@ class MappedModel:
     names: tuple[str, ...]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MapResult:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class MapResult(Displayed):
     """The models of a database, and how they came about."""
 
     database: Path
@@ -47,33 +48,36 @@ class MapResult:
         """Number of cameras in all models."""
         return sum(int(model.located.kept.sum()) for model in self.models)
 
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in map.json."""
+        facts: MapSummary = {
+            "schema_version": SCHEMA_VERSION,
+            "inputs": {"database": str(self.database)},
+            "options": asdict(self.options),
+            "num_images": self.num_images,
+            "num_placed": self.num_placed,
+            "num_pairs": self.num_pairs,
+            "models": [
+                {
+                    "folder": str(number),
+                    "num_images": len(model.names),
+                    "num_placed": int(model.located.kept.sum()),
+                    "averaging": _summarize_averaging(model.averaging),
+                    "located": cast("LocateSummary", model.located.summary()),
+                }
+                for number, model in enumerate(self.models)
+            ],
+            "left_out": self.left_out,
+            "timings_s": self.timings_s,
+            "warnings": list(self.warnings),
+        }
+        return dict(facts)
 
-def map_summary(found: MapResult) -> dict[str, Any]:
-    """Return what stands in map.json."""
-    return {
-        "schema_version": SCHEMA_VERSION,
-        "inputs": {"database": str(found.database)},
-        "options": asdict(found.options),
-        "num_images": found.num_images,
-        "num_placed": found.num_placed,
-        "num_pairs": found.num_pairs,
-        "models": [
-            {
-                "folder": str(number),
-                "num_images": len(model.names),
-                "num_placed": int(model.located.kept.sum()),
-                "averaging": _averaging_summary(model.averaging),
-                "located": summary(model.located),
-            }
-            for number, model in enumerate(found.models)
-        ],
-        "left_out": found.left_out,
-        "timings_s": found.timings_s,
-        "warnings": list(found.warnings),
-    }
+    def _headline(self) -> str:
+        return f"{self.num_placed} of {self.num_images} images placed in {len(self.models)} models"
 
 
-def _averaging_summary(averaging: AveragedRotations) -> dict[str, Any]:
+def _summarize_averaging(averaging: AveragedRotations) -> Averaging:
     return {
         "statement": averaging.statement,
         "num_registered": int(averaging.registered.sum()),

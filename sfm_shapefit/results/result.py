@@ -1,21 +1,25 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.directions import DirectionStatus, PairDirections
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats import EpipolarGeometries
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
+from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.options import SolverResult
@@ -42,8 +46,8 @@ class Inputs:
     """How that choice was made, for the user."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LocateResult:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class LocateResult(Displayed):
     """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
 
     reconstruction: "pycolmap.Reconstruction"
@@ -75,9 +79,26 @@ class LocateResult:
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
 
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in locate.json."""
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> LocateSummary:
+        return summarize_model(self)
+
+    def _headline(self) -> str:
+        images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
+        return f"{images}, {self.reconstruction.num_points3D()} points, {len(self.warnings)} warnings"
+
+    @cached_property
+    def image_names(self) -> tuple[str, ...]:
+        """Names of all images of the input, posed or not."""
+        return tuple(image.name for image in self.model.reconstruction.images.values())
+
     @property
-    def solve(self) -> SolverResult:
-        """The certified solve of the largest rigid piece."""
+    def certified(self) -> SolverResult:
+        """The solve of the largest rigid piece, with its certificate, before any refinement."""
         return self.placement.solve
 
     @property
@@ -85,7 +106,7 @@ class LocateResult:
         """The parallel-rigid pieces of the view graph, largest first."""
         return self.placement.pieces
 
-    @property
+    @cached_property
     def cameras(self) -> list[CameraRow]:
         """One row per image of the input: the posed ones by id, then those without a rotation."""
         image_ids = self.model.image_ids[self.placement.cameras]
@@ -100,7 +121,7 @@ class LocateResult:
             is_fixed = self.fixed is not None and self.fixed[camera]
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
-        unposed = sorted(set(all_names(self)) - set(self.model.names))
+        unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
@@ -113,7 +134,7 @@ class LocateResult:
             if camera not in judged and self.reconstruction.image(image_id).has_pose
         }
 
-    @property
+    @cached_property
     def pairs(self) -> list[PairRow]:
         """One row per pair that was looked at, usable or not, in the order of pairs."""
         support = self.directions.num_inliers[self.directions.usable()]
@@ -138,7 +159,7 @@ def _turned(row: PairRow, axes: FloatArray | None) -> PairRow:
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class FurtherPiece:
     """A rigid piece beside the largest: directions do not say how large it is, nor where it stands."""
 
@@ -153,15 +174,15 @@ class FurtherPiece:
     image_ids: IntArray
     """(k,) the images of the placement's cameras."""
 
-    @property
-    def cameras(self) -> list[CameraRow]:
+    @cached_property
+    def camera_rows(self) -> list[CameraRow]:
         """One row per camera of the piece."""
         centers = _centers_of(self.reconstruction, self.image_ids, self.kept)
         return own_camera_rows(self.placement, centers, self.gauge.similarity.scale)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class GraphResult:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class GraphResult(Displayed):
     """A bare view graph, placed. Locations are in the solver's units, centroid 0."""
 
     path: Path
@@ -179,12 +200,29 @@ class GraphResult:
     rotations: FloatArray | None = None
     """(n, 3, 3) cam_from_world of all nodes, where there are relative poses."""
 
+    def summary(self) -> dict[str, Any]:
+        """Return what stands in locate.json."""
+        return dict(self._summary)
+
+    @cached_property
+    def _summary(self) -> GraphSummary:
+        return summarize_graph(self)
+
+    def _headline(self) -> str:
+        placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
+        return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
     @property
+    def certified(self) -> SolverResult:
+        """The solve of the largest rigid piece, with its certificate, before any refinement."""
+        return self.placement.solve
+
+    @cached_property
     def cameras(self) -> list[CameraRow]:
         """One row per node."""
         return camera_rows(self.placement, self.placement.locations, 1.0, self.further)
 
-    @property
+    @cached_property
     def pairs(self) -> list[PairRow]:
         """One row per edge."""
         support = np.zeros(self.placement.num_pairs, dtype=np.int64)
@@ -198,8 +236,3 @@ def _centers_of(
     centers = np.full((len(kept), 3), np.nan)
     centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
     return centers
-
-
-def all_names(found: LocateResult) -> list[str]:
-    """Return the names of all images of the input, posed or not."""
-    return [image.name for image in found.model.reconstruction.images.values()]

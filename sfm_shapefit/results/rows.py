@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.directions import PairDirections
+from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.results.tables import CameraRow, PairRow, PieceRow

@@ -2,7 +2,7 @@
 
 from dataclasses import asdict
 from importlib.metadata import version
-from typing import Any
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -11,17 +11,30 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.starts import Finish
-from sfm_shapefit.results.result import GraphResult, LocateResult, all_names
+from sfm_shapefit.results import json_types
+from sfm_shapefit.results.json_types import (
+    BundleAdjustment,
+    GraphSummary,
+    LocateSummary,
+    LooseGroup,
+    Piece,
+    RigidGroups,
+    RotationRefinement,
+    Solve,
+)
 from sfm_shapefit.results.rows import piece_rows
-from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION, PieceRow, solve_summary
+from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.results.warnings import graph_warnings
+
+if TYPE_CHECKING:
+    from sfm_shapefit.results.result import GraphResult, LocateResult
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 _QUANTILES = (25, 50, 75, 90)
 _ANGLES_DEG = (1, 2, 5, 10, 30, 90)
 
 
-def summary(found: LocateResult) -> dict[str, Any]:
+def summarize_model(found: "LocateResult") -> LocateSummary:
     """Return what stands in locate.json: plain values, schema version first."""
     placement = found.placement
     num_unusable = len(found.directions.pairs) - placement.num_pairs
@@ -29,11 +42,11 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "schema_version": SCHEMA_VERSION,
         "inputs": {
             "model": str(found.inputs.folder or IN_MEMORY),
-            "database": found.inputs.database and str(found.inputs.database),
+            "database": None if found.inputs.database is None else str(found.inputs.database),
             "directions": found.inputs.statement,
         },
         "options": asdict(found.options),
-        "num_images": len(all_names(found)),
+        "num_images": len(found.image_names),
         "num_placed": found.reconstruction.num_reg_images(),
         "not_trusted": _not_trusted(found),
         "num_pairs": len(found.directions.pairs),
@@ -48,19 +61,19 @@ def summary(found: LocateResult) -> dict[str, Any]:
         "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
         "scale": found.gauge.statement,
-        "rigid_groups": _groups_summary(found),
-        "pieces": [asdict(row) for row in _pieces_of(found)],
-        "solve": solve_summary(found.solve),
-        "finish": _finish_summary(placement.finish),
-        "rotation_refinement": _refinement_summary(found.turned_deg),
-        "bundle_adjustment": found.adjusted and _adjustment_summary(found.adjusted),
+        "rigid_groups": _summarize_groups(found),
+        "pieces": _pieces_of(found),
+        "solve": cast("Solve", found.certified.summary()),
+        "finish": _summarize_finish(placement.finish),
+        "rotation_refinement": _summarize_rotations(found.turned_deg),
+        "bundle_adjustment": None if found.adjusted is None else _summarize_adjustment(found.adjusted),
         "timings_s": found.timings_s,
         "warnings": list(found.warnings),
         "versions": _versions(),
     }
 
 
-def graph_summary(found: GraphResult) -> dict[str, Any]:
+def summarize_graph(found: "GraphResult") -> GraphSummary:
     """Return what stands in the locate.json of a bare graph."""
     placement = found.placement
     return {
@@ -76,22 +89,18 @@ def graph_summary(found: GraphResult) -> dict[str, Any]:
         "residual_level_deg": placement.assessment.level_deg,
         "residuals_deg": residuals_deg(placement),
         "loose_groups": _loose_groups(placement),
-        "pieces": [
-            asdict(row)
-            for row in piece_rows(
-                placement,
-                [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)],
-            )
-        ],
-        "solve": solve_summary(placement.solve),
-        "finish": _finish_summary(placement.finish),
+        "pieces": _describe_pieces(
+            placement, [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)]
+        ),
+        "solve": cast("Solve", placement.solve.summary()),
+        "finish": _summarize_finish(placement.finish),
         "timings_s": found.timings_s,
         "warnings": list(graph_warnings(placement)),
         "versions": _versions(),
     }
 
 
-def _groups_summary(found: LocateResult) -> dict[str, int] | None:
+def _summarize_groups(found: "LocateResult") -> RigidGroups | None:
     """Return what moved together: frames of rigs, and fixed cameras; None where each camera moves by
     itself."""
     placement = found.placement
@@ -114,13 +123,18 @@ def residuals_deg(placement: Placement) -> dict[str, float]:
     return facts | {f"share_beyond_{angle}": float(np.mean(residuals > angle)) for angle in _ANGLES_DEG}
 
 
-def _pieces_of(found: LocateResult) -> list[PieceRow]:
+def _pieces_of(found: "LocateResult") -> list[Piece]:
     solved = [(0, found.gauge.statement, int(np.sum(found.kept)))]
     solved += [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in found.further]
-    return piece_rows(found.placement, solved)
+    return _describe_pieces(found.placement, solved)
 
 
-def _not_trusted(found: LocateResult) -> dict[str, str]:
+def _describe_pieces(placement: Placement, solved: list[tuple[int, str, int]]) -> list[Piece]:
+    """Return the pieces of three cameras or more; arguments as of `piece_rows`."""
+    return [cast("Piece", asdict(row)) for row in piece_rows(placement, solved)]
+
+
+def _not_trusted(found: "LocateResult") -> dict[str, str]:
     """Return the reason for each camera that is left out because it is not trusted."""
     placement = found.placement
     return {
@@ -129,7 +143,7 @@ def _not_trusted(found: LocateResult) -> dict[str, str]:
     }
 
 
-def _loose_groups(placement: Placement) -> list[dict[str, Any]]:
+def _loose_groups(placement: Placement) -> list[LooseGroup]:
     """Return the groups of cameras that are rigid by the graph but loose by the geometry."""
     return [
         {
@@ -140,7 +154,7 @@ def _loose_groups(placement: Placement) -> list[dict[str, Any]]:
     ]
 
 
-def _finish_summary(finish: Finish) -> dict[str, Any]:
+def _summarize_finish(finish: Finish) -> json_types.Finish:
     lud = finish.lud
     return {
         "start": finish.start,
@@ -153,8 +167,9 @@ def _finish_summary(finish: Finish) -> dict[str, Any]:
         "moved_max": finish.moved[1],
         "num_turned_pairs": finish.num_turned_pairs,
         "num_put_back": finish.num_put_back,
-        "lud": lud
-        and {
+        "lud": None
+        if lud is None
+        else {
             "objective": lud.objective,
             "dual_bound": lud.dual_bound,
             "equality_residual": lud.equality_residual,
@@ -163,7 +178,7 @@ def _finish_summary(finish: Finish) -> dict[str, Any]:
     }
 
 
-def _refinement_summary(turned_deg: FloatArray | None) -> dict[str, Any] | None:
+def _summarize_rotations(turned_deg: FloatArray | None) -> RotationRefinement | None:
     if turned_deg is None:
         return None
     changed = turned_deg[turned_deg > 0.0]
@@ -175,7 +190,7 @@ def _refinement_summary(turned_deg: FloatArray | None) -> dict[str, Any] | None:
     }
 
 
-def _adjustment_summary(adjusted: Adjusted) -> dict[str, Any]:
+def _summarize_adjustment(adjusted: Adjusted) -> BundleAdjustment:
     return {
         "converged": adjusted.converged,
         "iterations": adjusted.iterations,

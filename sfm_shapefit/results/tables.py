@@ -11,13 +11,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.judgement.verdicts import Verdict
-from sfm_shapefit.solver.options import SolverResult
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION: Literal[1] = 1
 IN_MEMORY = "in memory"
 """What stands in locate.json in the place of a model's path where there is none."""
 
@@ -156,22 +155,6 @@ def dumps(summary: dict[str, Any], *, only_ascii: bool = False) -> str:
     """
     text = json.dumps(_finite(summary), indent=2, ensure_ascii=only_ascii, allow_nan=False)
     return text.encode("utf-8", errors="backslashreplace").decode("utf-8")  # Python's escape is JSON's
-
-
-def solve_summary(result: SolverResult) -> dict[str, Any]:
-    """Return the `solve` object of locate.json."""
-    return {
-        "status": result.status.name.lower(),
-        "objective": result.objective,
-        "dual_bound": result.dual_bound,
-        "gap": result.gap,
-        "equality_residual": result.equality_residual,
-        "unique": result.unique,
-        "iterations": result.iterations,
-        "seconds": result.seconds,
-        "method": result.method,
-        "method_reason": result.method_reason,
-    }
 
 
 def _cell(value: object) -> object:

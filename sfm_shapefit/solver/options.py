@@ -4,14 +4,21 @@ Pure data, no numerics, so that the command line, the tests and the benchmark ca
 """
 
 import enum
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
+
+from sfm_shapefit.display import Displayed
+from sfm_shapefit.settings import Settings, explained, option
 
 if TYPE_CHECKING:  # numpy is not cheap
     from sfm_shapefit.arrays import FloatArray
 
-Method = Literal["auto", "newton", "admm", "conic"]
+Solver = Literal["auto", "newton", "admm", "conic"]
+
+MAX_THREADS = 256
+"""Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
 
 
 class Status(enum.Enum):
@@ -49,39 +56,52 @@ OnIteration = Callable[[IterationInfo], bool | None]
 """Called after each iteration; returning False, or raising, cancels the solve."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SolverOptions:
-    """Settings of one solve. Unit-free: the program fixes its own scale."""
+@explained
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions(Settings):
+    """The certified program, unit-free: it fixes its own scale."""
 
-    method: Method = "auto"
-    """Which solver: "newton" is primal-dual Newton, "admm" splitting (with Newton steps
-    at the end if the gap needs them) for large graphs, "conic" the generic
-    conic program through cvxpy and Clarabel; "auto" picks by size and predicted fill, and says why."""
-    tol: float = 1e-8
-    """The certified gap, objective - dual_bound, at which a solve counts as converged."""
-    max_iterations: int | None = None
-    """Hard limit; None: the method's own. Reaching it is reported in `SolverResult.status`, never silent."""
-    uniqueness: bool = True
-    """Also examine whether the certificate proves the optimum unique; costs one sparse factorisation."""
-    factor_memory: int = 2000
-    """What one sparse factor may take, in MB. Larger ones are replaced by iterations in the solve, and left
-    out elsewhere: on long chains in the refinement, and for standard deviations."""
-    threads: int = 1
-    """Threads of the passes over edges; the answer does not depend on it."""
+    solver: Solver = option(
+        "auto",
+        'Which solver: "newton" is primal-dual Newton, "admm" splitting (with Newton steps at the end if the '
+        'gap needs them) for large graphs, "conic" the generic conic program through cvxpy and Clarabel; '
+        '"auto" picks by size and predicted fill, and says why.',
+        also="method",
+    )
+    tol: float = option(1e-8, "Certified gap, objective - dual_bound, at which a solve counts as converged.")
+    max_iterations: int | None = option(
+        None, "Hard limit; by default the solver's own. Reaching it is reported, never silent."
+    )
+    uniqueness: bool = option(
+        True,
+        "Also examine whether the certificate proves the optimum unique; costs one sparse factorisation.",
+    )
+    factor_memory_mb: int = option(
+        2000,
+        "What one sparse factor may take. Larger ones are replaced by iterations in the solve, and left out "
+        "elsewhere: on long chains in the refinement, and for standard deviations.",
+        also="factor_memory",
+    )
+    threads: int = option(
+        0, f"Threads to use, at most {MAX_THREADS}; 0 means one per core. The answer does not depend on it."
+    )
 
     def __post_init__(self) -> None:
-        if self.method not in get_args(Method):
-            raise ValueError(f"SolverOptions.method must be one of {get_args(Method)}, got {self.method!r}")
+        super().__post_init__()
         if not 0.0 < self.tol < 1.0:
-            raise ValueError(f"SolverOptions.tol must lie in (0, 1), got {self.tol}")
-        for name in ("max_iterations", "factor_memory", "threads"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise ValueError(f"SolverOptions.{name} must be >= 1, got {value}")
+            raise ValueError(f"tol must lie in (0, 1), got {self.tol}")
+        if self.max_iterations is not None:
+            self.check_range("max_iterations", 1)
+        self.check_range("factor_memory_mb", 1)
+        self.check_range("threads", 0, MAX_THREADS)
+
+    def num_threads(self) -> int:
+        """Return the number of threads to use."""
+        return self.threads or min(os.cpu_count() or 1, MAX_THREADS)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SolverResult:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class SolverResult(Displayed):
     """A solve's answer together with the evidence that it is one."""
 
     locations: "FloatArray"
@@ -112,3 +132,27 @@ class SolverResult:
     def gap(self) -> float:
         """How far `objective` may be above the optimum, in the same dimensionless scale."""
         return self.objective - self.dual_bound
+
+    @property
+    def converged(self) -> bool:
+        """Whether the certified gap is below the tolerance."""
+        return self.status is Status.CONVERGED
+
+    def summary(self) -> dict[str, Any]:
+        """Return the `solve` object of locate.json."""
+        return {
+            "status": self.status.name.lower(),
+            "objective": self.objective,
+            "dual_bound": self.dual_bound,
+            "gap": self.gap,
+            "equality_residual": self.equality_residual,
+            "unique": self.unique,
+            "iterations": self.iterations,
+            "seconds": self.seconds,
+            "method": self.method,
+            "method_reason": self.method_reason,
+        }
+
+    def _headline(self) -> str:
+        found = f"{len(self.locations)} locations, {self.status.name.lower()}, objective {self.objective:.6g}"
+        return f"{found}, gap {self.gap:.1e}" if self.status.has_certificate else found

@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from sfm_shapefit.arrays import FloatArray, frozen
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.rigidity import is_parallel_rigid
+from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
@@ -63,7 +64,11 @@ class Choice(NamedTuple):
 
 @one_blas_thread()  # more would split, and round, the sums of long vectors differently
 def solve(
-    graph: ViewGraph, options: SolverOptions | None = None, on_iteration: OnIteration | None = None
+    graph: ViewGraph,
+    options: SolverOptions | None = None,
+    *,
+    on_iteration: OnIteration | None = None,
+    **overrides: Any,
 ) -> SolverResult:
     """Solve ShapeFit on a parallel-rigid view graph, with a certificate of optimality.
 
@@ -73,8 +78,9 @@ def solve(
 
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
-        options: solver settings; defaults if None.
+        options: solver settings, see `help(SolverOptions)`; defaults if None.
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
+        **overrides: single options by name: `solve(graph, tol=1e-6)`.
 
     Returns:
         Locations, status, objective, and a feasible dual point whose value bounds the optimum from below.
@@ -86,7 +92,7 @@ def solve(
 
     Source: Hand, Lee, Voroninski (2015), arXiv 1506.01437.
     """
-    options = options or SolverOptions()
+    options = merge_options(options, SolverOptions, overrides)
     start = time.perf_counter()
     _refuse_undetermined(graph)
     choice = choose_method(graph, options)
@@ -100,7 +106,7 @@ def solve(
         run.dual,
         tol=options.tol,
         uniqueness=options.uniqueness,
-        threads=options.threads,
+        threads=options.num_threads(),
     )
     status = judge_status(certificate, options.tol, run.iterations >= limit, watch.cancelled)
     return describe_run(run, choice, certificate, locations, status, start)
@@ -174,10 +180,10 @@ def uncertified(
 def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
     unknowns = graph.num_nodes * graph.dimension
-    asked = options.method != "auto"
-    if options.method == "conic":
+    asked = options.solver != "auto"
+    if options.solver == "conic":
         return Choice("conic", _run_conic, "asked for")
-    if options.method == "admm":
+    if options.solver == "admm":
         return Choice("admm", _run_admm, "asked for")
     if unknowns <= _SMALL:
         return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
@@ -226,8 +232,8 @@ def _run_admm(
         graph,
         options.tol,
         limit,
-        threads=options.threads,
-        memory_bytes=options.factor_memory * 1_000_000,
+        threads=options.num_threads(),
+        memory_bytes=options.factor_memory_mb * 1_000_000,
         prediction=prediction,
         on_iteration=watch,
     )

@@ -13,7 +13,7 @@ import pytest
 
 from sfm_shapefit import LocateOptions, MapOptions, locate, map_database
 from sfm_shapefit.cli import console
-from sfm_shapefit.cli.console import shown_progress
+from sfm_shapefit.cli.console import show_progress
 from tests.scenes import BUNDLED, FACADE, RING, ROOT
 
 
@@ -65,7 +65,7 @@ def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations
 @pytest.mark.slow
 def test_map_counts_the_pairs_whose_rotations_it_estimates():
     database = BUNDLED / "photographed" / "database.db"
-    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress))
+    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress=progress))
     steps = stages["relative rotations"]
     assert steps[:2] == [(0, 1), (1, 57)]
     assert steps[-2:] == [(57, 57), (1, 1)]
@@ -74,8 +74,8 @@ def test_map_counts_the_pairs_whose_rotations_it_estimates():
 def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
     """A stage that ends before its limit, as a solve does, shows the steps that it took."""
     code = (
-        "from sfm_shapefit.cli.console import shown_progress\n"
-        "with shown_progress(True) as progress:\n"
+        "from sfm_shapefit.cli.console import show_progress\n"
+        "with show_progress(True) as progress:\n"
         "    progress('solve', 0, 1)\n"
         "    for k in range(1, 8):\n"
         "        progress('solve', k, 100)\n"
@@ -99,7 +99,7 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
 
 
 def test_nothing_is_shown_where_there_is_no_terminal(capfd):
-    with shown_progress(enabled=True) as progress:
+    with show_progress(enabled=True) as progress:
         assert progress is None
     assert capfd.readouterr().err == ""
 

@@ -19,15 +19,15 @@ from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.atomic_folder import atomic_folder, check_output
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.quiet import pycolmap_heard, quiet_stderr
+from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
 from sfm_shapefit.colmap.structure import (
-    StructureOptions,
     colored,
     correspondence_graph,
     filtered,
     triangulate,
 )
+from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import fit_similarity_l1
@@ -560,7 +560,7 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
 
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
     seed, graph = seeded(ring_model(noise_px=0.5)[0])
-    with pycolmap_heard(not quiet):
+    with hear_pycolmap(not quiet):
         bundle_adjust(seed, graph)
     said = capfd.readouterr()
     assert said.out == ""
@@ -571,7 +571,7 @@ def test_stderr_is_quiet_only_inside_the_block_and_only_if_nobody_listens(capfd)
     with contextlib.suppress(KeyError), quiet_stderr():
         os.write(2, b"lost")
         raise KeyError
-    with pycolmap_heard(), quiet_stderr():
+    with hear_pycolmap(), quiet_stderr():
         os.write(2, b"seen ")
     os.write(2, b"after")
     assert capfd.readouterr().err == "seen after"

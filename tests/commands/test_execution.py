@@ -19,7 +19,8 @@ from sfm_shapefit.commands.stages.execution import (
     open_executor,
     shared_out,
 )
-from sfm_shapefit.directions import DirectionOptions, concatenate
+from sfm_shapefit.directions.options import DirectionOptions
+from sfm_shapefit.directions.pair_directions import concatenate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace

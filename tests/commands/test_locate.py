@@ -11,7 +11,6 @@ import sfm_shapefit
 from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.commands.write import write_result
-from sfm_shapefit.results import summary
 from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
 
 
@@ -36,7 +35,7 @@ def test_the_courtyard_is_placed_in_spite_of_a_quarter_of_wrong_pairs(courtyard)
     # 0.5 px at 720 px focal length and 10 m gives 7 mm per match; a pair has hundreds of matches.
     assert errors.position.median < 0.005
     assert errors.position.max < 0.03
-    assert courtyard.solve.gap <= 1e-8
+    assert courtyard.certified.gap <= 1e-8
 
 
 def test_the_pairs_that_contradict_the_solution_are_the_wrong_ones(courtyard):
@@ -64,8 +63,8 @@ def test_the_inputs_centres_place_nothing(tmp_path):
         frame.rig_from_world = pycolmap.Rigid3d(rotation, rng.standard_normal(3))
     options = LocateOptions(scale="unit")
     database = scene / "database.db"
-    moved = sfm_shapefit.locate(model, database, options)
-    plain = sfm_shapefit.locate(scene / "sparse" / "0", database, options)
+    moved = sfm_shapefit.locate(model, database, options=options)
+    plain = sfm_shapefit.locate(scene / "sparse" / "0", database, options=options)
     for image_id in model.images:
         np.testing.assert_array_equal(
             moved.reconstruction.image(image_id).projection_center(),
@@ -184,7 +183,7 @@ def test_two_groups_joined_at_one_camera_are_two_pieces(tmp_path):
     first, second = {1, 2, 3, 4}, {4, 5, 6, 7, 8}
     keep_pairs(scene / "database.db", lambda i, j: {i, j} <= first or {i, j} <= second)
     found = sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
-    facts = summary(found)
+    facts = found.summary()
     assert [piece["num_cameras"] for piece in facts["pieces"]] == [5, 4]
     assert [piece["hinges"] for piece in facts["pieces"]] == [["0004.jpg"], ["0004.jpg"]]
     reasons = {row.reason for row in found.cameras if not row.placed}
@@ -210,7 +209,7 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(tmp_path):
     np.testing.assert_allclose(centers.mean(axis=0), 0.0, atol=1e-12)
     assert np.median(np.linalg.norm(centers, axis=1)) == pytest.approx(1.0)
     assert sfm_shapefit.evaluate(folder, RING / "sparse" / "0").position.max < 1e-5
-    row = summary(found)["pieces"][1]
+    row = found.summary()["pieces"][1]
     assert (row["folder"], row["num_placed"]) == ("pieces/1", 4)
     assert row["scale"].startswith("unit")
     with (folder / "cameras.csv").open(newline="") as stream:
@@ -342,4 +341,4 @@ def test_real_scenes_are_placed_as_well_as_measured_before(name, median, mean):
     assert not errors.missing
     assert errors.position.median <= median
     assert errors.position.mean <= mean
-    assert found.solve.gap <= 1e-8
+    assert found.certified.gap <= 1e-8

@@ -12,7 +12,6 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.results import summary
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import RING, copied
@@ -116,7 +115,7 @@ def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wro
     assert abs(fit.scale - 1.0) < 1e-3
     errors = np.linalg.norm(fit.apply(centers) - rigs.scene.centers, axis=1)
     assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
-    assert found.solve.gap <= 1e-8
+    assert found.certified.gap <= 1e-8
     assert found.gauge.statement.startswith("rig: ")
     assert_rigs_equal(found.reconstruction, found.model.reconstruction)
 
@@ -141,7 +140,7 @@ def test_tables_say_what_moved_together(found, tmp_path):
     assert facts["num_placed"] == 36
     again = pycolmap.Reconstruction(tmp_path / "out")
     assert_rigs_equal(again, found.model.reconstruction)
-    assert summary(found)["num_placed"] == again.num_reg_images()
+    assert found.summary()["num_placed"] == again.num_reg_images()
 
 
 def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
@@ -247,15 +246,15 @@ def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(
     model, centers, names, all_names = moved_ring
     given = poses(model)
     options = LocateOptions(fix=str(names), bundle_adjust=bundle_adjust)
-    found = sfm_shapefit.locate(model, RING / "database.db", options)
+    found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     after = poses(found.reconstruction)
     for name in all_names[:5]:
         np.testing.assert_array_equal(after[name], given[name])
     errors = np.linalg.norm(centres(found.reconstruction)[1] - centers, axis=1) * 0.37
     assert errors.max() < 0.02  # metres; half a pixel at 4 m is 2 mm
-    assert summary(found)["rigid_groups"]["num_fixed"] == 5
+    assert found.summary()["rigid_groups"]["num_fixed"] == 5
     assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
-    assert found.solve.gap <= 1e-8
+    assert found.certified.gap <= 1e-8
 
 
 def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_without(moved_ring):
@@ -263,7 +262,7 @@ def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_withou
     names.write_text(all_names[2])
     given = poses(model)[all_names[2]]
     options = LocateOptions(fix=str(names), scale="unit")
-    found = sfm_shapefit.locate(model, RING / "database.db", options)
+    found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     np.testing.assert_array_equal(poses(found.reconstruction)[all_names[2]], given)
     own = centres(found.reconstruction)[1]
     assert np.median(np.linalg.norm(own - own.mean(axis=0), axis=1)) == pytest.approx(1.0)
@@ -272,7 +271,9 @@ def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_withou
 
 def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
     model, _, names, all_names = moved_ring
-    solved = sfm_shapefit.locate(model, RING / "database.db", LocateOptions(fix=str(names))).reconstruction
+    solved = sfm_shapefit.locate(
+        model, RING / "database.db", options=LocateOptions(fix=str(names))
+    ).reconstruction
     new = all_names[-1]
     for image in list(solved.images.values()):  # one image has never been placed: a rotation, no points
         if image.name == new:
@@ -281,9 +282,9 @@ def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
             frame = solved.frame(image.frame_id)
             frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     given = poses(solved)
-    found = sfm_shapefit.locate(solved, RING / "database.db", LocateOptions(fix="solved"))
+    found = sfm_shapefit.locate(solved, RING / "database.db", options=LocateOptions(fix="solved"))
     after = poses(found.reconstruction)
-    assert summary(found)["rigid_groups"]["num_fixed"] == len(all_names) - 1
+    assert found.summary()["rigid_groups"]["num_fixed"] == len(all_names) - 1
     for name in all_names[:-1]:
         np.testing.assert_array_equal(after[name], given[name])
     assert np.abs(after[new] - given[new]).max() > 1.0
@@ -294,7 +295,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     names = tmp_path / "names.txt"
     names.write_text("0008.jpg\n")
     found = sfm_shapefit.locate(
-        model, workspace / "database.db", LocateOptions(fix=str(names), points="never")
+        model, workspace / "database.db", options=LocateOptions(fix=str(names), points="never")
     )
     for image_id in (7, 8, 9):
         np.testing.assert_array_equal(
@@ -328,7 +329,7 @@ def test_fixed_cameras_without_positions_are_refused(tmp_path):
     for frame in model.frames.values():
         frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
-        sfm_shapefit.locate(model, RING / "database.db", LocateOptions(fix=str(names)))
+        sfm_shapefit.locate(model, RING / "database.db", options=LocateOptions(fix=str(names)))
 
 
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from sfm_shapefit.directions import estimate_directions
+from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.tracks import Tracks, build_tracks, covering_set, join_points
 from sfm_shapefit.evaluation import evaluate_poses

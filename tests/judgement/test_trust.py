@@ -186,6 +186,8 @@ def test_no_camera_of_a_sound_real_scene_is_blamed(name):
 
 def test_a_floor_of_zero_keeps_every_camera():
     scene = real_scene("lego100")
-    found = sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db", LocateOptions(min_trust=0.0))
+    found = sfm_shapefit.locate(
+        scene / "sparse" / "0", scene / "database.db", options=LocateOptions(min_trust=0.0)
+    )
     assert found.kept.all()
     assert any(row.reason for row in found.cameras if row.placed)

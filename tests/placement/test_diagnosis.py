@@ -121,7 +121,7 @@ def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
 def test_the_plan_is_what_a_placement_does(method):
     problem = random_graph_problem(30, seed=5, sigma=0.01)
     graph = problem.view_graph
-    options = PlacementOptions(method=method, tol=1e-4)
+    options = PlacementOptions(solver=method, tol=1e-4)
     plan, done = diagnose(graph, options).plan, place(graph, options)
     assert plan.solver == done.solve.method
     assert done.solve.method_reason.startswith(plan.solver_reason)

@@ -168,7 +168,7 @@ def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
         found = finished(expander)  # without a factor, and as good
         assert found.refined
         np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
-    found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory=1)  # MB
+    found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
     assert not found.refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it

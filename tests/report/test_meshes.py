@@ -9,13 +9,13 @@ import trimesh
 
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors, write_meshes
-from tests.made_scenes import made_scene
+from tests.drawings import make_drawing
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("meshes")
-    write_meshes(made_scene()[0], folder)
+    write_meshes(make_drawing()[0], folder)
     return folder
 
 
@@ -28,7 +28,7 @@ def glb_tree(path):
 
 
 def test_the_glb_holds_cameras_points_and_a_kind_of_line_per_verdict(folder):
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     modes = {mesh["name"]: mesh["primitives"][0]["mode"] for mesh in glb_tree(folder / "scene.glb")["meshes"]}
     points, lines, triangles = 0, {1, 3}, 4  # of the specification
     assert modes["cameras"] == triangles
@@ -36,44 +36,46 @@ def test_the_glb_holds_cameras_points_and_a_kind_of_line_per_verdict(folder):
     assert {modes[f"pairs: {kind}"] for kind in ("agrees", "contradicts", "undetermined")} <= lines
     loaded = trimesh.load(folder / "scene.glb").geometry
     assert len(loaded["cameras"].faces) == 6 * 24
-    assert len(loaded["points"].vertices) == len(scene.points.positions)
+    assert len(loaded["points"].vertices) == len(drawing.points.positions)
 
 
 def test_in_the_glb_y_is_up_and_the_cameras_are_around_the_origin(folder):
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     cameras = trimesh.load(folder / "scene.glb").geometry["cameras"]
     apexes = np.asarray(cameras.vertices)[: 5 * 24 : 5]
-    placed = scene.cameras.centers[scene.cameras.placed]
-    height = (placed - np.median(placed, axis=0)) @ scene.axes[2]
+    placed = drawing.cameras.centers[drawing.cameras.placed]
+    height = (placed - np.median(placed, axis=0)) @ drawing.axes[2]
     np.testing.assert_allclose(apexes[:, 1], height, atol=1e-5)  # float32 of 10
     np.testing.assert_allclose(np.median(apexes, axis=0), 0.0, atol=1e-5)
 
 
 def test_the_ply_is_in_the_axes_of_the_model_and_coloured_by_trust(folder):
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     mesh = trimesh.load(folder / "scene.ply", process=False)
-    placed = scene.cameras.centers[scene.cameras.placed]
+    placed = drawing.cameras.centers[drawing.cameras.placed]
     apexes = mesh.vertices[: 5 * 24 : 5]
     np.testing.assert_allclose(apexes, placed, atol=1e-5)  # float32 of 10
     colors = mesh.visual.vertex_colors[: 5 * 24 : 5, :3]
-    np.testing.assert_array_equal(colors, trust_colors(scene.cameras.trust[scene.cameras.placed]))
+    np.testing.assert_array_equal(colors, trust_colors(drawing.cameras.trust[drawing.cameras.placed]))
     np.testing.assert_allclose(
-        mesh.vertices[-len(scene.points.positions) :], scene.points.positions, atol=1e-5
+        mesh.vertices[-len(drawing.points.positions) :], drawing.points.positions, atol=1e-5
     )
 
 
 def test_the_ply_has_a_ribbon_for_each_pair_of_placed_cameras(folder):
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     mesh = trimesh.load(folder / "scene.ply", process=False)
-    ends, classes = scene.pairs.cameras, scene.pairs.classes
-    drawn = scene.cameras.placed[ends].all(axis=1) & (classes != PairClass.NO_DIRECTION)
+    ends, classes = drawing.pairs.cameras, drawing.pairs.classes
+    drawn = drawing.cameras.placed[ends].all(axis=1) & (classes != PairClass.NO_DIRECTION)
     assert len(mesh.faces) == 6 * 24 + 2 * int(drawn.sum())
     wrong = int(np.sum(drawn & (classes == PairClass.CONTRADICTS)))
     reds = (mesh.visual.vertex_colors[:, :3] == PAIR_COLORS[PairClass.CONTRADICTS]).all(axis=1)
     assert int(reds[5 * 24 :].sum()) == 4 * wrong
-    ribbons = np.asarray(mesh.vertices)[5 * 24 : -len(scene.points.positions)].reshape(-1, 4, 3).mean(axis=1)
-    middles = scene.cameras.centers[ends[drawn & (classes == PairClass.CONTRADICTS)]].mean(axis=1)
-    found = ribbons[reds[5 * 24 : -len(scene.points.positions) : 4]]
+    ribbons = (
+        np.asarray(mesh.vertices)[5 * 24 : -len(drawing.points.positions)].reshape(-1, 4, 3).mean(axis=1)
+    )
+    middles = drawing.cameras.centers[ends[drawn & (classes == PairClass.CONTRADICTS)]].mean(axis=1)
+    found = ribbons[reds[5 * 24 : -len(drawing.points.positions) : 4]]
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 
@@ -85,6 +87,6 @@ def test_trust_is_red_at_0_green_at_1_and_grey_where_unknown():
 
 
 def test_nothing_placed_gives_empty_scenes_that_still_open(tmp_path):
-    scene, _ = made_scene(num_cameras=1, num_pairs=0, num_points=3)  # the last camera is never placed
-    write_meshes(scene, tmp_path)
+    drawing, _ = make_drawing(num_cameras=1, num_pairs=0, num_points=3)  # the last camera is never placed
+    write_meshes(drawing, tmp_path)
     assert len(trimesh.load(tmp_path / "scene.ply", process=False).vertices) == 3

@@ -5,7 +5,7 @@ import pytest
 
 from sfm_shapefit.report.page import write_report
 from tests.browser import chromium, complaints, opened, requests, wait_for
-from tests.made_scenes import made_scene
+from tests.drawings import make_drawing
 from tests.report.test_report_page import HOSTILE
 
 HIGHLIGHT = """
@@ -25,7 +25,7 @@ def driver():
 @pytest.fixture(scope="module")
 def report(driver, tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "report.html"
-    write_report(*made_scene(), path)
+    write_report(*make_drawing(), path)
     opened(driver, path)
     return path
 
@@ -47,11 +47,11 @@ def test_a_click_on_a_row_highlights_and_centres_its_camera(driver, report):
     after, center = driver.execute_script(HIGHLIGHT), driver.execute_script(CENTER)
     assert after["line"] > before[0]["line"]
     assert before[0]["mark"] == [None, None, None]
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     name = driver.find_element("css selector", "#details h3").text
-    position = scene.cameras.centers[scene.cameras.names.index(name)]
-    middle = np.median(scene.cameras.centers[scene.cameras.placed], axis=0)
-    np.testing.assert_allclose(after["mark"], scene.axes @ (position - middle), atol=1e-5)  # float32 of 10
+    position = drawing.cameras.centers[drawing.cameras.names.index(name)]
+    middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
+    np.testing.assert_allclose(after["mark"], drawing.axes @ (position - middle), atol=1e-5)  # float32 of 10
     assert center != before[1]
     assert driver.find_element("css selector", "#cameras tr[aria-selected=true]").get_attribute(
         "data-row"
@@ -145,11 +145,11 @@ def test_it_fits_a_narrow_window_and_a_screenshot_shows_the_scene(driver, report
 
 
 def test_hostile_names_do_nothing_in_the_browser(driver, tmp_path):
-    scene, facts = made_scene(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
+    drawing, facts = make_drawing(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
     facts["inputs"]["model"] = HOSTILE[0]
     facts["warnings"] = [f"look at {name}" for name in HOSTILE]
     facts["options"]["note"] = HOSTILE[1]
-    write_report(scene, facts, tmp_path / "report.html")
+    write_report(drawing, facts, tmp_path / "report.html")
     opened(driver, tmp_path / "report.html")
     for row in range(len(HOSTILE)):
         if row < 3:  # each draws the scene anew

@@ -14,7 +14,7 @@ from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import first_looks, shortened, summary_sentences
-from tests.made_scenes import made_scene
+from tests.drawings import make_drawing
 
 HOSTILE = [
     "<script>document.title='owned'</script>.jpg",
@@ -40,20 +40,20 @@ def unpacked(column):
 
 @pytest.fixture(scope="module")
 def page():
-    return report_html(*made_scene())
+    return report_html(*make_drawing())
 
 
 def test_columns_survive_the_way_into_the_page(page):
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     data = data_of(page)
-    order = [scene.cameras.names.index(name) for name in data["cameras"]["names"]]
+    order = [drawing.cameras.names.index(name) for name in data["cameras"]["names"]]
     world = unpacked(data["cameras"]["world"]).reshape(-1, 3)
-    np.testing.assert_array_equal(world, scene.cameras.centers[order])
+    np.testing.assert_array_equal(world, drawing.cameras.centers[order])
     ends = np.stack([unpacked(data["pairs"][end]) for end in ("first", "second")], axis=1)
-    rows = scene.pairs.worst_first()
-    np.testing.assert_array_equal(np.array(order)[ends], scene.pairs.cameras[rows])
+    rows = drawing.pairs.worst_first()
+    np.testing.assert_array_equal(np.array(order)[ends], drawing.pairs.cameras[rows])
     residuals = unpacked(data["pairs"]["residual"])
-    np.testing.assert_array_equal(residuals, scene.pairs.residuals_deg[rows].astype(np.float32))
+    np.testing.assert_array_equal(residuals, drawing.pairs.residuals_deg[rows].astype(np.float32))
 
 
 def test_cameras_stand_by_trust_and_contradicting_pairs_first(page):
@@ -69,33 +69,33 @@ def test_cameras_stand_by_trust_and_contradicting_pairs_first(page):
 
 
 def test_the_page_is_small_and_quickly_made():
-    scene, facts = made_scene(1000, 20_000, 20_000)
-    report_html(scene, facts)  # reads plotly.js, once per process
+    drawing, facts = make_drawing(1000, 20_000, 20_000)
+    report_html(drawing, facts)  # reads plotly.js, once per process
     start = time.process_time()
-    page = report_html(scene, facts)
+    page = report_html(drawing, facts)
     assert time.process_time() - start < 2.0  # the requirement; 0.1 s here
     assert len(page.encode()) < 8_000_000
 
 
 def test_of_many_pairs_the_worst_are_listed_and_the_page_says_so():
-    scene, facts = made_scene(300, MAX_PAIRS + 10_000, 10)
-    data = page_data(scene, facts)
+    drawing, facts = make_drawing(300, MAX_PAIRS + 10_000, 10)
+    data = page_data(drawing, facts)
     assert len(unpacked(data["pairs"]["first"])) == MAX_PAIRS
-    wrong = int(np.sum(scene.pairs.classes == PairClass.CONTRADICTS))
+    wrong = int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS))
     assert int(np.sum(unpacked(data["pairs"]["verdict"]) == PairClass.CONTRADICTS)) == wrong
     assert "30,000 pairs the worst 20,000" in data["pairsNote"]
     assert data["pairsNote"] in data["sceneNote"]
     counted = sum(data["histogram"]["counts"]["output"])
-    assert counted == int(np.isfinite(scene.pairs.residuals_deg).sum())  # all of them, listed or not
-    assert page_data(*made_scene())["pairsNote"] == ""
+    assert counted == int(np.isfinite(drawing.pairs.residuals_deg).sum())  # all of them, listed or not
+    assert page_data(*make_drawing())["pairsNote"] == ""
 
 
 def test_hostile_names_stay_text_in_the_file():
-    scene, facts = made_scene(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
+    drawing, facts = make_drawing(num_cameras=len(HOSTILE), num_pairs=20, names=HOSTILE)
     facts["inputs"]["model"] = HOSTILE[0]
     facts["warnings"] = [f"look at {name}" for name in HOSTILE]
-    page = report_html(scene, facts)
-    assert page.count("<script") == report_html(*made_scene()).count("<script")
+    page = report_html(drawing, facts)
+    assert page.count("<script") == report_html(*make_drawing()).count("<script")
     assert "<img" not in page.split("<script>", 1)[0]
     assert "<title>&lt;script&gt;" in page
     names = data_of(page)["cameras"]["names"]
@@ -118,80 +118,80 @@ def test_only_the_two_scripts_of_the_page_may_run_and_nothing_be_fetched(page):
 
 
 def test_a_model_in_memory_is_titled_by_its_database():
-    scene, facts = made_scene()
+    drawing, facts = make_drawing()
     for inputs, title in [
         ({"model": "sparse/0", "database": "a.db"}, "sparse/0"),
         ({"model": "in memory", "database": "a.db"}, "a.db"),
         ({"model": "in memory", "database": None}, "in memory"),
     ]:
-        assert page_data(scene, {**facts, "inputs": {**facts["inputs"], **inputs}})["title"] == title
+        assert page_data(drawing, {**facts, "inputs": {**facts["inputs"], **inputs}})["title"] == title
 
 
 def test_same_scene_same_page():
-    assert report_html(*made_scene()) == report_html(*made_scene())
+    assert report_html(*make_drawing()) == report_html(*make_drawing())
 
 
 def test_the_words_say_what_is_placed_and_what_to_look_at():
-    scene, facts = made_scene()
-    text = " ".join(summary_sentences(scene, facts))
+    drawing, facts = make_drawing()
+    text = " ".join(summary_sentences(drawing, facts))
     assert "24 of 25 images were placed; 1 is not" in text
     assert "18 contradict it" in text
     assert "no other placement is as good" in text
-    looks = first_looks(scene, facts)
+    looks = first_looks(drawing, facts)
     assert looks[0].text == facts["warnings"][0]
     assert any(look.camera == 24 and "not placed" in look.text for look in looks)
-    least = int(np.nanargmin(scene.cameras.trust))
+    least = int(np.nanargmin(drawing.cameras.trust))
     assert next(look for look in looks if "has trust" in look.text).camera == least
     pair = next(look.pair for look in looks if look.pair is not None)
-    against = scene.pairs.classes == PairClass.CONTRADICTS
-    assert scene.pairs.support[pair] == scene.pairs.support[against].max()
+    against = drawing.pairs.classes == PairClass.CONTRADICTS
+    assert drawing.pairs.support[pair] == drawing.pairs.support[against].max()
 
 
 def test_pairs_that_are_off_by_little_alarm_nobody_one_by_one():
-    scene, facts = made_scene()
-    against = scene.pairs.classes == PairClass.CONTRADICTS
-    small = np.where(against, 0.05, scene.pairs.residuals_deg)
-    looks = first_looks(replace(scene, pairs=replace(scene.pairs, residuals_deg=small)), facts)
+    drawing, facts = make_drawing()
+    against = drawing.pairs.classes == PairClass.CONTRADICTS
+    small = np.where(against, 0.05, drawing.pairs.residuals_deg)
+    looks = first_looks(replace(drawing, pairs=replace(drawing.pairs, residuals_deg=small)), facts)
     assert all(look.pair is None for look in looks)
     said = f"{against.sum()} of the pairs contradict the solution, but by 0.05 degrees at most"
     assert said in [look.text for look in looks]
 
 
 def test_nothing_known_nothing_claimed():
-    scene, facts = made_scene(num_cameras=3, num_pairs=2, num_points=0)
+    drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
     facts |= {"warnings": [], "loose_groups": []}
     facts["solve"]["unique"] = None
-    data = page_data(scene, facts)
+    data = page_data(drawing, facts)
     assert "no other placement" not in " ".join(data["summary"])
     json.dumps(data, allow_nan=False)
 
 
 def test_residuals_at_the_optimum_are_angles_to_its_baselines():
-    scene, _ = made_scene()
-    used = scene.pairs.classes != PairClass.NO_DIRECTION
+    drawing, _ = make_drawing()
+    used = drawing.pairs.classes != PairClass.NO_DIRECTION
     # The made optimum is the truth plus 1 cm per axis and end, on baselines of 2 m: 2 degrees are 5 sigma.
-    assert np.nanmax(scene.pairs.certified_deg[used]) < 2.0
-    assert np.isnan(scene.pairs.certified_deg[~used]).all()
+    assert np.nanmax(drawing.pairs.certified_deg[used]) < 2.0
+    assert np.isnan(drawing.pairs.certified_deg[~used]).all()
 
 
 def test_the_histogram_counts_the_same_pairs_before_and_after():
-    scene, _ = made_scene()
-    histogram = residual_histogram(scene.pairs)
+    drawing, _ = make_drawing()
+    histogram = residual_histogram(drawing.pairs)
     totals = {state: int(counts.sum()) for state, counts in histogram.counts.items()}
     assert list(totals) == ["input", "optimum", "output"]
     assert len(set(totals.values())) == 1
-    assert histogram.medians_deg["output"] == pytest.approx(np.nanmedian(scene.pairs.residuals_deg))
+    assert histogram.medians_deg["output"] == pytest.approx(np.nanmedian(drawing.pairs.residuals_deg))
 
 
 def test_the_matrix_shows_the_worst_of_each_cell_or_shares():
-    scene, _ = made_scene()
-    matrix = view_graph_matrix(scene.pairs, 25)
+    drawing, _ = make_drawing()
+    matrix = view_graph_matrix(drawing.pairs, 25)
     assert matrix.cameras_per_cell == 1
     np.testing.assert_array_equal(matrix.cells, matrix.cells.T)
-    wrong = scene.pairs.cameras[scene.pairs.classes == PairClass.CONTRADICTS]
+    wrong = drawing.pairs.cameras[drawing.pairs.classes == PairClass.CONTRADICTS]
     assert (matrix.cells[wrong[:, 0], wrong[:, 1]] == 4).all()
 
-    large, _ = made_scene(1000, 5000, 0)
+    large, _ = make_drawing(1000, 5000, 0)
     matrix = view_graph_matrix(large.pairs, 1000)
     assert matrix.cells.shape == (200, 200)
     both = np.tril(matrix.counts)
@@ -201,20 +201,20 @@ def test_the_matrix_shows_the_worst_of_each_cell_or_shares():
 
 
 def test_frusta_stand_before_their_cameras_with_the_pictures_shape():
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     rows = np.arange(24)
-    centers = scene.cameras.centers[rows]
-    corners = frustum_corners(scene, rows, centers)
+    centers = drawing.cameras.centers[rows]
+    corners = frustum_corners(drawing, rows, centers)
     middle = corners.mean(axis=1) - centers
     np.testing.assert_allclose(
-        middle, scene.frustum_depth * scene.cameras.poses.rotations[rows, 2], atol=1e-12
+        middle, drawing.frustum_depth * drawing.cameras.poses.rotations[rows, 2], atol=1e-12
     )
     width = np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
-    np.testing.assert_allclose(width, 2 * 0.6 * scene.frustum_depth)
+    np.testing.assert_allclose(width, 2 * 0.6 * drawing.frustum_depth)
 
 
 def test_up_is_where_level_cameras_have_it():
-    rotations = made_scene()[0].cameras.poses.rotations  # they look inwards all around, y down
+    rotations = make_drawing()[0].cameras.poses.rotations  # they look inwards all around, y down
     axes = view_axes(rotations)
     np.testing.assert_allclose(axes[2], [0, -1, 0], atol=0.05)
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)

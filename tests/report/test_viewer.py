@@ -17,7 +17,7 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.report.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
-from tests.made_scenes import made_scene
+from tests.drawings import make_drawing
 from tests.scenes import BUNDLED, FACADE, ROOT
 
 pytest.importorskip("viser", reason="viser is not installed")
@@ -48,17 +48,17 @@ def test_a_bare_graph_has_its_report_too(tmp_path):
     assert result.exit_code == 0
     assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
     assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    scene, _ = read_output(tmp_path / "out")
-    assert np.isfinite(scene.cameras.centers).all()
+    drawing, _ = read_output(tmp_path / "out")
+    assert np.isfinite(drawing.cameras.centers).all()
 
 
 def test_a_folder_is_read_back_as_it_was_written(located):
-    scene, facts = read_output(located)
+    drawing, facts = read_output(located)
     assert facts == json.loads((located / "locate.json").read_text())
-    assert int(scene.cameras.placed.sum()) == facts["num_placed"]
-    assert int(np.sum(scene.pairs.classes == PairClass.CONTRADICTS)) == facts["pairs"]["outlier"]
-    assert np.isfinite(scene.cameras.poses.rotations[scene.cameras.placed]).all()
-    assert len(scene.points.positions) > 0
+    assert int(drawing.cameras.placed.sum()) == facts["num_placed"]
+    assert int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS)) == facts["pairs"]["outlier"]
+    assert np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).all()
+    assert len(drawing.points.positions) > 0
 
 
 def test_the_report_can_be_made_again(located):
@@ -84,45 +84,47 @@ def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, 
 
 
 def test_thresholds_decide_which_pairs_are_drawn():
-    scene, _ = made_scene()
+    drawing, _ = make_drawing()
     everything = Thresholds(residual_deg=180.0, min_support=0, min_trust=0.0, camera=None)
-    drawn = drawn_pairs(scene, everything)
-    placed = scene.cameras.placed[scene.pairs.cameras].all(axis=1) & np.isfinite(scene.pairs.residuals_deg)
+    drawn = drawn_pairs(drawing, everything)
+    placed = drawing.cameras.placed[drawing.pairs.cameras].all(axis=1) & np.isfinite(
+        drawing.pairs.residuals_deg
+    )
     assert len(drawn.rows) == int(placed.sum())
     assert not drawn.contradicts.any()
 
     strict = Thresholds(residual_deg=4.0, min_support=50, min_trust=0.7, camera=3)
-    drawn = drawn_pairs(scene, strict)
+    drawn = drawn_pairs(drawing, strict)
     assert len(drawn.rows) > 0
-    assert (scene.pairs.support[drawn.rows] >= 50).all()
-    assert (scene.pairs.cameras[drawn.rows] == 3).any(axis=1).all()
-    assert (scene.cameras.trust[scene.pairs.cameras[drawn.rows]] >= 0.7).all()
-    np.testing.assert_array_equal(drawn.contradicts, scene.pairs.residuals_deg[drawn.rows] > 4.0)
+    assert (drawing.pairs.support[drawn.rows] >= 50).all()
+    assert (drawing.pairs.cameras[drawn.rows] == 3).any(axis=1).all()
+    assert (drawing.cameras.trust[drawing.pairs.cameras[drawn.rows]] >= 0.7).all()
+    np.testing.assert_array_equal(drawn.contradicts, drawing.pairs.residuals_deg[drawn.rows] > 4.0)
 
 
 def test_the_inputs_centres_are_brought_into_the_outputs_units():
     from dataclasses import replace
 
-    scene, _ = made_scene()
-    poses = replace(scene.cameras.poses, centers=100.0 * scene.cameras.centers + 7.0)
-    other = replace(scene, cameras=replace(scene.cameras, poses=poses), input_is_aligned=False)
-    placed = scene.cameras.placed
-    np.testing.assert_allclose(input_centers(other)[placed], scene.cameras.centers[placed], atol=1e-6)
+    drawing, _ = make_drawing()
+    poses = replace(drawing.cameras.poses, centers=100.0 * drawing.cameras.centers + 7.0)
+    other = replace(drawing, cameras=replace(drawing.cameras, poses=poses), input_is_aligned=False)
+    placed = drawing.cameras.placed
+    np.testing.assert_allclose(input_centers(other)[placed], drawing.cameras.centers[placed], atol=1e-6)
     same = replace(poses, centers=np.zeros_like(poses.centers))
     assert input_centers(replace(other, cameras=replace(other.cameras, poses=same))) is None
 
 
 def test_a_ray_picks_the_camera_that_it_meets():
-    scene, _ = made_scene()
-    eye = scene.cameras.centers[scene.cameras.placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
-    for camera in np.flatnonzero(scene.cameras.placed)[:5].tolist():
-        assert camera_at(scene, eye, 7.0 * (scene.cameras.centers[camera] - eye)) == camera
-    assert camera_at(scene, eye, np.array([0.0, 1.0, 0.0])) is None  # away from all
+    drawing, _ = make_drawing()
+    eye = drawing.cameras.centers[drawing.cameras.placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
+    for camera in np.flatnonzero(drawing.cameras.placed)[:5].tolist():
+        assert camera_at(drawing, eye, 7.0 * (drawing.cameras.centers[camera] - eye)) == camera
+    assert camera_at(drawing, eye, np.array([0.0, 1.0, 0.0])) is None  # away from all
 
 
 def test_moving_a_control_redraws():
-    scene, facts = made_scene()
-    server = serve(scene, facts, "127.0.0.1", 8765)
+    drawing, facts = make_drawing()
+    server = serve(drawing, facts, "127.0.0.1", 8765)
     try:
         controls = {handle.label: handle for handle in server.gui._gui_input_handle_from_uuid.values()}
         before = controls["pairs drawn"].value
@@ -130,10 +132,10 @@ def test_moving_a_control_redraws():
         assert controls["pairs drawn"].value != before
         assert "input's poses (grey)" in controls
         (clicked,) = server.scene._scene_pointer_cb
-        middle = np.median(scene.cameras.centers[scene.cameras.placed], axis=0)
-        towards = scene.cameras.centers[3] - middle - np.array([50.0, 0.0, 0.0])
+        middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
+        towards = drawing.cameras.centers[3] - middle - np.array([50.0, 0.0, 0.0])
         clicked.callback(SimpleNamespace(ray_origin=(50.0, 0.0, 0.0), ray_direction=tuple(towards)))
-        assert controls["pairs of"].value.endswith(scene.cameras.names[3])
+        assert controls["pairs of"].value.endswith(drawing.cameras.names[3])
     finally:
         server.stop()
 

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.directions import DirectionOptions, DirectionStatus, estimate_directions
+from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.options import DirectionOptions
+from sfm_shapefit.directions.pair_directions import DirectionStatus
 from sfm_shapefit.results import match_warnings
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.scenes import project_points

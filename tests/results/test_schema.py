@@ -8,6 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
+from sfm_shapefit.results.schema import PATH, schema_text
 from tests.scenes import BUNDLED, COURTYARD, RING
 
 RING_MODEL = RING / "sparse" / "0"
@@ -29,7 +30,7 @@ def problems(facts, name):
 def commands(out):
     return {
         "locate": ("locate", RING_MODEL, out, "--refine-rotations", "--bundle-adjust", "--no-report"),
-        "solve_graph": ("solve", BUNDLED / "graph40.txt", out, "--no-report"),
+        "solve_graph": ("place", BUNDLED / "graph40.txt", out, "--no-report"),
         "inspect": ("inspect", RING_MODEL, "--theory"),
         "evaluate": ("evaluate", RING_MODEL, RING_MODEL),
         "map": ("map", COURTYARD / "database.db", out),
@@ -38,6 +39,10 @@ def commands(out):
 
 def test_the_schema_is_one():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
+
+
+def test_the_shipped_schema_is_the_one_that_is_generated():
+    assert schema_text() == PATH.read_text("utf-8"), "run python -m sfm_shapefit.results.schema"
 
 
 @pytest.mark.parametrize("name", commands(""))
@@ -55,6 +60,6 @@ def test_a_key_that_is_missing_renamed_or_unknown_breaks_the_schema():
 
 
 def test_a_baseline_keeps_to_the_schema(tmp_path):
-    arguments = ("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--no-report", "--json")
+    arguments = ("place", BUNDLED / "graph40.txt", tmp_path / "out", "--no-report", "--json")
     facts = printed(*arguments, "--objective", "least-squares", "--filter", "triangles")
     assert problems(facts, "solve_graph") == []

@@ -10,7 +10,6 @@ from peers.colmap import averaged_model
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.colmap.model import read_model, with_turned_cameras
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
-from sfm_shapefit.results import summary
 from sfm_shapefit.rotations import joint_refinement as epipolar
 from sfm_shapefit.rotations.acceptance import refine_rotations
 from sfm_shapefit.rotations.joint_refinement import RayMatches, State, at_state
@@ -206,7 +205,7 @@ def turned_courtyard():
 
 
 def located(model, **options):
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", LocateOptions(**options))
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", options=LocateOptions(**options))
     return found, sfm_shapefit.evaluate(found.reconstruction, COURTYARD / "truth")
 
 
@@ -216,7 +215,7 @@ def test_refined_rotations_are_closer_to_the_truth_and_so_are_the_cameras(turned
     assert refined.rotation_deg.median < 0.25 * plain.rotation_deg.median
     assert refined.position.median < 0.5 * plain.position.median
     assert refined.rotation_deg.max <= plain.rotation_deg.max
-    told = summary(found)["rotation_refinement"]
+    told = found.summary()["rotation_refinement"]
     assert told["num_updated"] + told["num_kept"] == found.model.num_images
     assert told["num_updated"] == np.count_nonzero(found.turned_deg) > 15
     assert 0.1 < told["median_change_deg"] < 1.0
@@ -226,7 +225,7 @@ def test_refined_rotations_are_closer_to_the_truth_and_so_are_the_cameras(turned
 def test_without_being_asked_no_rotation_changes(turned_courtyard):
     found, _ = located(turned_courtyard)
     assert found.turned_deg is None
-    assert summary(found)["rotation_refinement"] is None
+    assert found.summary()["rotation_refinement"] is None
     for image_id, image in found.reconstruction.images.items():
         given = turned_courtyard.image(image_id).cam_from_world().rotation.quat
         np.testing.assert_array_equal(image.cam_from_world().rotation.quat, given)
@@ -260,7 +259,7 @@ def test_relative_poses_are_no_matches_to_refine_on():
 def test_averaged_rotations_of_a_real_scene_get_better():
     scene = real_scene("fountain-P11")
     model = averaged_model(scene / "database.db", scene / "sparse" / "0")
-    found = sfm_shapefit.locate(model, scene / "database.db", LocateOptions(refine_rotations=True))
+    found = sfm_shapefit.locate(model, scene / "database.db", options=LocateOptions(refine_rotations=True))
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
     assert errors.position.median < 0.003
     assert errors.position.max < 0.008

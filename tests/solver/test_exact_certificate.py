@@ -45,7 +45,7 @@ def checked(graph, locations, dual, bound):
 @pytest.mark.parametrize("seed", range(50))
 def test_the_certificate_of_a_small_problem_holds_exactly(seed):
     graph = problem(seed)
-    found = solve(graph, SolverOptions(method="admm" if seed % 7 == 6 else "newton"))
+    found = solve(graph, SolverOptions(solver="admm" if seed % 7 == 6 else "newton"))
     proven, below, above = checked(graph, found.locations, found.dual, found.dual_bound)
     assert proven >= Fraction(found.dual_bound) - Fraction(ROUNDING)
     assert below - Fraction(ROUNDING) <= Fraction(found.objective) <= above + Fraction(ROUNDING)
@@ -78,5 +78,5 @@ def test_the_bound_of_any_dual_made_feasible_holds_exactly(seed):
 
 def test_splitting_asked_for_on_a_tiny_graph_proves_its_answer_too():
     for seed in range(200):  # 54, 66, 162, 174: accelerated, it leads to locations of 1e10 and more
-        found = solve(problem(seed), SolverOptions(method="admm"))
+        found = solve(problem(seed), SolverOptions(solver="admm"))
         assert found.status is Status.CONVERGED, seed

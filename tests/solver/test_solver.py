@@ -111,7 +111,7 @@ def test_the_conic_solver_loosens_its_tolerance_rather_than_giving_up(seed):
     drawn = random_graph_problem(12, 0.9, d=5, sigma=0.0, q=1.0, seed=seed)
     weights = np.random.default_rng(seed).uniform(0.2, 3.0, len(drawn.edges))
     graph = ViewGraph(12, drawn.edges, drawn.directions, weights)
-    conic = solve(graph, SolverOptions(method="conic"))
+    conic = solve(graph, SolverOptions(solver="conic"))
     assert conic.gap < 1e-6
     assert conic.objective == pytest.approx(solve(graph).objective, abs=1e-6)
 
@@ -254,7 +254,7 @@ def test_certify_refuses_what_it_cannot_judge():
 @pytest.mark.parametrize("method", ["newton", "conic"])
 def test_too_few_iterations_are_reported_not_hidden(method):
     graph, _ = problem(13, sigma=0.05)
-    result = solve(graph, SolverOptions(method=method, max_iterations=3))
+    result = solve(graph, SolverOptions(solver=method, max_iterations=3))
     assert result.status is not Status.CONVERGED
     assert result.gap > TOL
     assert np.isfinite(result.locations).all()
@@ -292,14 +292,14 @@ def test_auto_says_what_it_chose_and_why():
     sparse = solve(box(300))
     assert sparse.method == "newton"
     assert "Gflop for a sparse factor" in sparse.method_reason
-    assert solve(box(60), SolverOptions(method="admm", tol=1e-3)).method_reason == "asked for"
+    assert solve(box(60), SolverOptions(solver="admm", tol=1e-3)).method_reason == "asked for"
 
 
 def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
     from sfm_shapefit.solver import solve as module
 
     def chosen(graph, method="auto"):
-        choice = module.choose_method(graph, SolverOptions(method=method))
+        choice = module.choose_method(graph, SolverOptions(solver=method))
         run = getattr(choice.run, "func", choice.run)
         return choice.method, run.__name__, choice.reason, getattr(choice.run, "keywords", {})
 
@@ -360,14 +360,14 @@ def test_the_table_of_choices(method, n, share, flops, run, reason, monkeypatch)
     pairs = int(np.ceil(share * n * (n - 1) / 2))
     graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=pairs)
     monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops))
-    choice = solving.choose_method(graph, SolverOptions(method=method))
+    choice = solving.choose_method(graph, SolverOptions(solver=method))
     assert getattr(choice.run, "func", choice.run).__name__ == run
     assert choice.method == {"_run_admm": "admm", "_run_conic": "conic"}.get(run, "newton")
     assert choice.reason == reason
 
 
 def test_the_splitting_is_given_the_options_in_bytes_and_says_how_it_ended(monkeypatch):
-    graph, options, seen = problem(1)[0], SolverOptions(tol=1e-5, factor_memory=3, threads=2), {}
+    graph, options, seen = problem(1)[0], SolverOptions(tol=1e-5, factor_memory_mb=3, threads=2), {}
 
     def solved(*arguments, **named):
         seen.update(named, arguments=arguments)
@@ -396,9 +396,9 @@ def test_auto_leaves_newton_where_its_factor_would_explode(monkeypatch):
 @pytest.mark.parametrize("n", [60, 300])
 def test_all_methods_agree(n):
     graph = box(n)
-    reference = solve(graph, SolverOptions(method="conic"))
+    reference = solve(graph, SolverOptions(solver="conic"))
     for method in ("newton", "admm"):
-        result = solve(graph, SolverOptions(method=method))
+        result = solve(graph, SolverOptions(solver=method))
         assert result.objective == pytest.approx(reference.objective, abs=1e-7)
         # The optimum is unique; 1e-8 of the objective leaves about its square root of the locations.
         np.testing.assert_allclose(shape(result.locations), shape(reference.locations), atol=1e-4)
@@ -412,7 +412,7 @@ def test_the_callback_sees_every_iteration_and_can_cancel(method):
         seen.append(info)
         return len(seen) < 3
 
-    result = solve(graph, SolverOptions(method=method, tol=1e-12), watch)
+    result = solve(graph, SolverOptions(solver=method, tol=1e-12), on_iteration=watch)
     assert result.status is Status.CANCELLED
     assert [info.iteration for info in seen] == [1, 2, 3]
     assert np.isfinite(result.locations).all()
@@ -422,7 +422,7 @@ def test_the_callback_sees_every_iteration_and_can_cancel(method):
 @pytest.mark.parametrize("method", ["newton", "admm"])
 def test_threads_and_repetitions_change_no_bit(method):
     graph = box(300)
-    results = [solve(graph, SolverOptions(method=method, tol=1e-6, threads=k)) for k in (1, 2, 1)]
+    results = [solve(graph, SolverOptions(solver=method, tol=1e-6, threads=k)) for k in (1, 2, 1)]
     for other in results[1:]:
         np.testing.assert_array_equal(results[0].locations, other.locations)
         np.testing.assert_array_equal(results[0].dual, other.dual)

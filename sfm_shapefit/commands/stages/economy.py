@@ -7,7 +7,7 @@ import numpy as np
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.measure import samples_errors, without_points
 from sfm_shapefit.commands.stages.memory import Workload, choose_economy
-from sfm_shapefit.directions import PairDirections
+from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.directions.tracks import JointGraph
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
@@ -21,7 +21,7 @@ def known_workload(
     source: MatchSource, directions: PairDirections, joint: JointGraph, options: LocateOptions
 ) -> Workload:
     """Return what there is to do once the graph is known: its factor is planned, nothing is solved."""
-    entries, flops = _factor(joint.graph, options.factor_memory * 1_000_000)
+    entries, flops = _factor(joint.graph, options.factor_memory_mb * 1_000_000)
     return replace(
         source.workload(),
         num_pairs=len(directions.pairs),
@@ -38,18 +38,18 @@ def known_workload(
 def within_memory(
     source: MatchSource, directions: PairDirections, joint: JointGraph, options: LocateOptions
 ) -> tuple[MatchSource, JointGraph, LocateOptions]:
-    """Return the three as they stay below `options.max_memory`; as they are, if that is no limit.
+    """Return the three as they stay below `options.max_memory_mb`; as they are, if that is no limit.
 
     Raises:
         InputError: with the number needed, if there is no way.
     """
-    if not options.max_memory:
+    if not options.max_memory_mb:
         return source, joint, options
-    economy = choose_economy(known_workload(source, directions, joint, options), options.max_memory)
+    economy = choose_economy(known_workload(source, directions, joint, options), options.max_memory_mb)
     if not economy.points:
         joint = without_points(joint)
     if not economy.factor:
-        options = replace(options, factor_memory=1)
+        options = replace(options, factor_memory_mb=1)
     return replace(source, economy=economy), joint, options
 
 

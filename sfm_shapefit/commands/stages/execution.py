@@ -22,8 +22,10 @@ from typing import Any, Literal
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras
-from sfm_shapefit.directions import DirectionOptions, PairDirections, concatenate, estimate_directions
+from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.directions.options import DirectionOptions
+from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
 

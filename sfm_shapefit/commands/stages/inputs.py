@@ -71,13 +71,13 @@ class MatchSource:
 
 
 @contextmanager
-def open_source(model: PosedModel, inputs: Inputs, max_memory: int = 0) -> Iterator[MatchSource]:
+def open_source(model: PosedModel, inputs: Inputs, max_memory_mb: int = 0) -> Iterator[MatchSource]:
     """Open the matches that were chosen, and close them in the end.
 
     Args:
         model: whose images they belong to.
         inputs: what was chosen.
-        max_memory: limit of the peak memory in MB, which decides the economy; 0 for none.
+        max_memory_mb: limit of the peak memory in MB, which decides the economy; 0 for none.
 
     Raises:
         InputError: if the matches cannot be read, or there is no way to stay below the limit.
@@ -87,8 +87,8 @@ def open_source(model: PosedModel, inputs: Inputs, max_memory: int = 0) -> Itera
         return
     with open_database(inputs.database, model) as database:
         source = MatchSource(model=model, kind=inputs.source, database=database)
-        if max_memory:
-            economy = choose_economy(source.workload(), max_memory)
+        if max_memory_mb:
+            economy = choose_economy(source.workload(), max_memory_mb)
             database.limit_rays(economy.rays_bytes)
             source = replace(source, economy=economy)
         yield source

@@ -10,13 +10,13 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.execution import directions_of, shared_out
 from sfm_shapefit.commands.stages.inputs import MatchSource
-from sfm_shapefit.directions import (
+from sfm_shapefit.directions.pair_directions import (
     CONTRADICTIONS,
     DirectionStatus,
     PairDirections,
     concatenate,
-    from_relative_poses,
 )
+from sfm_shapefit.directions.relative_poses import from_relative_poses
 from sfm_shapefit.directions.tracks import JointGraph, build_tracks, covering_set, join_points
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
@@ -49,12 +49,12 @@ def measure_directions(
             (poses.rotations, poses.translations),
             model.rotations,
             poses.num_inliers,
-            options.for_directions(),
+            options,
         )
     if executor is not None and source.database is not None:
-        parts = shared_out(source.database, model, options.for_directions(), executor, clock.advance)
+        parts = shared_out(source.database, model, options, executor, clock.advance)
     else:
-        wanted, threads = options.for_directions(), options.num_threads()
+        wanted, threads = options, options.num_threads()
         batches = source.counted(source.batches(), clock.advance)
         parts = [directions_of(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
     if not parts:

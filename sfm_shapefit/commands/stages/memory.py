@@ -161,7 +161,7 @@ def choose_economy(work: Workload, limit_mb: float) -> Economy:
             return economy
     needed = forecast(work, ECONOMIES[-1]).peak_mb
     raise InputError(
-        f"this takes about {needed:.0f} MB even with every economy, and max_memory allows {limit_mb:.0f}; "
+        f"this takes about {needed:.0f} MB even with every economy, and max_memory_mb allows {limit_mb:.0f}; "
         f"raise it to {np.ceil(needed / 10.0) * 10.0:.0f} or more, or split the model"
     )
 

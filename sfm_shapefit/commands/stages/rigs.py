@@ -71,7 +71,7 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
         raise InputError(
             f"the scale is that of the {source}; leave out other scales, known distances and priors"
         )
-    if not options.for_placement().solves_shapefit or options.filter != "none":
+    if not options.solves_shapefit or options.filter != "none":
         raise InputError(
             "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
         )
@@ -113,8 +113,8 @@ def placed(
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
     if rigid.groups is None:
-        settings, k = options.for_placement(), joint.num_cameras
-        return place(joint.graph, settings, joint.covariance, evidence, k, clock.iteration)
+        k = joint.num_cameras
+        return place(joint.graph, options, joint.covariance, evidence, k, clock.iteration)
     first = None
     if options.points != "always":
         try:
@@ -135,7 +135,7 @@ def _placed_groups(joint: JointGraph, evidence: Evidence, rigid: Rigid, options:
     return place_groups(
         joint.graph,
         rigid.groups.with_separate(joint.num_points),
-        options.for_placement(),
+        options,
         joint.covariance,
         evidence,
         joint.num_cameras,

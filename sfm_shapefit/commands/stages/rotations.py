@@ -37,9 +37,7 @@ def refined_rotations(
             given, current = (resources.enter_context(open_source(m, inputs)) for m in (model, turned))
             directions = measure_directions(current, options, clock)
             joint = joint_graph(current, directions, options)
-            placement = place(
-                joint.graph, options.for_placement(), joint.covariance, num_cameras=joint.num_cameras
-            )
+            placement = place(joint.graph, options, joint.covariance, num_cameras=joint.num_cameras)
             residuals = placement.assessment.residuals_deg[placement.pairs]
             near = placement.edges[placement.pairs[residuals <= _REFINEMENT_RESIDUAL_DEG]]
             rays = _rays_of_pairs(given, directions.usable()[near], placement.cameras)

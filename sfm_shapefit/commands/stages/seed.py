@@ -53,12 +53,12 @@ def seeded_model(
         seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
     if not options.bundle_adjust:  # which triangulates at the seed's poses itself
         with clock("triangulation"):
-            settings = options.for_structure()
+            settings = options
             seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
     if options.bundle_adjust:
         with clock("bundle adjustment"):
             still = () if fixed is None else source.model.frame_ids[fixed].tolist()
-            adjusted = bundle_adjust(seed, tracks, options.for_structure(), fixed_frames=still)
+            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=still)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     if source.database is not None:  # points of the model's own tracks have their colours already
@@ -76,7 +76,7 @@ def further_pieces(
 ) -> tuple[FurtherPiece, ...]:
     """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own."""
     found = []
-    for placed in place_further(placement, options.for_placement(), joint.covariance, evidence):
+    for placed in place_further(placement, options, joint.covariance, evidence):
         kept = trusted(placed, options.min_trust)
         gauge = unit_gauge(placed.locations[kept])
         seeded, _ = seeded_model(source, placed, kept, gauge, options, Clock())

@@ -52,7 +52,7 @@ def solve_groups(
     Raises:
         InputError: if a method is asked for that does not exist over groups.
         UnsolvableError: if no pair joins two groups, the pairs do not determine the groups, or a factor over
-            the groups would take more than `options.factor_memory`.
+            the groups would take more than `options.factor_memory_mb`.
     """
     options = options or SolverOptions()
     start = time.perf_counter()
@@ -78,14 +78,14 @@ def solve_groups(
 
 def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
     """Return the solver that is asked for, if it knows groups."""
-    if options.method == "admm":
+    if options.solver == "admm":
         raise InputError(
             "method 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
         )
     reason = "asked for"
-    if options.method == "auto":
+    if options.solver == "auto":
         reason = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
-    if options.method == "conic":
+    if options.solver == "conic":
         return Choice("conic", partial(_run_conic, groups), reason)
     return Choice("newton", partial(_run_newton, groups), reason)
 
@@ -94,7 +94,7 @@ def _run_newton(
     groups: RigidGroups, graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None
 ) -> Run:
     factor = ReducedFactor(
-        graph.edges, groups, threads=options.threads, max_bytes=options.factor_memory * 1_000_000
+        graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_memory_mb * 1_000_000
     )
     return Run(*solve_newton_reduced(graph, factor, options.tol, limit, watch))
 

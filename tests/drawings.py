@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.report.drawing import Points, Poses, build_scene
+from sfm_shapefit.report.drawing import Points, Poses, build_drawing
 from sfm_shapefit.results.tables import CameraRow, PairRow
 
 UNDETERMINED_EVERY, NO_DIRECTION_EVERY, WRONG_EVERY = 50, 30, 7
 
 
-def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0):
-    """Return a scene and what locate.json would say of it."""
+def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0):
+    """Return a drawing and what locate.json would say of it."""
     rng = np.random.default_rng(seed)
     names = names or [f"images/IMG_{k:05d}.jpg" for k in range(num_cameras)]
     centers, rotations = _ring(num_cameras, rng)
@@ -30,7 +30,7 @@ def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0
     ]
     pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
     history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
-    scene = build_scene(
+    drawing = build_drawing(
         cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape)
     )
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
@@ -40,11 +40,15 @@ def made_scene(num_cameras=25, num_pairs=120, num_points=500, names=None, seed=0
         colors=rng.integers(60, 220, (num_points, 3)),
         num_all=3 * num_points,
     )
-    pairs = replace(scene.pairs, input_deg=scene.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))
-    scene = replace(
-        scene, cameras=replace(scene.cameras, poses=poses), points=points, pairs=pairs, input_is_aligned=True
+    pairs = replace(drawing.pairs, input_deg=drawing.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))
+    drawing = replace(
+        drawing,
+        cameras=replace(drawing.cameras, poses=poses),
+        points=points,
+        pairs=pairs,
+        input_is_aligned=True,
     )
-    return replace(scene, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(
+    return replace(drawing, axes=np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), frustum_depth=0.3), _facts(
         names
     )
 

@@ -1,0 +1,39 @@
+"""What a 3D point must satisfy. Pure data, and cheap to import."""
+
+from dataclasses import dataclass
+
+from sfm_shapefit.settings import Settings, explained, option
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class StructureOptions(Settings):
+    """What a 3D point must satisfy to stand in the output."""
+
+    max_reprojection_error_px: float = option(
+        4.0,
+        "Observations with a larger reprojection error are removed, and points that lose all but one.",
+    )
+    min_triangulation_angle_deg: float = option(
+        1.5,
+        "Points that no two cameras see under at least this angle are removed; their depth means little.",
+    )
+    min_track_length: int = option(2, "Points seen in fewer images than this are removed; 2 or more.")
+    ignore_two_view_tracks: bool = option(
+        True,
+        "Leave out matches that only two images share: a wrong one is not noticed, since one epipolar "
+        "constraint is all that checks it. Concerns matches of a database, not a model's own tracks, "
+        "and only models of three images or more: two have no other matches.",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0.0 < self.max_reprojection_error_px < float("inf"):
+            raise ValueError(
+                f"max_reprojection_error_px must be positive and finite, got {self.max_reprojection_error_px}"
+            )
+        if not 0.0 <= self.min_triangulation_angle_deg < 90.0:
+            raise ValueError(
+                f"min_triangulation_angle_deg must lie in [0, 90), got {self.min_triangulation_angle_deg}"
+            )
+        self.check_range("min_track_length", 2)

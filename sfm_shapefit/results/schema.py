@@ -1,0 +1,89 @@
+"""The JSON Schema of what the commands print, made of `json_types`.
+
+python -m sfm_shapefit.results.schema           # writes sfm_shapefit/schemas/output.schema.json anew
+"""
+
+import json
+import types
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
+
+from sfm_shapefit.results.json_types import (
+    EvaluateSummary,
+    GraphSummary,
+    InspectSummary,
+    LocateSummary,
+    MapSummary,
+)
+
+PATH = Path(__file__).parents[1] / "schemas" / "output.schema.json"
+
+_COMMANDS = {
+    "locate": LocateSummary,
+    "solve_graph": GraphSummary,
+    "inspect": InspectSummary,
+    "evaluate": EvaluateSummary,
+    "map": MapSummary,
+}
+_SIMPLE = {int: "integer", float: "number", str: "string", bool: "boolean", type(None): "null"}
+
+
+def output_schema() -> dict[str, Any]:
+    """Return one schema for all commands; `$defs` has that of each."""
+    definitions: dict[str, Any] = {}
+    names = {kind: name for name, kind in _COMMANDS.items()}
+    for kind in _COMMANDS.values():
+        _schema_of(kind, definitions, names)
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "title": "Output of sfm-shapefit",
+        "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
+        "solve_graph (the command place), inspect, evaluate, map.",
+        "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
+        "$defs": definitions,
+    }
+
+
+def _schema_of(kind: Any, definitions: dict[str, Any], names: dict[Any, str]) -> dict[str, Any]:
+    """Return the schema of a type; that of a TypedDict is added to the definitions, and referred to."""
+    if is_typeddict(kind):
+        name = names.get(kind, kind.__name__)
+        if name not in definitions:
+            definitions[name] = {}  # Holds the place: definitions stand in the order of their use.
+            hints = get_type_hints(kind, include_extras=True)
+            definitions[name] |= {
+                "type": "object",
+                "description": kind.__doc__,
+                "properties": {key: _schema_of(hint, definitions, names) for key, hint in hints.items()},
+                "required": list(hints),
+                "additionalProperties": False,
+            }
+        return {"$ref": f"#/$defs/{name}"}
+    if get_origin(kind) is Annotated:
+        described, sentence = get_args(kind)
+        return _schema_of(described, definitions, names) | {"description": sentence}
+    inner = [_schema_of(one, definitions, names) for one in get_args(kind) if not isinstance(one, str | int)]
+    return _plain_schema_of(kind, inner)
+
+
+def _plain_schema_of(kind: Any, inner: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return the schema of a type, given those of its arguments."""
+    origin = get_origin(kind)
+    if origin is Literal:
+        return {"enum": list(get_args(kind))}
+    if origin is types.UnionType:
+        return {"anyOf": inner}
+    if origin is list:
+        return {"type": "array", "items": inner[0]}
+    if origin is dict:
+        return {"type": "object", "additionalProperties": inner[1]}
+    return {} if kind is Any else {"type": _SIMPLE[kind]}
+
+
+def schema_text() -> str:
+    """Return the text of the schema's file."""
+    return json.dumps(output_schema(), indent=2) + "\n"
+
+
+if __name__ == "__main__":
+    PATH.write_text(schema_text(), encoding="utf-8")

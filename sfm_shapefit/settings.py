@@ -1,0 +1,147 @@
+"""Settings of any stage: dataclasses whose fields carry their sentence, so that it is written once.
+
+The command line's flags, the keys of its TOML file, `help()`, the JSON Schema and the table in
+`docs/options.md` are all made of these fields.
+
+    @explained
+    @dataclass(frozen=True, kw_only=True)
+    class SolverOptions(Settings):
+        "How the program is solved."
+
+        tol: float = option(1e-8, "Certified gap at which a solve counts as converged.")
+"""
+
+import difflib
+import inspect
+import numbers
+import textwrap
+import types
+from collections.abc import Iterator
+from dataclasses import Field, dataclass, field, fields, replace
+from functools import cache
+from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
+
+S = TypeVar("S", bound="Settings")
+
+_HELP_WIDTH = 88
+
+
+def option(default: Any, help: str, *, also: str = "") -> Any:  # noqa: A002  as click and argparse call it
+    """Return a field with its default and the sentence that explains it.
+
+    Args:
+        default: what holds where the user says nothing.
+        help: the sentence.
+        also: an earlier name of the field, which the command line still takes.
+    """
+    return field(default=default, metadata={"help": help, "also": also})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """Fields made by `option`. Values of another type than the field's are refused by name."""
+
+    def __post_init__(self) -> None:
+        kinds = _hints(type(self))  # type: ignore[arg-type]  # a class can be hashed
+        for item in fields(self):
+            value, kind = getattr(self, item.name), kinds[item.name]
+            if not _fits(value, kind):
+                raise ValueError(f"{item.name} must be {_wanted(kind)}, got {value!r}")
+
+    def check_range(self, name: str, low: float, high: float = float("inf")) -> None:
+        """Refuse a field whose value lies outside [low, high].
+
+        Raises:
+            ValueError: a sentence that names the field.
+        """
+        value = getattr(self, name)
+        if not low <= value <= high:
+            limits = f"be at least {low:g}" if high == float("inf") else f"lie in [{low:g}, {high:g}]"
+            raise ValueError(f"{name} must {limits}, got {value}")
+
+
+class Group(NamedTuple):
+    """The fields that one settings class states itself, and what they are about."""
+
+    title: str
+    fields: tuple[Field[Any], ...]
+
+
+def groups_of(settings: type[Settings]) -> Iterator[Group]:
+    """Yield the fields of a settings class, grouped by the class that states them, its own first.
+
+    The title of a group is the first sentence of that class. A field that is stated again, with another
+    default, belongs to the class that states it last.
+    """
+    known, seen = {item.name: item for item in fields(settings)}, set[str]()
+    for base in settings.__mro__:
+        names = [name for name in inspect.get_annotations(base) if name in known.keys() - seen]
+        seen |= set(names)
+        if names:
+            title = (base.__doc__ or base.__name__).split("\n")[0].rstrip(".")
+            yield Group(title, tuple(known[name] for name in names))
+
+
+def explained(settings: type[S]) -> type[S]:
+    """Add the options of a settings class, with defaults and sentences, to its docstring."""
+    lines = [(settings.__doc__ or "").rstrip(), "", "Options:"]
+    for group in groups_of(settings):
+        for item in group.fields:
+            sentence = textwrap.wrap(item.metadata["help"], _HELP_WIDTH)
+            lines += [f"    {item.name} = {item.default!r}", *(f"        {line}" for line in sentence)]
+    settings.__doc__ = "\n".join(lines)
+    return settings
+
+
+def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any]) -> S:
+    """Return the settings of a call: those given, or the defaults, with single options set by keyword.
+
+    Raises:
+        TypeError: if a keyword is no option; the message names a near one.
+        ValueError: if a value is refused.
+    """
+    known = [item.name for item in fields(settings)]
+    for name in overrides:
+        if name not in known:
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+            raise TypeError(f"{name!r} is no option of {settings.__name__}; {hint}")
+    if given is None:
+        return settings(**overrides)
+    return replace(given, **overrides) if overrides else given
+
+
+@cache
+def _hints(settings: Any) -> dict[str, Any]:
+    """Return the types of a settings class's fields by name."""
+    return get_type_hints(settings)
+
+
+_KINDS: dict[Any, tuple[type, ...]] = {
+    int: (numbers.Integral,),
+    float: (numbers.Real,),
+    str: (str,),
+    bool: (bool,),
+    tuple: (tuple, list),
+}
+
+
+def _fits(value: object, kind: Any) -> bool:
+    """Tell whether a value is of a field's type; an integer serves as a float, a list as a tuple."""
+    if get_origin(kind) in (Union, types.UnionType):
+        return any(_fits(value, choice) for choice in get_args(kind))
+    if get_origin(kind) is Literal:
+        return isinstance(value, str) and value in get_args(kind)
+    if kind is type(None):
+        return value is None
+    accepted = _KINDS[get_origin(kind) or kind]
+    return isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
+
+
+def _wanted(kind: Any) -> str:
+    """Say what a field takes."""
+    if get_origin(kind) is Literal:
+        return f"one of {', '.join(get_args(kind))}"
+    if get_origin(kind) in (Union, types.UnionType):
+        return " or ".join(_wanted(choice) for choice in get_args(kind) if choice is not type(None))
+    return f"of type {(get_origin(kind) or kind).__name__}"
