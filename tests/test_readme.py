@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pycolmap
 import pytest
-from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
+from tests.program import run
 from tests.scenes import COURTYARD, RING, ROOT
 
 README = ROOT / "README.md"
@@ -109,7 +109,7 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
         if arguments[0] == "view":
             viewed(arguments, tmp_path)
             continue
-        result = CliRunner().invoke(app, arguments)
+        result = run(*arguments)
         assert result.exit_code == 0, f"{command}\n{result.output}"
 
 

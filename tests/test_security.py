@@ -10,15 +10,14 @@ import sys
 import tomllib
 
 import pytest
-from typer.testing import CliRunner
 
-from sfm_shapefit.cli import app
 from sfm_shapefit.colmap import database as database_module
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
+from tests.program import run
 from tests.scenes import RING, ROOT, copied
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
@@ -193,8 +192,7 @@ def test_no_command_waits_for_a_pipe(tmp_path, impatient, what):
     pipe = tmp_path / "pipe.json"
     os.mkfifo(pipe)
     arguments = [word.format(pipe=pipe, out=tmp_path / "out") for word in READING[what]]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 3, result.output
+    result = run(*arguments, code=3)
     assert "it is a pipe or a device" in result.output or "give the folder" in result.output
     assert sorted(tmp_path.iterdir()) == [pipe]
 

@@ -14,19 +14,14 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
-from sfm_shapefit.cli import app
 from sfm_shapefit.options import LocateOptions
+from tests.program import run
 from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
 
 RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def refused(result, code):
@@ -42,7 +37,7 @@ def refused(result, code):
 @pytest.fixture(scope="module")
 def ring_out(tmp_path_factory):
     out = tmp_path_factory.mktemp("ring") / "out"
-    assert run("locate", RING_MODEL, out).exit_code == 0
+    run("locate", RING_MODEL, out, code=0)
     return out
 
 
@@ -75,16 +70,16 @@ def test_quiet_prints_nothing(tmp_path):
 def test_colmaps_own_names_are_accepted(tmp_path):
     out = tmp_path / "out"
     names = ("--input_path", RING_MODEL, "--output_path", out, "--database_path", RING / "database.db")
-    assert run("locate", *names).exit_code == 0
+    run("locate", *names, code=0)
     assert out.is_dir()
 
 
 def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
-    assert run("locate", RING_MODEL).exit_code == 2
-    assert run("locate", RING_MODEL, tmp_path / "out", "--output_path", tmp_path / "o").exit_code == 2
-    assert run("locate", RING_MODEL, tmp_path / "out", "--scale", "metric").exit_code == 2
-    assert run("locate", RING_MODEL, tmp_path / "out", "--min-inlier-ratio", "7").exit_code == 2
-    assert run("frobnicate").exit_code == 2
+    run("locate", RING_MODEL, code=2)
+    run("locate", RING_MODEL, tmp_path / "out", "--output_path", tmp_path / "o", code=2)
+    run("locate", RING_MODEL, tmp_path / "out", "--scale", "metric", code=2)
+    run("locate", RING_MODEL, tmp_path / "out", "--min-inlier-ratio", "7", code=2)
+    run("frobnicate", code=2)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -155,11 +150,11 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
 
 def test_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):
     out = tmp_path / "out"
-    assert run("locate", RING_MODEL, out, "-q").exit_code == 0
+    run("locate", RING_MODEL, out, "-q", code=0)
     before = fingerprint(out)
     assert "exists already" in refused(run("locate", RING_MODEL, out), 3)
     assert fingerprint(out) == before
-    assert run("locate", RING_MODEL, out, "-q", "--overwrite", "--scale", "unit").exit_code == 0
+    run("locate", RING_MODEL, out, "-q", "--overwrite", "--scale", "unit", code=0)
     assert fingerprint(out) != before
     assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
@@ -245,7 +240,7 @@ def test_a_database_in_use_is_read_and_left_alone(tmp_path):
     writer.commit()
     before = fingerprint(scene)
     assert {"database.db-wal", "database.db-shm"} <= set(before)
-    assert run("locate", scene / "sparse" / "0", tmp_path / "out", "-q").exit_code == 0
+    run("locate", scene / "sparse" / "0", tmp_path / "out", "-q", code=0)
     assert fingerprint(scene) == before
     writer.close()
 
@@ -329,9 +324,9 @@ def test_synth_makes_a_workspace_that_locate_takes(tmp_path):
     made = run("synth", tmp_path / "scene", "--shape", "ring", "--num-images", "12", "--seed", "3")
     assert made.exit_code == 0
     assert "12" in made.stdout
-    assert run("locate", tmp_path / "scene" / "sparse" / "0", tmp_path / "out", "-q").exit_code == 0
+    run("locate", tmp_path / "scene" / "sparse" / "0", tmp_path / "out", "-q", code=0)
     refused(run("synth", tmp_path / "scene"), 3)
-    assert run("synth", tmp_path / "other", "--num-images", "1").exit_code == 2
+    run("synth", tmp_path / "other", "--num-images", "1", code=2)
 
 
 def test_names_cannot_play_with_the_terminal(tmp_path):
@@ -351,7 +346,7 @@ def test_brackets_in_a_path_are_only_brackets(tmp_path):
     result = run("locate", scene / "sparse" / "0", folder / "out")
     assert result.exit_code == 0, result.output
     assert "[b]:star:[red]" in "".join(result.stdout.split())
-    assert run("evaluate", folder / "out", scene / "sparse" / "0").exit_code == 0
+    run("evaluate", folder / "out", scene / "sparse" / "0", code=0)
 
 
 def test_evaluate_does_not_write_over_other_files(ring_out, tmp_path):

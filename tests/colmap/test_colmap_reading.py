@@ -184,10 +184,10 @@ def test_a_binary_file_cut_at_any_byte_is_refused_at_once(tmp_path, name):
     data = (folder / name).read_bytes()
     for length in range(len(data)):
         (folder / name).write_bytes(data[:length])
-        start = time.perf_counter()
+        start = time.process_time()
         with pytest.raises(InputError, match=rf"{name}: the file ends inside .* truncated"):
             check_model_files(folder)
-        assert time.perf_counter() - start < 2.0  # it takes under a millisecond; a hang would not end
+        assert time.process_time() - start < 2.0  # it takes under a millisecond; a hang would not end
 
 
 @pytest.mark.parametrize("name", MODEL_FILES)
@@ -985,13 +985,13 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
 
 def test_a_real_scene_is_read_in_well_under_ten_seconds():
     folder = real_scene("castle-P30") / "sparse" / "0"
-    start = time.perf_counter()
+    start = time.process_time()
     model = read_model(folder)
     with open_database(find_database(folder), model) as database:
         (batch,) = database.iter_matches(1)
     (own,) = track_matches(model, 15)
     # 30 images, 226 088 matches, 276 983 track matches: about 0.4 s on an idle core.
-    assert time.perf_counter() - start < 10.0
+    assert time.process_time() - start < 10.0
     assert model.num_images == 30
     assert len(batch.pairs) == 378
     assert len(batch.keypoints) == 146829 + 10078 + 69181  # by configuration, counted in SQL

@@ -6,9 +6,7 @@ import re
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sfm_shapefit.cli import app
 from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.options import LocateOptions
@@ -17,13 +15,12 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene
+from tests.program import run
 from tests.scenes import BUNDLED, real_scene
 
 
 def solve(*arguments, code=0):
-    result = CliRunner().invoke(app, ["solve", *map(str, arguments)])
-    assert result.exit_code == code, result.output
-    return result
+    return run("solve", *arguments, code=code)
 
 
 def centers_of(out):

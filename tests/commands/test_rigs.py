@@ -14,6 +14,7 @@ from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.program import run
 from tests.scenes import RING, copied
 
 
@@ -333,20 +334,14 @@ def test_fixed_cameras_without_positions_are_refused(tmp_path):
 
 
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
-    from typer.testing import CliRunner
-
-    from sfm_shapefit.cli import app
-
     scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
     names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
-    arguments = ["locate", str(scene / "sparse" / "0"), str(tmp_path / "out"), "--fix", str(names)]
-    done = CliRunner().invoke(app, arguments)
-    assert done.exit_code == 0, done.output
+    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--fix"]
+    done = run(*arguments, names, code=0)
     assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
         done.output.replace("│", " ").split()
     )
     given, after = (poses(pycolmap.Reconstruction(p)) for p in (scene / "sparse" / "0", tmp_path / "out"))
     for k in (1, 2, 3):
         np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
-    refused = CliRunner().invoke(app, [*arguments[:-1], str(tmp_path / "none.txt"), "--overwrite"])
-    assert refused.exit_code == 3
+    run(*arguments, tmp_path / "none.txt", "--overwrite", code=3)

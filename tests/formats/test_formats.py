@@ -4,13 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sfm_shapefit.cli import app
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import graph_text, read_graph
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.program import run
 from tests.scenes import BUNDLED
 
 GOOD = "7 3 1 0 0\n3 -2 0 1 0\n-2 7 0 0 1\n"
@@ -114,9 +113,7 @@ def test_missing_and_binary_files_are_refused(tmp_path):
 def test_solve_places_a_bare_graph(tmp_path, d):
     truth = graph_file(tmp_path / "g.txt", d=d, pendant=True)
     before = (tmp_path / "g.txt").read_bytes()
-    arguments = ["solve", str(tmp_path / "g.txt"), str(tmp_path / "out"), "--json"]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0, result.output
+    result = run("solve", tmp_path / "g.txt", tmp_path / "out", "--json", code=0)
     facts = json.loads(result.stdout)
     assert (facts["num_images"], facts["num_placed"], facts["dimension"]) == (13, 12, d)
     assert facts["solve"]["gap"] <= 1e-8
@@ -136,8 +133,7 @@ def test_solve_places_a_bare_graph(tmp_path, d):
 
 def test_a_graph_that_determines_nothing_exits_with_4(tmp_path):
     write(tmp_path / "g.txt", "0 1 1 0 0\n1 2 0 1 0\n")
-    result = CliRunner().invoke(app, ["solve", str(tmp_path / "g.txt"), str(tmp_path / "out")])
-    assert result.exit_code == 4
+    run("solve", tmp_path / "g.txt", tmp_path / "out", code=4)
     assert not (tmp_path / "out").exists()
 
 

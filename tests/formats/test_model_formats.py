@@ -16,10 +16,8 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
-from typer.testing import CliRunner
 
 import sfm_shapefit
-from sfm_shapefit.cli import app
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import reconstruction_of, relative_poses_of, scene_of
 from sfm_shapefit.errors import InputError
@@ -29,6 +27,7 @@ from sfm_shapefit.formats.nerf import nerf_text
 from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
+from tests.program import run
 from tests.scenes import COURTYARD, RING
 
 R = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
@@ -446,8 +445,7 @@ def test_a_malformed_relative_pose_is_refused_by_its_line(tmp_path, line, messag
 
 
 def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
-    run = CliRunner().invoke
-    source = str(RING / "sparse" / "0")
+    source = RING / "sparse" / "0"
     for name, extra in {
         "bin": [],
         "text": ["--format", "colmap-txt"],
@@ -455,18 +453,16 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
         "t.tum": [],
         "t.csv": [],
     }.items():
-        result = run(app, ["convert", source, str(tmp_path / name), *extra])
-        assert result.exit_code == 0, result.output
-        again = run(app, ["convert", source, str(tmp_path / name), *extra])
-        assert again.exit_code == 3
+        run("convert", source, tmp_path / name, *extra, code=0)
+        again = run("convert", source, tmp_path / name, *extra, code=3)
         assert "exists already" in again.output
     truth = read_model(source)
     for name in ("bin", "text"):
         copy = read_model(tmp_path / name)
         np.testing.assert_array_equal(copy.centers, truth.centers)
         assert copy.reconstruction.num_points3D() == truth.reconstruction.num_points3D()
-    assert run(app, ["convert", source, str(tmp_path / "t.csv"), "--overwrite"]).exit_code == 0
-    assert run(app, ["convert", source, str(tmp_path / "t.xyz")]).exit_code == 3
+    run("convert", source, tmp_path / "t.csv", "--overwrite", code=0)
+    run("convert", source, tmp_path / "t.xyz", code=3)
 
 
 def test_a_foreign_model_becomes_a_colmap_model(tmp_path):

@@ -4,11 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
-from sfm_shapefit.cli import app
 from sfm_shapefit.formats import graph_text
 from sfm_shapefit.placement.diagnosis import diagnose, direction_spread, theory_of
 from sfm_shapefit.placement.place import place
@@ -22,6 +20,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
+from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, fingerprint
 
 FAMILIES = {
@@ -32,10 +31,6 @@ FAMILIES = {
     "trajectory": lambda **how: trajectory_graph_problem(150, **how),
     "community": lambda **how: community_graph_problem(200, **how),
 }
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def test_pieces_hinges_and_components_are_counted_and_named():
@@ -202,10 +197,10 @@ def test_a_bare_graph_is_diagnosed_too(tmp_path):
     assert result.exit_code == 0
     assert "5: pendant" in result.stdout
     assert "no centres" in result.stdout
-    assert run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db").exit_code == 3
-    assert run("inspect", tmp_path / "nowhere").exit_code == 3
-    assert run("inspect").exit_code == 2
-    assert run("inspect", tmp_path / "graph.txt", "--min-inlier-ratio", "7").exit_code == 2
+    run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db", code=3)
+    run("inspect", tmp_path / "nowhere", code=3)
+    run("inspect", code=2)
+    run("inspect", tmp_path / "graph.txt", "--min-inlier-ratio", "7", code=2)
 
 
 def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):

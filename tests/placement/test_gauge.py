@@ -7,10 +7,8 @@ import numpy as np
 import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from sfm_shapefit import InputError, LocateOptions, locate
-from sfm_shapefit.cli import app
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.geometry import normalized
@@ -18,6 +16,7 @@ from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_g
 from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.program import run
 from tests.scenes import RING
 
 RING_MODEL = RING / "sparse" / "0"
@@ -36,10 +35,6 @@ def priors_of(positions, sigma=np.nan, rows=None):
         covariances=np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3)),
         statement="a test",
     )
-
-
-def run(*arguments):
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 # --- the input's centres -----------------------------------------------------------------------------

@@ -11,13 +11,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from sfm_shapefit.cli import app
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.report.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
 from tests.drawings import make_drawing
+from tests.program import run
 from tests.scenes import BUNDLED, FACADE, ROOT
 
 pytest.importorskip("viser", reason="viser is not installed")
@@ -26,26 +25,20 @@ pytest.importorskip("viser", reason="viser is not installed")
 @pytest.fixture(scope="module")
 def located(tmp_path_factory):
     out = tmp_path_factory.mktemp("located") / "out"
-    result = CliRunner().invoke(app, ["locate", str(FACADE / "sparse" / "0"), str(out), "--scene", "-q"])
-    assert result.exit_code == 0, result.output
+    run("locate", FACADE / "sparse" / "0", out, "--scene", "-q", code=0)
     return out
 
 
 def test_locate_writes_the_report_and_the_scenes_that_are_asked_for(located, tmp_path):
     pictures = {"report.html", "scene.glb", "scene.ply"}
     assert pictures <= {path.name for path in located.iterdir()}
-    model = str(FACADE / "sparse" / "0")
-    result = CliRunner().invoke(app, ["locate", model, str(tmp_path / "out"), "--no-report"])
-    assert result.exit_code == 0
+    result = run("locate", FACADE / "sparse" / "0", tmp_path / "out", "--no-report", code=0)
     assert "report.html" not in result.stdout
     assert not pictures & {path.name for path in (tmp_path / "out").iterdir()}
 
 
 def test_a_bare_graph_has_its_report_too(tmp_path):
-    result = CliRunner().invoke(
-        app, ["solve", str(BUNDLED / "graph40.txt"), str(tmp_path / "out"), "--scene"]
-    )
-    assert result.exit_code == 0
+    result = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--scene", code=0)
     assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
     assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     drawing, _ = read_output(tmp_path / "out")
@@ -64,8 +57,7 @@ def test_a_folder_is_read_back_as_it_was_written(located):
 def test_the_report_can_be_made_again(located):
     before = (located / "report.html").read_text(encoding="utf-8")
     (located / "report.html").unlink()
-    result = CliRunner().invoke(app, ["report", str(located)])
-    assert result.exit_code == 0, result.output
+    run("report", located, code=0)
     after = (located / "report.html").read_text(encoding="utf-8")
     summaries = [re.search(r'"summary":(\[.*?\])', text).group(1) for text in (before, after)]
     assert summaries[0] == summaries[1]
@@ -73,12 +65,10 @@ def test_the_report_can_be_made_again(located):
 
 @pytest.mark.parametrize("command", ["report", "view"])
 def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, command):
-    result = CliRunner().invoke(app, [command, str(tmp_path)])
-    assert result.exit_code == 3
+    result = run(command, tmp_path, code=3)
     assert "give a folder that locate or solve wrote" in result.stderr
     (tmp_path / "locate.json").write_text("{}")
-    result = CliRunner().invoke(app, [command, str(tmp_path)])
-    assert result.exit_code == 3
+    result = run(command, tmp_path, code=3)
     assert "damaged or of another version" in result.stderr
     assert "Traceback" not in result.output
 

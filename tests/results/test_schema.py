@@ -5,10 +5,9 @@ from importlib import resources
 
 import jsonschema
 import pytest
-from typer.testing import CliRunner
 
-from sfm_shapefit.cli import app
 from sfm_shapefit.results.schema import PATH, schema_text
+from tests.program import run
 from tests.scenes import BUNDLED, COURTYARD, RING
 
 RING_MODEL = RING / "sparse" / "0"
@@ -16,9 +15,7 @@ SCHEMA = json.loads((resources.files("sfm_shapefit") / "schemas" / "output.schem
 
 
 def printed(*arguments):
-    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)
+    return json.loads(run(*arguments, code=0).stdout)
 
 
 def problems(facts, name):

@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
-from typer.testing import CliRunner
 
 from sfm_shapefit import evaluate, locate
-from sfm_shapefit.cli import app
 from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic import (
@@ -25,6 +23,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.synthetic.photographs import judge_matches, write_rendered_workspace
 from sfm_shapefit.synthetic.surfaces import Surfaces
+from tests.program import run
 from tests.scenes import BUNDLED
 
 SMALL = SceneOptions(num_images=6, image_width=320, image_height=240, focal_length_px=280.0, seed=2)
@@ -313,15 +312,13 @@ def test_synth_draws_images_on_request_and_says_how_many_pairs_are_wrong(tmp_pat
     flags = (
         "--shape facade --num-images 3 --image-width 240 --image-height 180 --focal-length-px 200 --images"
     )
-    done = CliRunner().invoke(app, ["synth", str(tmp_path / "out"), *flags.split(), "--gray-noise", "1"])
-    assert done.exit_code == 0, done.output
+    done = run("synth", tmp_path / "out", *flags.split(), "--gray-noise", "1", code=0)
     assert "of which 0 wrong" in done.output
     assert len(list((tmp_path / "out/images").iterdir())) == 3
     assert (tmp_path / "out/database.db").exists()
 
 
 def test_synth_refuses_options_of_drawing_without_images(tmp_path):
-    done = CliRunner().invoke(app, ["synth", str(tmp_path / "out"), "--gray-noise", "1"])
-    assert done.exit_code == 3
+    done = run("synth", tmp_path / "out", "--gray-noise", "1", code=3)
     assert "need --images" in done.output
     assert not (tmp_path / "out").exists()
