@@ -45,7 +45,7 @@ def tetrahedron():
     return t, edges, baselines / np.linalg.norm(baselines, axis=1, keepdims=True)
 
 
-@pytest.mark.parametrize("d", [2, 3, 5, 10])
+@pytest.mark.parametrize("d", [2, 3, 5])
 def test_recovery_is_exact_in_spite_of_corruption(d):
     graph, truth = problem(d, n=24, p=0.7, d=d, q=0.15)
     result = solve(graph)
