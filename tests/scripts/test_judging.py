@@ -107,7 +107,7 @@ def test_a_rival_is_tightened_until_it_is_as_good_as_promised():
         asked.append(tol)
         return best.locations * [1.0, 1.0, 1.0 + 3e4 * tol], None, 1  # the excess goes with the square
 
-    found = solver._tuned("sloppy", sloppy, graph, problem.locations, best.dual_bound)
+    found = solver._tune("sloppy", sloppy, graph, problem.locations, best.dual_bound)
     assert found.excess <= solver.TOL
     assert len(asked) >= 2
     assert found.tolerance == min(asked)  # the loosest that suffices is the last that was tried
@@ -119,7 +119,7 @@ def test_a_rival_that_breaks_is_a_failure_with_a_reason():
     def broken(tol):
         raise ValueError("no\nluck")
 
-    found = solver._tuned("rival", broken, graph, draw(SMALL).locations, 0.0)
+    found = solver._tune("rival", broken, graph, draw(SMALL).locations, 0.0)
     assert found.failure == "no luck"
     assert found.wall_s == ()
 
@@ -178,11 +178,11 @@ def test_only_a_real_graph_of_cameras_alone_is_held_to_the_limit_of_time():
 
 
 def test_close_is_where_the_objective_stays():
-    assert scale.settled([3.0, 1.0, 2.0, 1.0, 1.0], 1.5) == 4
-    assert scale.settled([1.0, 1.0], 1.5) == 1
-    assert scale.settled([1.0, 2.0], 1.5) is None
-    assert scale.settled([1.0, math.nan], 1.5) is None
-    assert scale.settled([], 1.5) is None
+    assert scale.find_settled([3.0, 1.0, 2.0, 1.0, 1.0], 1.5) == 4
+    assert scale.find_settled([1.0, 1.0], 1.5) == 1
+    assert scale.find_settled([1.0, 2.0], 1.5) is None
+    assert scale.find_settled([1.0, math.nan], 1.5) is None
+    assert scale.find_settled([], 1.5) is None
 
 
 def test_an_exponent_is_the_slope_of_the_logarithms():

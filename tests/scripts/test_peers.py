@@ -206,7 +206,7 @@ def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):
         name="fixed", prepare=lambda _: lambda: (np.arange(9.0).reshape(3, 3), "done"), package="x"
     )
     monkeypatch.setattr(on_scenes, "GRAPH_CONTENDERS", (contender,))
-    found = on_scenes._solved("fixed", directions, folder)
+    found = on_scenes._solve("fixed", directions, folder)
     assert found.names == ("0004.jpg", "0002.jpg", "0007.jpg")
     assert found.peak_mb > 10.0
 
