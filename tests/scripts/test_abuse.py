@@ -147,14 +147,13 @@ GROWTH_BYTES = 8_000_000
 def test_30_calls_in_one_process_leave_memory_files_and_answers_as_they_were(tmp_path):
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.write import write_result
-    from sfm_shapefit.options import LocateOptions
 
     base = make_base(tmp_path / "base")
     sources = [(base / "sparse" / "0", base / "database.db", "auto"), (base / "old", None, "tracks")]
     answers, sizes, descriptors = {}, [], set()
     for call in range(30 + WARM_UP):
         model, database, directions = sources[call % 2]
-        found = locate(model, database, LocateOptions(directions=directions, threads=1))
+        found = locate(model, database, directions=directions, threads=1)
         write_result(found, tmp_path / "out", overwrite=True)
         centers = np.array([row.center for row in found.cameras if row.placed]).tobytes()
         assert answers.setdefault(call % 2, centers) == centers
