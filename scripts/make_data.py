@@ -135,9 +135,9 @@ def _drop_descriptors(database: Path) -> None:
 def source_text(name: str) -> str:
     """Return what SOURCE.md says: what the scene is, and the commands that make it."""
     bundled = SCENES[name]
-    flags = _changed_flags(bundled.scene) + _changed_flags(bundled.workspace)
+    flags = _list_flags(bundled.scene) + _list_flags(bundled.workspace)
     if bundled.render is not None:
-        flags += ["--images", *_changed_flags(bundled.render)]
+        flags += ["--images", *_list_flags(bundled.render)]
     return (
         f"# {name}\n\n{bundled.purpose}\n\n"
         f"Synthetic, seed {bundled.scene.seed}. Made, with the other scenes, by\n\n"
@@ -146,7 +146,7 @@ def source_text(name: str) -> str:
     )
 
 
-def _changed_flags(options: SceneOptions | WorkspaceOptions | RenderOptions) -> list[str]:
+def _list_flags(options: SceneOptions | WorkspaceOptions | RenderOptions) -> list[str]:
     """Return the command-line flags of the options that differ from their defaults."""
     default = type(options)()
     flags = []

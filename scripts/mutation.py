@@ -1,6 +1,6 @@
 """Mutation testing of the solver and the rigidity test: do the tests notice when the code is wrong?
 
-    python scripts/mutation.py --state FOLDER --group newton [--per-group 30] [--seed 1] [--again]
+    python scripts/mutation.py --state FOLDER --group newton [--per-group 30] [--seed 1]
 
 The mutants are those of cosmic-ray (`pip install cosmic-ray`; arithmetic, comparisons, `and` and `or`, `not`,
 True and False, numbers, break and continue, exceptions, loops that do not run), and of one operator more that
@@ -13,7 +13,7 @@ are collected once. For each mutant a fork of the process puts the changed
 code in place of the old one and runs the tests that reach the changed function, the shortest first, until one
 fails. A mutant that takes far more processor time than the tests did counts as found.
 
-Outcomes are kept in FOLDER, and what is there is not run again; with --again, survivors are.
+Outcomes are kept in FOLDER, and what is there is not run again.
 """
 
 import argparse
@@ -31,52 +31,48 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType, FunctionType, ModuleType
+from types import FrameType, FunctionType
 from typing import Any
 
+from harness.process import thread_environment
+
 # One thread in all libraries, before any is loaded: a process with threads must not fork.
-for _name in ("OPENBLAS", "OMP", "MKL", "NUMBA", "RAYON"):
-    os.environ[f"{_name}_NUM_THREADS"] = "1"
+os.environ.update(thread_environment(1))
+
+import hypothesis
+import pytest
+from cosmic_ray import plugins
+from cosmic_ray.ast import Visitor, get_ast
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+
+from sfm_shapefit import jit
+
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sfm_shapefit"
-sys.path.insert(0, str(ROOT))
-
-import hypothesis  # noqa: E402
-import pytest  # noqa: E402
-from cosmic_ray import plugins  # noqa: E402
-from cosmic_ray.ast import Visitor, get_ast  # noqa: E402
-from cosmic_ray.mutating import mutate_code  # noqa: E402
-from cosmic_ray.operators.operator import Operator  # noqa: E402
-
-from sfm_shapefit import jit  # noqa: E402
-
-GROUPS = {
-    "rigidity": [f"rigidity/{name}.py" for name in ("game", "growth", "pieces", "reasons")],
-    "certificate": ["solver/certificate.py"],
-    "newton": ["solver/newton/dense.py", "solver/newton/sparse.py", "solver/newton/steps.py"],
-    "admm": [
-        f"solver/admm/{name}.py" for name in ("anderson", "edges", "engine", "linear", "lud", "shapefit")
-    ],
-    "program": ["solver/program.py", "solver/options.py"],
-    "solve": ["solver/solve.py", "solver/splitting/split_then_newton.py"],
-    "angular": ["refinement/angular.py"],
-    "rigid_groups": [
-        f"solver/groups/{name}.py" for name in ("certificate", "lud", "newton", "reduced", "rigid")
-    ],
+GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "rigidity": (("rigidity/*.py",), ("rigidity",)),
+    "certificate": (("solver/certificate.py",), ("certificate", "exact_certificate", "solver")),
+    "newton": (("solver/newton/*.py",), ("newton", "exact_certificate", "solver")),
+    "splitting": (("solver/splitting/*.py",), ("splitting", "certificate", "exact_certificate")),
+    "program": (("solver/program.py", "solver/options.py"), ("solver", "newton")),
+    "solve": (("solver/solve.py",), ("solver", "certificate", "splitting")),
+    "angular": (("refinement/angular.py",), ("angular",)),
+    "rigs": (("solver/rigs/*.py",), ("rigid_groups",)),
 }
-TESTS = {
-    "rigidity": ["rigidity"],
-    "certificate": ["certificate", "exact_certificate", "solver"],
-    "newton": ["newton", "exact_certificate", "solver"],
-    "admm": ["splitting", "exact_certificate"],
-    "program": ["solver", "newton"],
-    "solve": ["solver", "certificate", "splitting"],
-    "angular": ["angular"],
-    "rigid_groups": ["rigid_groups"],
-}
-LONGEST_TEST_S = 2.0  # of processor time, interpreted and observed: longer ones are left out
-BUDGET_S = 12.0  # of tests per mutant, by their time in the first run
-PATIENCE = 3.0  # times the tests' own time, after which a mutant counts as endless
+"""Files of the package, and the names of the tests that are to notice their mutants."""
+LONGEST_TEST_S = 2.0
+"""Of processor time, interpreted and observed: longer tests are left out."""
+BUDGET_S = 12.0
+"""Of tests per mutant, by their time in the first run."""
+PATIENCE = 3.0
+"""Times the tests' own time, after which a mutant counts as endless."""
+
+
+def files_of(group: str) -> list[str]:
+    """Return the files of a group, relative to the package."""
+    found = [path for pattern in GROUPS[group][0] for path in sorted(PACKAGE.glob(pattern))]
+    return [path.relative_to(PACKAGE).as_posix() for path in found]
 
 
 # --- mutants ------------------------------------------------------------------------------------
@@ -111,9 +107,8 @@ class Delete(Operator):
         del index
         text = "return None" if node.type == "return_stmt" else "pass"
         statement = get_ast(f"{text}\n").children[0].children[0]
-        (
-            statement if not hasattr(statement, "children") else statement.get_first_leaf()
-        ).prefix = node.get_first_leaf().prefix
+        first = statement.get_first_leaf() if hasattr(statement, "children") else statement
+        first.prefix = node.get_first_leaf().prefix
         return statement
 
     @classmethod
@@ -127,10 +122,10 @@ def _is_deletable(node: Any) -> bool:
         return False
     if node.type in ("return_stmt", "raise_stmt"):
         return node.get_first_leaf() is not node.get_last_leaf()
-    if node.type == "expr_stmt":  # plain names would only raise NameError
-        return node.children[0].type != "name" or (
-            node.children[1].type == "operator" and (node.children[1].value not in ("=", ":"))
-        )
+    if node.type == "expr_stmt":
+        # Without a plain assignment, a name would only be unknown.
+        target, sign = node.children[:2]
+        return target.type != "name" or (sign.type == "operator" and sign.value not in ("=", ":"))
     return node.type in ("atom_expr", "power")
 
 
@@ -190,7 +185,7 @@ def _quiet_spans(tree: ast.Module) -> list[tuple[tuple[int, int], tuple[int, int
 def sample(group: str, count: int, seed: int) -> list[Mutant]:
     """Return one random mutant of each of `count` random places."""
     rng = random.Random(f"{seed} {group}")
-    places = [place for path in GROUPS[group] for place in mutants_of(path)]
+    places = [place for path in files_of(group) for place in mutants_of(path)]
     return [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
 
 
@@ -200,7 +195,7 @@ def sample(group: str, count: int, seed: int) -> list[Mutant]:
 def interpret_kernels(group: str) -> None:
     """Let the kernels of a group be plain functions; call before they are imported."""
     compiled = jit.kernel
-    names = {_module_name(path) for path in GROUPS[group]}
+    names = {_module_name(path) for path in files_of(group)}
 
     def kernel(**options: bool) -> Callable[[Any], Any]:
         def decorate(function: Any) -> Any:
@@ -211,18 +206,13 @@ def interpret_kernels(group: str) -> None:
     jit.kernel = kernel
 
 
-def module_of(path: str) -> ModuleType:
-    """Return the module of a file of the package."""
-    return importlib.import_module(_module_name(path))
-
-
 def _module_name(path: str) -> str:
     return "sfm_shapefit." + path.removesuffix(".py").replace("/", ".")
 
 
 def put_in_place(path: str, source: str) -> None:
     """Give the loaded module of a file the code of another source, wherever its functions are known."""
-    module = module_of(path)
+    module = importlib.import_module(_module_name(path))
     fresh = {key: module.__dict__.get(key) for key in ("__name__", "__file__", "__package__")}
     exec(compile(source, str(module.__file__), "exec"), fresh)
     for name, new in fresh.items():
@@ -330,19 +320,20 @@ class Runner:
     def _baseline(self, items: list[Any]) -> dict[str, Any]:
         record = self.state / f"tests_{self.args.group}.json"
         known = json.loads(record.read_text()) if record.exists() else {}
-        sources = "".join((PACKAGE / path).read_text() for path in GROUPS[self.args.group])
+        sources = "".join((PACKAGE / path).read_text() for path in files_of(self.args.group))
         for item in items:
             text = sources + inspect.getsource(item.function)
             key = hashlib.sha256(text.encode()).hexdigest()[:12]
             if known.get(item.nodeid, {}).get("key") != key:
-                seen = self._observed(item)
+                seen = self._observe(item)
                 if not seen["passed"] and seen["seconds"] > LONGEST_TEST_S:
-                    seen = self._observed(item)  # what it had to load or compile is there now
+                    # What it had to load or compile is there now.
+                    seen = self._observe(item)
                 known[item.nodeid] = {"key": key, **seen}
                 record.write_text(json.dumps(known, indent=0))
         return {item.nodeid: known[item.nodeid] for item in items}
 
-    def _observed(self, item: Any) -> dict[str, Any]:
+    def _observe(self, item: Any) -> dict[str, Any]:
         """Run one test with an observer."""
         observer, self.failed = _Observer(), False
 
@@ -368,11 +359,11 @@ class Runner:
         record = self.state / f"{group}.json"
         known = json.loads(record.read_text()) if record.exists() else {}
         mutants = sample(group, self.args.per_group, self.args.seed)
-        usable = self._sound(items, usable)
+        usable = self._keep_sound(items, usable)
         for mutant in mutants:
             outcome = known.get(mutant.name)
-            if outcome is None or (self.args.again and outcome[0] == "survived"):
-                known[mutant.name] = outcome = self._outcome(mutant, items, usable)
+            if outcome is None:
+                known[mutant.name] = outcome = self._try(mutant, items, usable)
                 record.write_text(json.dumps(known, indent=0))
                 print(f"{outcome[0]:9}{mutant.name}  {outcome[1]}", flush=True)
         outcomes = [known[mutant.name][0] for mutant in mutants]
@@ -385,13 +376,13 @@ class Runner:
             if known[mutant.name][0] == "survived":
                 print(f"\n{mutant.name}\n{known[mutant.name][2]}", flush=True)
 
-    def _sound(self, items: dict[str, Any], usable: dict[str, Any]) -> dict[str, Any]:
+    def _keep_sound(self, items: dict[str, Any], usable: dict[str, Any]) -> dict[str, Any]:
         """Return the tests that pass in a fork with unchanged code in place; others would find anything."""
-        sources = {path: (PACKAGE / path).read_text() for path in GROUPS[self.args.group]}
+        sources = {path: (PACKAGE / path).read_text() for path in files_of(self.args.group)}
         usable = dict(usable)
         while True:
             seconds = sum(row["seconds"] for row in usable.values())
-            verdict, by = self._forked(sources, [items[key] for key in usable], seconds)
+            verdict, by = self._run_forked(sources, [items[key] for key in usable], seconds)
             if verdict == "survived":
                 return usable
             if by not in usable:
@@ -399,7 +390,7 @@ class Runner:
             print(f"{by} fails in a fork with unchanged code, and is left out", flush=True)
             del usable[by]
 
-    def _outcome(self, mutant: Mutant, items: dict[str, Any], usable: dict[str, Any]) -> list[str]:
+    def _try(self, mutant: Mutant, items: dict[str, Any], usable: dict[str, Any]) -> list[str]:
         """Return (found, endless or survived; by which test; the changed line) of a mutant."""
         source = (PACKAGE / mutant.path).read_text()
         changed = mutate_code(source, _operators()[mutant.operator], mutant.occurrence)
@@ -410,10 +401,10 @@ class Runner:
             if seconds + usable[key]["seconds"] <= BUDGET_S:
                 chosen.append(items[key])
                 seconds += usable[key]["seconds"]
-        verdict, by = self._forked({mutant.path: changed}, chosen, seconds)
+        verdict, by = self._run_forked({mutant.path: changed}, chosen, seconds)
         return [verdict, by, _difference(source, changed)]
 
-    def _forked(self, sources: dict[str, str], chosen: list[Any], seconds: float) -> tuple[str, str]:
+    def _run_forked(self, sources: dict[str, str], chosen: list[Any], seconds: float) -> tuple[str, str]:
         read, write = os.pipe()
         child = os.fork()
         if child == 0:
@@ -461,29 +452,19 @@ def main() -> int:
     parser.add_argument("--group", choices=GROUPS, required=True)
     parser.add_argument("--per-group", type=int, default=30, help="mutants of each group")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--again", action="store_true", help="run recorded survivors again")
     args = parser.parse_args()
     interpret_kernels(args.group)
-    phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)  # a failure need not be made small
+    # A failure need not be made small.
+    phases = (hypothesis.Phase.explicit, hypothesis.Phase.generate)
     hypothesis.settings.register_profile(
         "mutation", phases=phases, derandomize=True, database=None, deadline=None
     )
     hypothesis.settings.load_profile("mutation")
-    options = [
-        "-s",
-        "-p",
-        "no:cacheprovider",
-        "-o",
-        "addopts=",
-        "--tb=native",
-        "-W",
-        "ignore",
-        "-m",
-        "not slow",
-    ]
-    tests = [str(path) for name in TESTS[args.group] for path in (ROOT / "tests").rglob(f"test_{name}.py")]
+    options = ["-s", "-p", "no:cacheprovider", "-o", "addopts=", "--tb=native", "-W", "ignore", "-m"]
+    names = GROUPS[args.group][1]
+    tests = [str(path) for name in names for path in (ROOT / "tests").rglob(f"test_{name}.py")]
     os.chdir(ROOT)
-    return int(pytest.main([*options, *tests], plugins=[Runner(args)]))
+    return int(pytest.main([*options, "not slow", *tests], plugins=[Runner(args)]))
 
 
 if __name__ == "__main__":

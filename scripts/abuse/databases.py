@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
-from abuse.mutations import BROKEN_NAMES, HOSTILE_NAMES, changed_bytes, pick
+from abuse.mutations import BROKEN_NAMES, HOSTILE_NAMES, change_bytes, pick
 
 READ_TABLES = ("images", "keypoints", "two_view_geometries")
 _COLUMNS = {
@@ -52,7 +52,7 @@ _VERSIONS = (0, 3600, 3700, 3800, 3900, 31000, 31200, 4000000, 4020100, 99999999
 def foreign_version(path: Path, rng: Generator) -> bool:
     """Make the schema that of another release; every one from 3.6 to 4.2 is to be read."""
     columns = str(pick(rng, sorted(_OLD_GEOMETRIES.values())))
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         connection.execute(f"PRAGMA user_version = {int(pick(rng, _VERSIONS))}")
         connection.execute(f"CREATE TABLE old AS SELECT {columns} FROM two_view_geometries")
         connection.execute("DROP TABLE two_view_geometries")
@@ -83,7 +83,7 @@ def missing_part(path: Path, rng: Generator) -> bool:
             f"DELETE FROM {table} WHERE rowid % 2",
         ),
     )
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         connection.execute(str(statement))
     return False
 
@@ -104,7 +104,7 @@ def impostor(path: Path, rng: Generator) -> bool:
         "file": f"SELECT {', '.join(f'readfile(1) AS {name}' for name in columns)} FROM real",
     }
     kind = str(pick(rng, (*computed, "virtual", "generated", "untyped", "without rowid", "trigger")))
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         if kind == "trigger":
             connection.execute(f"CREATE TRIGGER t AFTER UPDATE ON {table} BEGIN DELETE FROM {table}; END")
             return True
@@ -135,7 +135,7 @@ def odd_values(path: Path, rng: Generator) -> bool:
     """Write values of wrong type or size into untyped copies of the tables, where sqlite lets them be."""
     table = str(pick(rng, READ_TABLES))
     listed = ", ".join(_COLUMNS[table])
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         connection.execute(f"CREATE TABLE untyped ({listed})")
         connection.execute(f"INSERT INTO untyped SELECT {listed} FROM {table}")
         connection.execute(f"DROP TABLE {table}")
@@ -158,22 +158,22 @@ def odd_blobs(path: Path, rng: Generator) -> bool:
             *(("two_view_geometries", "qvec"), ("two_view_geometries", "tvec")),
         ),
     )
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         rows = connection.execute(f"SELECT rowid, {column} FROM {table}").fetchall()
         for rowid, data in rows if rng.random() < 0.3 else [pick(rng, rows)]:
-            changed = _changed_blob(data or bytes(32), str(column), table == "keypoints", rng)
+            changed = _change_blob(data or bytes(32), str(column), table == "keypoints", rng)
             connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = ?", (changed, rowid))
     return False
 
 
-def _changed_blob(data: bytes, column: str, is_float: bool, rng: Generator) -> bytes:
+def _change_blob(data: bytes, column: str, is_float: bool, rng: Generator) -> bytes:
     match int(rng.integers(4)):
         case 0:
             return data[: int(rng.integers(len(data) + 1))]
         case 1:
             return data + rng.bytes(int(rng.integers(1, 40)))
         case 2:
-            return changed_bytes(data, rng)
+            return change_bytes(data, rng)
         case _:
             layout = "<f4" if is_float else "<u4" if column == "data" else "<f8"
             odd = (
@@ -188,7 +188,7 @@ def _changed_blob(data: bytes, column: str, is_float: bool, rng: Generator) -> b
 
 def odd_names(path: Path, rng: Generator) -> bool:
     """Give images of the database names that their model does not have, or that are no text."""
-    with _edited(path) as connection:
+    with _edit(path) as connection:
         for image_id in range(1, int(rng.integers(2, 5))):
             raw = bytes(pick(rng, (*HOSTILE_NAMES, *BROKEN_NAMES)))
             kind = pick(rng, ("CAST(? AS TEXT)", "CAST(? AS TEXT)", "?"))
@@ -203,16 +203,14 @@ def odd_pages(path: Path, rng: Generator) -> bool:
     data = path.read_bytes()
     match int(rng.integers(4)):
         case 0:
-            path.write_bytes(changed_bytes(data[:100], rng) + data[100:])
+            path.write_bytes(change_bytes(data[:100], rng) + data[100:])
         case 1:
             page = int(rng.integers(len(data) // 4096)) * 4096
-            path.write_bytes(
-                data[:page] + changed_bytes(data[page : page + 64], rng)[:64] + data[page + 64 :]
-            )
+            path.write_bytes(data[:page] + change_bytes(data[page : page + 64], rng)[:64] + data[page + 64 :])
         case 2:
             path.write_bytes(data[: int(rng.integers(len(data)))])
         case _:
-            path.write_bytes(changed_bytes(data, rng))
+            path.write_bytes(change_bytes(data, rng))
     return False
 
 
@@ -235,7 +233,7 @@ WAYS: tuple[Callable[[Path, Generator], bool], ...] = (
 )
 
 
-class _Edited(closing[sqlite3.Connection]):
+class _Edit(closing[sqlite3.Connection]):
     """Commits and closes."""
 
     def __exit__(self, *error: object) -> None:
@@ -244,8 +242,8 @@ class _Edited(closing[sqlite3.Connection]):
         self.thing.close()
 
 
-def _edited(path: Path) -> _Edited:
+def _edit(path: Path) -> _Edit:
     """Open a private copy for writing; text may hold any bytes."""
     connection = sqlite3.connect(path)
     connection.text_factory = bytes
-    return _Edited(connection)
+    return _Edit(connection)

@@ -48,10 +48,7 @@ def run(args: argparse.Namespace) -> int:
             if (scene / "database.db").exists():
                 different += [f"map, {name}" for name in differing_files(scene, work / "map", command="map")]
             worst = max(
-                (
-                    reordered_difference(scene, work, seed)
-                    for seed in range(args.seed, args.seed + args.orders)
-                ),
+                (measure_reordering(scene, work, seed) for seed in range(args.seed, args.seed + args.orders)),
                 default=0.0,
             )
         failed |= bool(different) or worst > _AGREEMENT
@@ -119,13 +116,13 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
 # --- reordered input -------------------------------------------------------------------------------------
 
 
-def reordered_difference(scene: Path, work: Path, seed: int) -> float:
+def measure_reordering(scene: Path, work: Path, seed: int) -> float:
     """Return by how much of the extent positions move when everything is listed in another order."""
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.write import write_result
     from sfm_shapefit.options import LocateOptions
 
-    copy = reordered(scene, work / f"order{seed}", np.random.default_rng(seed))
+    copy = reorder(scene, work / f"order{seed}", np.random.default_rng(seed))
     tables = []
     for place in (scene, copy):
         out = work / "out"
@@ -141,7 +138,7 @@ def reordered_difference(scene: Path, work: Path, seed: int) -> float:
     return float(np.abs(centers[0] - centers[1]).max() / extent)
 
 
-def reordered(scene: Path, target: Path, rng: Generator) -> Path:
+def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     """Write a copy of a scene with other image and point ids and everything listed in another order."""
     source, model = scene / "sparse" / "0", target / "sparse" / "0"
     model.mkdir(parents=True)
@@ -155,7 +152,7 @@ def reordered(scene: Path, target: Path, rng: Generator) -> Path:
     image_ids = dict(zip(images, (1 + rng.permutation(2 * len(images)))[: len(images)].tolist(), strict=True))
     point_ids = dict(zip(points, (1 + rng.permutation(len(points))).tolist(), strict=True))
     for name in MODEL_FILES:
-        (model / f"{name}.bin").write_bytes(_reordered_file(name, data[name], image_ids, point_ids, rng))
+        (model / f"{name}.bin").write_bytes(_reorder_file(name, data[name], image_ids, point_ids, rng))
     if (scene / "database.db").exists():
         _reorder_database(scene / "database.db", target / "database.db", image_ids, rng)
     return target
@@ -165,7 +162,7 @@ def _values(data: bytes, fields: list[Field]) -> list[int]:
     return [int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0]) for field in fields]
 
 
-def _reordered_file(
+def _reorder_file(
     name: str, data: bytes, image_ids: dict[int, int], point_ids: dict[int, int], rng: Generator
 ) -> bytes:
     """Rename ids in a model file and shuffle its records."""

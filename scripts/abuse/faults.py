@@ -29,8 +29,10 @@ from abuse.sandbox import Outcome, run_forked, start_forked
 HELP = "signals, full disks, little memory, rivals and locks while a command runs"
 _PROJECT = Path(__file__).resolve().parents[2]
 _NOBODY = 65534
-_EXTRA_MEMORY = (0, 2, 5, 10, 20, 40, 80, 160, 320)  # MB beyond what the idle process maps
-_FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)  # bytes that a file may have
+# The address space may grow by so much beyond what the idle process maps.
+_EXTRA_MEMORY_MB = (0, 2, 5, 10, 20, 40, 80, 160, 320)
+# A file may have so many bytes.
+_FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)
 
 Problems = Iterator[str]
 
@@ -46,7 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run all faults, print each problem and a table; 1 if there is a problem."""
     with tempfile.TemporaryDirectory() as temporary:
-        Path(temporary).chmod(0o711)  # another user reads the input later
+        # Another user reads the input later.
+        Path(temporary).chmod(0o711)
         bench = Bench((args.work or Path(temporary)).resolve())
         rng = np.random.default_rng(args.seed)
         checks: dict[str, Callable[[], Problems]] = {
@@ -67,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
             "little memory": partial(little_memory, bench),
             f"two runs at once, {args.rivals} times": partial(rivals, bench, args.rivals),
             "a read-only input": partial(read_only_input, bench),
-            "a database in use": partial(locked_database, bench),
+            "a database in use": partial(lock_database, bench),
         }
         failed = False
         for name, check in checks.items():
@@ -213,7 +216,7 @@ def _after_signal(
 # --- limits ----------------------------------------------------------------------------------------------
 
 
-def _limited(main: Callable[[], None], what: int, value: int) -> None:
+def _limit_resource(main: Callable[[], None], what: int, value: int) -> None:
     resource.setrlimit(what, (value, value))
     main()
 
@@ -222,7 +225,7 @@ def small_files(bench: Bench) -> Problems:
     """No file may be larger than so many bytes, as on a disk that is full."""
     for size in _FILE_SIZES:
         bench.prepare()
-        main = partial(_limited, bench.locate("-q"), resource.RLIMIT_FSIZE, size)
+        main = partial(_limit_resource, bench.locate("-q"), resource.RLIMIT_FSIZE, size)
         child = start_forked(main, bench.folder, [bench.folder, *caches()])
         os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
         outcome = bench.note(child.finish())
@@ -261,7 +264,7 @@ def _small_disk(folder: Path, size: int) -> Iterator[bool]:
 
 def little_memory(bench: Bench) -> Problems:
     """The address space may grow by so many megabytes."""
-    for megabytes in _EXTRA_MEMORY:
+    for megabytes in _EXTRA_MEMORY_MB:
         bench.prepare()
         main = partial(_with_memory, bench.locate("-q"), megabytes * 1_000_000)
         outcome = bench.note(run_forked(main, bench.folder, [bench.folder, *caches()]))
@@ -273,7 +276,7 @@ def little_memory(bench: Bench) -> Problems:
 
 def _with_memory(main: Callable[[], None], extra: int) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
-    _limited(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
+    _limit_resource(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
 
 
 # --- others ----------------------------------------------------------------------------------------------
@@ -321,7 +324,7 @@ def _as_nobody(main: Callable[[], None]) -> None:
     main()
 
 
-def locked_database(bench: Bench) -> Problems:
+def lock_database(bench: Bench) -> Problems:
     """Another program in the middle of a transaction, in either journal mode."""
     for mode in ("delete", "wal"):
         for begin in ("BEGIN EXCLUSIVE", "BEGIN IMMEDIATE", "written"):

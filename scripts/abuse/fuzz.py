@@ -286,7 +286,9 @@ def _form(case: Case) -> str:
     return "database" if "--database" in case.arguments else case.arguments[1]
 
 
-def _used(source: str, rng: Generator, *, database: bool, locate_only: bool = False) -> tuple[str, ...]:
+def _choose_command(
+    source: str, rng: Generator, *, database: bool, locate_only: bool = False
+) -> tuple[str, ...]:
     """Return a command that reads a model, most often locate."""
     choice = 1.0 if locate_only else rng.random()
     extra = ("--database", "database.db") if database else ()
@@ -324,17 +326,17 @@ def _binary(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(
         rng,
         (
-            *[mutations.changed_fields] * 3,
-            *(mutations.cut_at_field, mutations.shuffled_fields),
+            *[mutations.change_fields] * 3,
+            *(mutations.cut_at_field, mutations.shuffle_fields),
         ),
     )
     if rng.random() < 0.3:
-        path.write_bytes(mutations.changed_bytes(data, rng))
+        path.write_bytes(mutations.change_bytes(data, rng))
         label = "bytes"
     else:
         path.write_bytes(way(data, fields, rng))
         label = way.__name__
-    arguments = _used(source, rng, database=database)
+    arguments = _choose_command(source, rng, database=database)
     return Case(label=f"binary: {name} {label}", arguments=arguments, encoding=_encoding(rng))
 
 
@@ -346,17 +348,17 @@ def _text(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(
         rng,
         (
-            *[mutations.changed_words] * 4,
+            *[mutations.change_words] * 4,
             *(
-                mutations.changed_lines,
-                mutations.changed_lines,
+                mutations.change_lines,
+                mutations.change_lines,
                 mutations.cut_at_word,
-                mutations.changed_bytes,
+                mutations.change_bytes,
             ),
         ),
     )
     path.write_bytes(way(path.read_bytes(), rng))
-    arguments = _used("text", rng, database=database)
+    arguments = _choose_command("text", rng, database=database)
     return Case(label=f"text: {name} {way.__name__}", arguments=arguments, encoding=_encoding(rng))
 
 
@@ -364,7 +366,7 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
     _copy(base, folder, "sparse/0", "database.db", "truth")
     way = mutations.pick(rng, databases.WAYS)
     same = way(folder / "database.db", rng)
-    arguments = _used("sparse/0", rng, database=True, locate_only=same)
+    arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
     if not same and rng.random() < 0.15 and arguments[0] == "locate":
         arguments = (*arguments, "--directions", "relative-poses")
     return Case(
@@ -378,8 +380,8 @@ def _graph(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(
         rng,
         (
-            *[mutations.changed_words] * 3,
-            *(mutations.changed_lines, mutations.cut_at_word, mutations.changed_bytes),
+            *[mutations.change_words] * 3,
+            *(mutations.change_lines, mutations.cut_at_word, mutations.change_bytes),
         ),
     )
     path.write_bytes(way(path.read_bytes(), rng))
@@ -401,7 +403,7 @@ def _names(base: Path, folder: Path, rng: Generator) -> Case:
             connection.execute("UPDATE images SET name = CAST(? AS TEXT) WHERE name = ?", (new, old.decode()))
         connection.commit()
     path.write_bytes(data)
-    arguments = _used("sparse/0", rng, database=True, locate_only=True)
+    arguments = _choose_command("sparse/0", rng, database=True, locate_only=True)
     return Case(label="names: hostile", arguments=arguments, same_answer=True, encoding=_encoding(rng))
 
 
@@ -418,12 +420,13 @@ def _place(base: Path, folder: Path, rng: Generator) -> Case:
             ),
         )
     )
-    kind = mutations.misplaced(folder / target, rng)
+    kind = mutations.misplace(folder / target, rng)
     if target == "graph.txt":
         return Case(label=f"place: {kind}", arguments=("solve", "graph.txt", "out"))
     source = "text" if target.startswith("text") else "sparse/0"
     return Case(
-        label=f"place: {kind} as {target}", arguments=_used(source, rng, database=target == "database.db")
+        label=f"place: {kind} as {target}",
+        arguments=_choose_command(source, rng, database=target == "database.db"),
     )
 
 
@@ -439,12 +442,12 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     if rng.random() < 0.5:
         order = rng.permutation(len(records))[: int(rng.integers(0, len(records) + 1))]
     path.write_bytes(struct.pack("<Q", len(order)) + b"".join(records[int(k)] for k in order))
-    return Case(label=f"records: {name}", arguments=_used("sparse/0", rng, database=False))
+    return Case(label=f"records: {name}", arguments=_choose_command("sparse/0", rng, database=False))
 
 
 def _of_others(base: Path, folder: Path, rng: Generator) -> Case:
     """What other programs and people write."""
-    ways = (strangers.damaged_stranger, strangers.damaged_database, strangers.damaged_table)
+    ways = (strangers.damage_stranger, strangers.damage_database, strangers.damage_table)
     label, arguments = mutations.pick(rng, ways)(base, folder, rng)
     return Case(label=label, arguments=arguments, encoding=_encoding(rng))
 

@@ -91,7 +91,7 @@ def pick(rng: Generator, items: Sequence[Any]) -> Any:
     return items[int(rng.integers(len(items)))]
 
 
-def changed_bytes(data: bytes, rng: Generator) -> bytes:
+def change_bytes(data: bytes, rng: Generator) -> bytes:
     """Flip, insert, remove, repeat or blank a few bytes anywhere."""
     changed = bytearray(data)
     for _ in range(int(rng.integers(1, 9))):
@@ -118,7 +118,7 @@ def cut_at_field(data: bytes, fields: Sequence[Field], rng: Generator) -> bytes:
     return data[: max(field.offset + int(rng.integers(-1, 2)), 0)]
 
 
-def changed_fields(data: bytes, fields: Sequence[Field], rng: Generator) -> bytes:
+def change_fields(data: bytes, fields: Sequence[Field], rng: Generator) -> bytes:
     """Give one to three fields values that nobody expects; rare meanings are as likely as frequent ones."""
     changed = bytearray(data)
     meanings = sorted({field.meaning for field in fields})
@@ -140,7 +140,7 @@ def _value(field: Field, rng: Generator) -> bytes:
     return value.to_bytes(field.size, "little")
 
 
-def shuffled_fields(data: bytes, fields: Sequence[Field], rng: Generator) -> bytes:
+def shuffle_fields(data: bytes, fields: Sequence[Field], rng: Generator) -> bytes:
     """Remove a field, write it twice, or exchange two; lengths may then no longer fit."""
     first, second = pick(rng, fields), pick(rng, fields)
     own = data[first.offset : first.offset + first.size]
@@ -157,7 +157,7 @@ def shuffled_fields(data: bytes, fields: Sequence[Field], rng: Generator) -> byt
             return bytes(changed)
 
 
-def changed_words(data: bytes, rng: Generator) -> bytes:
+def change_words(data: bytes, rng: Generator) -> bytes:
     """Replace, remove, repeat or exchange a few words of a text file."""
     for _ in range(int(rng.integers(1, 4))):
         spans = words(data)
@@ -171,7 +171,7 @@ def changed_words(data: bytes, rng: Generator) -> bytes:
     return data
 
 
-def changed_lines(data: bytes, rng: Generator) -> bytes:
+def change_lines(data: bytes, rng: Generator) -> bytes:
     """Remove, repeat, exchange or cut lines, or change what ends them."""
     lines = data.splitlines(keepends=True)
     at = int(rng.integers(len(lines)))
@@ -200,7 +200,7 @@ def cut_at_word(data: bytes, rng: Generator) -> bytes:
     return data[: int(pick(rng, (start, end, (start + end) // 2)))]
 
 
-def misplaced(path: Path, rng: Generator) -> str:
+def misplace(path: Path, rng: Generator) -> str:
     """Put something that is no ordinary file in the place of one; return what."""
     data = path.read_bytes()
     path.unlink()

@@ -17,7 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CPU_LIMIT_S = 10
-WALL_LIMIT_S = 90.0  # several times the former: the machine may be shared
+# Several times the former, for the machine may be shared.
+WALL_LIMIT_S = 90.0
 MEMORY_LIMIT_BYTES = 2_000_000_000
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND

@@ -27,8 +27,8 @@ _MODELS = {
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
 _TEXT_WAYS: tuple[Callable[[bytes, Generator], bytes], ...] = (
-    *(mutations.changed_words, mutations.changed_words, mutations.changed_lines),
-    *(mutations.cut_at_word, mutations.changed_bytes),
+    *(mutations.change_words, mutations.change_words, mutations.change_lines),
+    *(mutations.cut_at_word, mutations.change_bytes),
 )
 
 Damage = tuple[str, tuple[str, ...]]
@@ -151,14 +151,14 @@ def _words(values: np.ndarray) -> str:
 # --- damage ----------------------------------------------------------------------------------------------
 
 
-def damaged_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
     """A damaged model of another program, or a damaged list beside it."""
     source = str(mutations.pick(rng, sorted(_MODELS)))
     shutil.copytree((base / source).parent, (folder / source).parent)
     target = str(mutations.pick(rng, (source, source, *_MODELS[source])))
     path = folder / target
     if path.suffix == ".json" and rng.random() < 0.8:
-        label, data = "json", _changed_json(path.read_bytes(), rng)
+        label, data = "json", _change_json(path.read_bytes(), rng)
     else:
         way = mutations.pick(rng, _TEXT_WAYS)
         label, data = way.__name__, way(path.read_bytes(), rng)
@@ -176,7 +176,7 @@ def damaged_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
     return f"stranger: {target} {label}", command
 
 
-def damaged_database(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_database(base: Path, folder: Path, rng: Generator) -> Damage:
     """A damaged database alone, from which `map` takes cameras and rotations too."""
     shutil.copyfile(base / "database.db", folder / "database.db")
     way = mutations.pick(rng, (*databases.WAYS, odd_cameras, odd_cameras, odd_cameras))
@@ -209,7 +209,7 @@ def odd_cameras(path: Path, rng: Generator) -> bool:
     return False
 
 
-def damaged_table(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_table(base: Path, folder: Path, rng: Generator) -> Damage:
     """A damaged table of priors, of names or of options beside a sound model."""
     name = str(mutations.pick(rng, sorted(_TABLES)))
     shutil.copytree(base / "sparse", folder / "sparse")
@@ -223,7 +223,7 @@ def damaged_table(base: Path, folder: Path, rng: Generator) -> Damage:
     return f"table: {name} {way.__name__}", (*arguments, *threads)
 
 
-def _changed_json(data: bytes, rng: Generator) -> bytes:
+def _change_json(data: bytes, rng: Generator) -> bytes:
     """Replace, remove or repeat one to three values somewhere in a JSON file."""
     content = json.loads(data)
     for _ in range(int(rng.integers(1, 4))):

@@ -13,9 +13,8 @@ from abuse.sandbox import MEMORY_LIMIT_BYTES, Outcome
 
 MODEL_FILES = ("cameras", "images", "points3D", "rigs", "frames")
 _REFUSALS = (2, 3, 4)
-_SAME_ANSWER = (
-    1e-6  # of the largest coordinate: names decide the order of images, and the solver stops at 1e-8
-)
+# Of the largest coordinate: names decide the order of images, and the solver stops at 1e-8.
+_SAME_ANSWER = 1e-6
 
 
 def snapshot(folder: Path) -> dict[str, str]:

@@ -61,13 +61,13 @@ def _models(case: str, key: str, old: dict[str, Any], new: dict[str, Any]) -> It
     names = sorted(set(old["poses"]) & set(new["poses"]))
     if names:
         a, b = (np.array([model["poses"][name] for name in names]) for model in (old, new))
-        yield _worst(case, "positions", key, names, _moved(a[:, :3], b[:, :3]))
+        yield _worst(case, "positions", key, names, _move(a[:, :3], b[:, :3]))
         sign = np.sign(np.sum(a[:, 3:] * b[:, 3:], axis=1, keepdims=True))
         yield _worst(case, "rotations", key, names, np.abs(a[:, 3:] - sign * b[:, 3:]).max(axis=1))
     yield from _trees(case, f"{key}: structure", old["structure"], new["structure"])
 
 
-def _moved(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _move(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Return how far each position moved, as a share of the old ones' extent."""
     extent = float(np.linalg.norm(np.ptp(a, axis=0))) or 1.0
     return np.linalg.norm(a - b, axis=1) / extent
@@ -92,7 +92,7 @@ def _tables(
     both = [name for name in names if all(row[name][axis] for row in rows for axis in axes)]
     if axes and both:
         a, b = (np.array([[float(row[n][axis]) for axis in axes] for n in both]) for row in rows)
-        yield _worst(case, "positions", key, both, _moved(a, b))
+        yield _worst(case, "positions", key, both, _move(a, b))
     for column in [name for name in old if name in new and name not in axes and name not in _KEYS]:
         differing = [
             d

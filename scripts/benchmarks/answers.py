@@ -76,7 +76,7 @@ class Runner:
         answer = {"exit": code, "said": said[-1] if said else "", "files": [], "printed": ""}
         answer |= {"models": {}, "tables": {}, "json": {}, "texts": {}}
         if stdout.startswith("{"):
-            answer["json"]["stdout"] = _kept(json.loads(stdout))
+            answer["json"]["stdout"] = _keep(json.loads(stdout))
         else:
             answer["printed"] = _NUMBER.sub("#", _BORDERS.sub(" ", stdout)).strip()
         if case.out and (self.work / case.out).exists():
@@ -114,11 +114,11 @@ class Runner:
             )
 
 
-def _kept(value: Any) -> Any:
+def _keep(value: Any) -> Any:
     """Return a JSON value without what differs from run to run."""
     if isinstance(value, dict):
-        return {key: _kept(inner) for key, inner in value.items() if key not in _VARIABLE}
-    return [_kept(inner) for inner in value] if isinstance(value, list) else value
+        return {key: _keep(inner) for key, inner in value.items() if key not in _VARIABLE}
+    return [_keep(inner) for inner in value] if isinstance(value, list) else value
 
 
 def _collect(out: Path, answer: Answer) -> None:
@@ -132,7 +132,7 @@ def _collect(out: Path, answer: Answer) -> None:
         elif path.suffix == ".csv":
             answer["tables"][key] = _table(path)
         elif path.suffix == ".json":
-            answer["json"][key] = _kept(json.loads(path.read_text(encoding="utf-8")))
+            answer["json"][key] = _keep(json.loads(path.read_text(encoding="utf-8")))
         elif path.suffix == ".db":
             answer["texts"][key] = _digest(path)
         elif path.suffix in (".txt", ".tum", ".g2o") and path.name not in _MODEL_FILES:
@@ -198,7 +198,7 @@ def run(args: argparse.Namespace) -> int:
     _write(args.out, recorded)
     if old is None:
         return 0
-    text, is_equal = compared(old, recorded, strict_words=args.strict_words)
+    text, is_equal = compare_recordings(old, recorded, strict_words=args.strict_words)
     print(text)
     return 0 if is_equal else 1
 
@@ -221,7 +221,7 @@ def record(
         runner = Runner(package.resolve(), Path(name).resolve())
         runner.check()
         _make(runner.work, folders, {case.scene for case in present})
-        answers = dict(_asked(runner, present, jobs))
+        answers = dict(_ask(runner, present, jobs))
     return {"answers": answers, "skipped": [case.name for case in missing]}
 
 
@@ -244,7 +244,7 @@ def _make(work: Path, folders: Mapping[str, Path], scenes: set[str]) -> None:
         shutil.copytree(madrid, work / "graphs" / MADRID, copy_function=shutil.copyfile)
 
 
-def _asked(runner: Runner, cases: list[Case], jobs: int) -> Iterator[tuple[str, Answer]]:
+def _ask(runner: Runner, cases: list[Case], jobs: int) -> Iterator[tuple[str, Answer]]:
     """Yield the answers as they come, and say so."""
     with ThreadPoolExecutor(jobs) as pool:
         for k, answers in enumerate(pool.map(runner.ask, cases)):
@@ -255,7 +255,9 @@ def _asked(runner: Runner, cases: list[Case], jobs: int) -> Iterator[tuple[str, 
                 yield name, answer
 
 
-def compared(old: dict[str, Any], new: dict[str, Any], *, strict_words: bool = False) -> tuple[str, bool]:
+def compare_recordings(
+    old: dict[str, Any], new: dict[str, Any], *, strict_words: bool = False
+) -> tuple[str, bool]:
     """Return what is to be said of two recordings, and whether the cases that both have are equal."""
     names = [name for name in new["answers"] if name in old["answers"]]
     differences = [d for name in names for d in compare(name, old["answers"][name], new["answers"][name])]

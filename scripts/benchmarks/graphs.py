@@ -205,7 +205,9 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     from sfm_shapefit.geometry import fit_similarity
 
     one = draw_graph(problem, seed, data)
-    run = ours.timed(lambda: ours.place(one.graph, covariance=one.covariance, num_cameras=one.num_cameras))
+    run = ours.time_call(
+        lambda: ours.place(one.graph, covariance=one.covariance, num_cameras=one.num_cameras)
+    )
     placement = run.found
     rows, count = placement.cameras, len(placement.cameras)
     truth, lud = one.truth[rows], ours.lud_of(placement)
@@ -244,7 +246,8 @@ def oracle(one: Drawn) -> "FloatArray":
     column = edges[:, :, None] * d + np.arange(d)
     columns = np.concatenate([np.repeat(column[:, k, None, :], d, axis=1).ravel() for k in (0, 1)])
     free = np.ones(t.size, dtype=bool)
-    free[:d] = False  # the origin, and of the farthest camera the coordinate that sets the scale
+    # Held are the origin and, of the farthest camera, the coordinate that sets the scale.
+    free[:d] = False
     far = int(np.argmax(np.abs(t - t[0]).max(axis=1)))
     free[far * d + int(np.argmax(np.abs(t[far] - t[0])))] = False
     for _ in range(_ORACLE_STEPS):

@@ -108,7 +108,7 @@ def measure(scene: str, mapper: str, database: Path, truth: Path, min_matches: i
     if mapper == "map":
         # Compiled code is loaded.
         ours.map_database(ROOT / "data_synthetic" / "ring8" / "database.db", bundle_adjust=True, threads=1)
-    done = ours.timed(run)
+    done = ours.time_call(run)
     errors = None if done.found is None else sfm_shapefit.evaluate(done.found, truth)
     return Outcome(
         scene=scene,

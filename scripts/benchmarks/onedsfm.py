@@ -75,7 +75,7 @@ def measure(name: str, source: Path) -> Outcome:
     read = ours.place_file(source)
     graph = read.placement.graph
     stages = ", ".join(f"{stage} {number(seconds)} s" for stage, seconds in read.timings_s.items())
-    run = ours.timed(lambda: ours.place(graph, **RUNS[name]))
+    run = ours.time_call(lambda: ours.place(graph, **RUNS[name]))
     placement = run.found
     residuals = placement.assessment.residuals_deg
     is_certified = RUNS[name].get("objective", "shapefit") == "shapefit"

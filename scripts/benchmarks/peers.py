@@ -64,7 +64,7 @@ def measure_scene(scene: Scene, folder: Path, cpu_limit_s: int) -> OnScene:
     """Run all contenders on a real scene, after the directions that peers get; those compile our code."""
     directions: on_scenes.Directions | str
     try:
-        directions = call(on_scenes.measured_directions, folder, environment=thread_environment(1))
+        directions = call(on_scenes.measure_directions, folder, environment=thread_environment(1))
     except RuntimeError as error:
         directions = str(error)
     names = on_scenes.contenders()

@@ -190,18 +190,18 @@ def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> Measured:
 def _locate(model: Path, **options: bool) -> ours.Timed:
     """Locate and write."""
     with tempfile.TemporaryDirectory() as folder:
-        return ours.timed(lambda: ours.locate_and_write(model, Path(folder) / "out", **options))
+        return ours.time_call(lambda: ours.locate_and_write(model, Path(folder) / "out", **options))
 
 
 def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
     """Locate on rotations from averaging, as they are and refined."""
-    from peers.colmap import averaged_model
+    from peers.colmap import average_rotations
     from sfm_shapefit import evaluate
 
-    model = averaged_model(folder / "database.db", folder / "sparse" / "0")
+    model = average_rotations(folder / "database.db", folder / "sparse" / "0")
     measured = []
     for refine in (False, True):
-        run = ours.timed(
+        run = ours.time_call(
             lambda refine=refine: ours.locate(model, folder / "database.db", refine_rotations=refine)
         )
         rotation = evaluate(run.found.reconstruction, folder / scene.truth).rotation_deg

@@ -95,7 +95,7 @@ def measure(method: str, share: float, num_images: int, drives: int) -> Drives:
 def _run(method: str, scene: "RigScene", workspace: Path) -> Outcome:
     if method == MAPPING:
         return _best_mapping(scene, workspace)
-    run = ours.timed(lambda: ours.locate(workspace / "sparse" / "0", bundle_adjust=method == ADJUSTED))
+    run = ours.time_call(lambda: ours.locate(workspace / "sparse" / "0", bundle_adjust=method == ADJUSTED))
     return compare(scene, run.found.reconstruction, run.wall_s)
 
 

@@ -138,7 +138,7 @@ class Measured:
     @property
     def close_at(self) -> int | None:
         """The iteration from which the objective stays within CLOSE of the best, from 1."""
-        return settled(self.trace.objectives, self.best_objective * (1.0 + CLOSE))
+        return find_settled(self.trace.objectives, self.best_objective * (1.0 + CLOSE))
 
     @property
     def close_s(self) -> float:
@@ -146,7 +146,7 @@ class Measured:
         return math.nan if self.close_at is None else self.trace.seconds[self.close_at - 1]
 
 
-def settled(values: Sequence[float], limit: float) -> int | None:
+def find_settled(values: Sequence[float], limit: float) -> int | None:
     """Return the number, from 1, of the first value from which all are at or below the limit."""
     above = [k for k, value in enumerate(values, start=1) if not value <= limit]
     first = above[-1] + 1 if above else 1
@@ -240,7 +240,7 @@ def measure(problem: Problem, asked: str, threads: int) -> Measured:
             graph = ViewGraph(len(truth), stored["edges"], stored["directions"])
     before_mb = resident_memory_mb()
     reset_peak()
-    run = ours.timed(lambda: _trace(graph, asked, problem.tol, threads))
+    run = ours.time_call(lambda: _trace(graph, asked, problem.tol, threads))
     (found, trace), peak_mb = run.found, peak_memory_mb()
     best, bound = min([found.objective, *trace.objectives]), found.dual_bound
     if problem.reference_tol is not None:
@@ -296,7 +296,7 @@ def search(name: str, problem: RigidProblem) -> Search:
 
     edges = call(draw_edges, problem.spec)
     ours.rigid_pieces(5, np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 0]]))
-    runs = [ours.timed(lambda: ours.rigid_pieces(problem.spec.n, edges)) for _ in range(RIGID_REPEATS)]
+    runs = [ours.time_call(lambda: ours.rigid_pieces(problem.spec.n, edges)) for _ in range(RIGID_REPEATS)]
     sizes = np.bincount(runs[0].found)
     return Search(
         name=name,

@@ -222,7 +222,7 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
         return found.locations, found.dual, found.iterations
 
     solvers = {"ours": our_own, "cvxpy + Clarabel": cvxpy, "Clarabel directly": direct}
-    tuned = {name: _tuned(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()}
+    tuned = {name: _tune(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()}
     turns: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in solvers}
     for name in [name for _ in range(repeats) for name in solvers if not tuned[name].failure]:
         turns[name].append(_turn(solvers[name], tuned[name].tolerance))
@@ -230,7 +230,7 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
     return Compared(spec=spec, num_edges=graph.num_edges, contenders=contenders)
 
 
-def _tuned(
+def _tune(
     name: str,
     solver: Callable[[float], tuple["FloatArray", "FloatArray | None", int]],
     graph: "ViewGraph",
@@ -245,7 +245,8 @@ def _tuned(
     while tol > _TIGHTEST:
         try:
             locations, dual, iterations = solver(tol)
-        except Exception as error:  # whatever a library raises is an answer, to be shown as such
+        except Exception as error:
+            # Whatever a library raises is an answer, to be shown as such.
             reason = " ".join(str(error).split())[:200]
             return best if not best.failure else Contender(name=name, tolerance=tol, failure=reason)
         if locations is None:
@@ -294,7 +295,8 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     graph, nodes = placement.graph.restricted_to(placement.edges)
     num_points = int((nodes >= placement.num_cameras).sum())
     tight = solve_ours(graph, 1e-11)
-    found = solve_ours(graph, TOL, "auto")  # a warm-up too
+    # This is a warm-up, too.
+    found = solve_ours(graph, TOL, "auto")
     wall: dict[str, list[float]] = {"auto": [], "newton": []}
     for _ in range(REAL_REPEATS):
         for method, seconds in wall.items():

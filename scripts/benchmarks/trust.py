@@ -253,7 +253,7 @@ def _chosen(seed: int, graph: Graph) -> "BoolArray":
     return chosen
 
 
-def concentrated(seed: int) -> Graph:
+def concentrate(seed: int) -> Graph:
     """A tenth of the cameras have 70 % wrong pairs."""
     graph = _box(seed, 0.0)
     own = _chosen(seed, graph)[graph.edges].any(axis=1)
@@ -261,7 +261,7 @@ def concentrated(seed: int) -> Graph:
     return _measure(graph.locations, graph.edges, wrong, seed)
 
 
-def turned(seed: int) -> Graph:
+def turn_cameras(seed: int) -> Graph:
     """A tenth of the cameras are turned by 20 degrees, the directions of their pairs half as far."""
     from sfm_shapefit.geometry import normalized
 
@@ -277,7 +277,7 @@ def turned(seed: int) -> Graph:
     )
 
 
-def weak(seed: int) -> Graph:
+def weaken(seed: int) -> Graph:
     """A tenth of the cameras have three pairs."""
     graph = _box(seed, 0.0)
     kept = np.ones(len(graph.edges), dtype=np.bool_)
@@ -289,9 +289,9 @@ def weak(seed: int) -> Graph:
 
 
 SPOILED: dict[str, Callable[[int], Graph]] = {
-    "10 % of the cameras with 70 % wrong pairs": concentrated,
-    "10 % of the cameras turned by 20 degrees": turned,
-    "10 % of the cameras with three pairs": weak,
+    "10 % of the cameras with 70 % wrong pairs": concentrate,
+    "10 % of the cameras turned by 20 degrees": turn_cameras,
+    "10 % of the cameras with three pairs": weaken,
 }
 
 

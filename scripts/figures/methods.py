@@ -25,7 +25,7 @@ def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
     return ours.solve(graph, solver="conic", tol=1e-9).locations
 
 
-def _refined(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
+def _refine(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
     """ShapeFit and LUD, both refined in angles, the better kept: what `locate` does."""
     placement = ours.place(graph, tol=_TOL, uniqueness=False)
     if len(placement.cameras) < graph.num_nodes:
@@ -62,7 +62,7 @@ def _misfit(graph: ViewGraph, locations: FloatArray) -> float:
 METHODS: dict[str, Callable[[ViewGraph, GraphProblem], FloatArray]] = {
     "ShapeFit": _shapefit,
     "ShapeFit, conic": _conic,
-    "refined": _refined,
+    "refined": _refine,
     "LUD": _lud,
     "least squares": _least_squares,
     "oracle": _oracle,

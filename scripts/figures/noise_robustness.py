@@ -25,7 +25,7 @@ NOT_RECOVERABLE = 1e-4
 """Error at sigma = 1e-6 of a problem that is lost without noise, too."""
 
 
-def fitted_slope(sigmas: np.ndarray, errors: np.ndarray) -> float:
+def fit_slope(sigmas: np.ndarray, errors: np.ndarray) -> float:
     """Return the least squares slope of log error against log sigma, up to the largest fitted noise."""
     used = sigmas <= LARGEST_FITTED
     return float(np.polyfit(np.log10(sigmas[used]), np.log10(errors[used]), 1)[0])
@@ -36,7 +36,7 @@ def draw(sigmas: np.ndarray, results: Results, path: Path) -> None:
     figure, axis = plt.subplots(figsize=(6.4, 4.4), dpi=100)
     for method in results.methods:
         errors = results.mean_errors(method)
-        axis.loglog(sigmas, errors, marker=".", label=f"{method}, slope {fitted_slope(sigmas, errors):.3f}")
+        axis.loglog(sigmas, errors, marker=".", label=f"{method}, slope {fit_slope(sigmas, errors):.3f}")
     axis.set(
         xlabel="noise sigma",
         ylabel="mean relative error",
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     print(f"{len(sigmas)} values of sigma in {results.seconds:.0f} s")
     for method in results.methods:
         lost = int(np.sum(results.values[0, results.methods.index(method), :, 0] > NOT_RECOVERABLE))
-        slope = fitted_slope(sigmas, results.mean_errors(method))
+        slope = fit_slope(sigmas, results.mean_errors(method))
         print(
             f"{method}: slope {slope:.4f} for sigma <= {LARGEST_FITTED:g}; {lost} problems lost without noise"
         )

@@ -65,7 +65,7 @@ def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
         granted.append((found.granted, found.granted_in_space, found.feasible))
         for k, q in enumerate(shares(num_shares)):
             problem = random_graph_problem(n, p, q=float(q), seed=1000 * (k + 1) + trial)
-            outcomes.append((worst_share(problem), recovered(problem)))
+            outcomes.append((worst_share(problem), is_recovered(problem)))
     lost = [share for share, good in outcomes if not good]
     largest = max(share for share, _ in outcomes)
     return Point(*np.median(granted, axis=0).tolist(), min(lost, default=largest))
@@ -77,7 +77,7 @@ def worst_share(problem: GraphProblem) -> float:
     return float(np.bincount(problem.edges[problem.corrupted].ravel(), minlength=n).max() / n)
 
 
-def recovered(problem: GraphProblem) -> bool:
+def is_recovered(problem: GraphProblem) -> bool:
     """Return whether ShapeFit is exact; a problem that is not rigid is lost."""
     try:
         locations = METHODS["ShapeFit"](view_graph(problem), problem)

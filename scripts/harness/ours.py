@@ -22,7 +22,7 @@ class Timed(NamedTuple):
     cpu_s: float
 
 
-def timed(function: Callable[[], Any]) -> Timed:
+def time_call(function: Callable[[], Any]) -> Timed:
     """Call a function once."""
     wall, cpu = time.perf_counter(), time.process_time()
     found = function()

@@ -81,11 +81,13 @@ def _answer(
 ) -> None:
     """Send what the function returns or why it failed."""
     if cpu_limit_s is not None:
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # the system would write the memory to a file
+        # Without this limit the system would write the memory to a file.
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         resource.setrlimit(resource.RLIMIT_CPU, (cpu_limit_s, cpu_limit_s + 1))
     try:
         sender.send((True, function(*args)))
-    except Exception as error:  # whatever a library raises is an answer, to be shown as such
+    except Exception as error:
+        # Whatever a library raises is an answer, to be shown as such.
         sender.send((False, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"))
     finally:
         sender.close()

@@ -172,7 +172,7 @@ def map_database(
     return max(models.values(), key=lambda model: model.num_reg_images()), seconds
 
 
-def averaged_model(database: Path, model: Path, min_num_matches: int = 15) -> pycolmap.Reconstruction:
+def average_rotations(database: Path, model: Path, min_num_matches: int = 15) -> pycolmap.Reconstruction:
     """Return a model of the images of `model` with rotations averaged by pycolmap, and centers 0.
 
     The relative rotations are those that COLMAP's geometric verification stored for the pairs; intrinsics

@@ -123,11 +123,11 @@ def _prepare_shapefit(graph: "ViewGraph") -> Solver:
     return run_it
 
 
-def _prepare_placed(graph: "ViewGraph") -> Solver:
+def _prepare_place(graph: "ViewGraph") -> Solver:
     def run_it() -> tuple["FloatArray", str]:
         found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
         positions = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-        return _gathered(positions, graph.num_nodes), f"from {ours.start_of(found)}, verdicts included"
+        return _gather(positions, graph.num_nodes), f"from {ours.start_of(found)}, verdicts included"
 
     return run_it
 
@@ -141,7 +141,8 @@ def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["Vie
         for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
             info = pytheia.sfm.TwoViewInfo()
             info.rotation_2 = np.zeros(3)
-            info.position_2 = -v if i < j else v  # where the second camera is, seen from the first
+            # Where the second camera is, seen from the first.
+            info.position_2 = -v if i < j else v
             info.num_verified_matches = 100
             pairs[min(i, j), max(i, j)] = info
         orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
@@ -149,7 +150,7 @@ def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["Vie
         def run_it() -> tuple["FloatArray", str]:
             with _silence():
                 found = estimate(pytheia.sfm, pairs, orientations)
-            return _gathered({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
+            return _gather({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
 
         return run_it
 
@@ -185,7 +186,7 @@ def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph
             with _silence():
                 values = recovery.run(measurements, 1.0)
             points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
-            return _gathered(points, graph.num_nodes), ""
+            return _gather(points, graph.num_nodes), ""
 
         return run_it
 
@@ -204,7 +205,7 @@ class Contender:
 
 
 CONTENDERS = (
-    Contender(name="ours, placed", prepare=_prepare_placed),
+    Contender(name="ours, placed", prepare=_prepare_place),
     Contender(name="ours, ShapeFit", prepare=_prepare_shapefit),
     Contender(name="pytheia LUD", prepare=_prepare_pytheia(_pytheia_lud), package="pytheia"),
     Contender(
@@ -233,7 +234,7 @@ def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float
     reset_peak()
     for _ in range(contender.runs):
         solver = contender.prepare(view_graph(problem))
-        (locations, note), wall_s, cpu_s = ours.timed(solver)
+        (locations, note), wall_s, cpu_s = ours.time_call(solver)
         runs.append((relative_error(locations, problem.locations), wall_s, cpu_s, note))
     runs.sort()
     error, wall_s, cpu_s, note = runs[len(runs) // 2]
@@ -242,7 +243,7 @@ def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float
     return error, wall_s, cpu_s, note, peak_memory_mb()
 
 
-def _gathered(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
+def _gather(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
     """Return the points as an array; RuntimeError if cameras are missing or not finite."""
     import numpy as np
 

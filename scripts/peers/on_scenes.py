@@ -97,11 +97,11 @@ def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, 
     if package is not None and find_spec(package) is None:
         return replace(empty, note=f"skipped: {package} is not installed")
     if package is None:
-        run = partial(_located, name)
+        run = partial(_locate, name)
     elif isinstance(directions, str):
         return replace(empty, note=f"failed: {directions}")
     else:
-        run = partial(_solved, name, directions)
+        run = partial(_solve, name, directions)
     try:
         found = call(
             run,
@@ -123,14 +123,14 @@ def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, 
     )
 
 
-def measured_directions(folder: Path) -> Directions:
+def measure_directions(folder: Path) -> Directions:
     """Return the directions of the rigid piece that `locate` places."""
     placement = ours.locate(folder / "sparse" / "0", **SAME_OPTIONS).placement
     graph, cameras = placement.graph.restricted_to(placement.edges)
     return Directions(cameras, graph.edges, graph.directions, graph.weights)
 
 
-def _solved(name: str, directions: Directions, folder: Path) -> Located:
+def _solve(name: str, directions: Directions, folder: Path) -> Located:
     """Run a solver of bare graphs; to be called once per process."""
     from sfm_shapefit import ViewGraph
     from sfm_shapefit.colmap.model import read_model
@@ -139,12 +139,12 @@ def _solved(name: str, directions: Directions, folder: Path) -> Located:
     graph = ViewGraph(len(directions.cameras), directions.edges, directions.directions, directions.weights)
     solver = next(one for one in GRAPH_CONTENDERS if one.name == name).prepare(graph)
     reset_peak()
-    (locations, note), wall_s, cpu_s = ours.timed(solver)
+    (locations, note), wall_s, cpu_s = ours.time_call(solver)
     names = tuple(model.names[c] for c in directions.cameras)
     return Located(names, locations, wall_s, cpu_s, peak_memory_mb(), note)
 
 
-def _located(name: str, folder: Path) -> Located:
+def _locate(name: str, folder: Path) -> Located:
     """Run what starts from the database; to be called once per process."""
     if name in (SAME_DIRECTIONS, BY_DEFAULT):
         return _ours(name, folder)

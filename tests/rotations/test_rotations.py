@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
-from peers.colmap import averaged_model
+from peers.colmap import average_rotations
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.colmap.model import read_model, with_turned_cameras
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
@@ -258,7 +258,7 @@ def test_relative_poses_are_no_matches_to_refine_on():
 
 def test_averaged_rotations_of_a_real_scene_get_better():
     scene = real_scene("fountain-P11")
-    model = averaged_model(scene / "database.db", scene / "sparse" / "0")
+    model = average_rotations(scene / "database.db", scene / "sparse" / "0")
     found = sfm_shapefit.locate(model, scene / "database.db", options=LocateOptions(refine_rotations=True))
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
     assert errors.position.median < 0.003

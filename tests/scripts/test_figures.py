@@ -62,9 +62,9 @@ def test_results_of_other_settings_are_not_mixed_in(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("figure", ["paper", "methods"])
-def test_figure_1_has_a_quick_mode(figure, tmp_path, capsys):
-    figure.main(["phase_transition", "--out", str(tmp_path / "f.png"), "--quick", "--figure", figure])
+@pytest.mark.parametrize("name", ["paper", "methods"])
+def test_figure_1_has_a_quick_mode(name, tmp_path, capsys):
+    figure.main(["phase_transition", "--out", str(tmp_path / "f.png"), "--quick", "--figure", name])
     assert (tmp_path / "f.png").stat().st_size > 5000
     said = capsys.readouterr().out
     assert "problems recovered below 1e-09" in said
@@ -84,7 +84,7 @@ def test_figure_2_has_a_quick_mode_and_its_slope_is_one(tmp_path, capsys):
 def test_the_slope_is_fitted_where_the_noise_is_small():
     sigmas = np.logspace(-6, 0, 7)
     errors = np.where(sigmas <= 1e-2, 3.0 * sigmas**1.5, 1.0)
-    assert noise_robustness.fitted_slope(sigmas, errors) == pytest.approx(1.5)
+    assert noise_robustness.fit_slope(sigmas, errors) == pytest.approx(1.5)
 
 
 def test_every_panel_of_every_figure_names_a_known_method():
