@@ -42,10 +42,10 @@ _PLACEMENT = {
     **{f"filter-{name}": f"--filter {name}" for name in ("1dsfm", "triangles")},
     "filter-triangles-least-squares": "--filter triangles --objective least-squares",
     "no-refine": "--no-refine",
-    "factor-memory-1": "--factor-memory-mb 1",
+    "factor-memory-1": "--factor-memory 1",
     "tol": "--tol 1e-5",
 }
-"""Flags of variants that `locate` and `place` have in common."""
+"""Flags of variants that `locate` and `solve` have in common; `solve` calls --solver --method."""
 
 _LOCATE = {
     **_PLACEMENT,
@@ -71,7 +71,7 @@ _LOCATE = {
     "thresholds": "--min-inliers 40 --inlier-threshold-px 1 --max-reprojection-error-px 2",
     "threads-1": "--threads 1",
     "processes": "--executor processes --threads 2",
-    "max-memory": "--max-memory-mb 1",
+    "max-memory": "--max-memory 1",
     "scene": "--scene",
 }
 _OF_ALL = " ".join(sorted({*_LOCATE} - {"min-trust-0", "scale-prior", "gps", "gps-refine"}))
@@ -117,7 +117,7 @@ _MAPPED = {
 }
 
 _SOLVE = {
-    **_PLACEMENT,
+    **{name: flags.replace("--solver", "--method") for name, flags in _PLACEMENT.items()},
     "default": "--json",
     "formats": "--g2o --1dsfm",
     "g2o": "--g2o",
