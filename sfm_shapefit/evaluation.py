@@ -35,12 +35,15 @@ _ON_A_LINE = (
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Position errors at which recall is always given, as fractions of the reference's extent."""
 
-_MIN_COMMON = 3  # fewer centres never determine a similarity
-_CAP_OF_SPREAD = (
-    0.5  # 0.3 and 0.5 survived every corruption of half minus one tried; 1 failed on some 7 and 11 cameras
-)
-_COLLINEAR_RATIO = 1e-3  # second to first singular value of the centres below which they count as a line
-_ORTHOGONALITY_TOLERANCE = 1e-4  # of R R^T - I; published references printed with 6 digits are 2e-6 off
+# Fewer centres never determine a similarity.
+_MIN_COMMON = 3
+# Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
+# failed on some sets of 7 and 11 cameras.
+_CAP_OF_SPREAD = 0.5
+# Centres count as a line if the ratio of their second to their first singular value is smaller.
+_COLLINEAR_RATIO = 1e-3
+# Published references printed with 6 digits are off by 2e-6 in R R^T - I.
+_ORTHOGONALITY_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -52,8 +52,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "and one with two or more fixed cameras theirs.",
     )
     known_distance: tuple[str, str, float] | None = option(
-        None,
-        "Two images by name, and how far apart they are in the output's units.",
+        None, "Two images by name, and how far apart they are in the output's units."
     )
     fix: str = option(
         "",
@@ -74,8 +73,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "are finer already.",
     )
     bundle_adjust: bool = option(
-        False,
-        "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed.",
+        False, "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."
     )
     min_trust: float = option(
         0.6,

@@ -31,10 +31,9 @@ def time_call(function: Callable[[], Any]) -> Timed:
 
 def solve(graph: "ViewGraph", *, note: Any = None, **options: Any) -> "SolverResult":
     """Return the certified ShapeFit optimum; `note` is called after each iteration."""
-    from sfm_shapefit import SolverOptions
     from sfm_shapefit import solve as solve_program
 
-    return solve_program(graph, SolverOptions(**{"uniqueness": False, **options}), on_iteration=note)
+    return solve_program(graph, on_iteration=note, **{"uniqueness": False, **options})
 
 
 def solve_lud(graph: "ViewGraph") -> "FloatArray":
@@ -60,10 +59,10 @@ def place(
 
 def place_file(source: Path, **options: Any) -> Any:
     """Place a graph file: what the command gives, with `placement`, `statement` and `timings_s`."""
-    from sfm_shapefit.commands.place import solve_graph_file
+    from sfm_shapefit.commands.place import place_graph_file
     from sfm_shapefit.refinement.options import PlacementOptions
 
-    return solve_graph_file(source, PlacementOptions(**options))
+    return place_graph_file(source, PlacementOptions(**options))
 
 
 def lud_of(placement: "Placement") -> "FloatArray | None":

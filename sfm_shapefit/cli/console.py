@@ -26,16 +26,18 @@ EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_INTERRUPTED = 3, 4, 130
 NAMES_SHOWN = 8
 SEE_JSON = "see --json"
 
-_LIBRARIES_BYTES = 850_000_000  # measured: with less, loading them or their first call fails
-_THREAD_BYTES = 50_000_000  # stack and work space of one thread of the linear algebra library
-
+# With less address space, loading the libraries or their first call fails (measured).
+_LIBRARIES_BYTES = 850_000_000
+# Each thread of the linear algebra library has a stack and work space.
+_THREAD_BYTES = 50_000_000
 
 _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
 """How Python, C++ and the dynamic linker say that there is no memory."""
 
 _COMPILING = "compiling kernels, which takes about a minute once; they are kept on disk"
 
-_AGAIN_S = 0.02  # after which an interrupt that was lost comes again: native code has returned by then
+# An interrupt that was lost comes again after this time; native code has returned by then.
+_AGAIN_S = 0.02
 
 _received: list[int] = []
 """Numbers of the signals that asked this process to end."""
@@ -176,7 +178,8 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
             shown = display.tasks[tasks[stage]]
             if total > 1 or shown.total == 1:
                 display.update(tasks[stage], completed=done, total=total)
-            elif done == total:  # the stage is over, perhaps sooner than its limit
+            elif done == total:
+                # The stage is over, perhaps sooner than its limit.
                 display.update(tasks[stage], total=shown.completed)
 
         yield advance

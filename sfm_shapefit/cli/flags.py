@@ -19,8 +19,7 @@ Command = TypeVar("Command", bound=Callable[..., None])
 ModelArgument = Annotated[
     Path | None,
     typer.Argument(
-        metavar="MODEL",
-        help="COLMAP model folder, binary or text; or a file of Bundler, openMVG or OpenSfM.",
+        metavar="MODEL", help="COLMAP model folder, binary or text; or a file of Bundler, openMVG or OpenSfM."
     ),
 ]
 OutArgument = Annotated[Path | None, typer.Argument(metavar="OUT", help="Folder to be made.")]

@@ -64,10 +64,10 @@ def place_command(
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
     with command_run(PlacementOptions, given, target, [source, rotations]) as run:
-        from sfm_shapefit.commands.place import solve_graph_file
+        from sfm_shapefit.commands.place import place_graph_file
         from sfm_shapefit.commands.write import write_graph_result
 
-        found = solve_graph_file(
+        found = place_graph_file(
             source,
             run.options,
             rotations=rotations,

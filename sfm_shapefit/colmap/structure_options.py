@@ -11,12 +11,10 @@ class StructureOptions(Settings):
     """What a 3D point must satisfy to stand in the output."""
 
     max_reprojection_error_px: float = option(
-        4.0,
-        "Observations with a larger reprojection error are removed, and points that lose all but one.",
+        4.0, "Observations with a larger reprojection error are removed, and points that lose all but one."
     )
     min_triangulation_angle_deg: float = option(
-        1.5,
-        "Points that no two cameras see under at least this angle are removed; their depth means little.",
+        1.5, "Points that no two cameras see under at least this angle are removed; their depth means little."
     )
     min_track_length: int = option(2, "Points seen in fewer images than this are removed; 2 or more.")
     ignore_two_view_tracks: bool = option(

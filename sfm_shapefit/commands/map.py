@@ -31,9 +31,12 @@ from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
 
-_DRAFT_WIDENING = 4.0  # of the reprojection limit: a draft is a few pixels off, and would lose long tracks
-_ALARMING_SHARE = 0.7  # of a model's pairs that agree with its rotations: castle-P30 0.97, lego100 0.89
-_DOUBTFUL_SHARE = 0.25  # of one image's pairs
+# A draft is a few pixels off and would lose long tracks, so its reprojection limit is wider by this factor.
+_DRAFT_WIDENING = 4.0
+# A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
+# 0.89), an image if a smaller share of its own does.
+_ALARMING_SHARE = 0.7
+_DOUBTFUL_SHARE = 0.25
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 
@@ -154,7 +157,8 @@ class _Run:
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
         known = self.options.known_distance
         if known is not None and not {*known[:2]} <= {unposed.names[k] for k in members.tolist()}:
-            settings |= {"known_distance": None, "scale": "unit"}  # it belongs to another component
+            # The known distance belongs to another component.
+            settings |= {"known_distance": None, "scale": "unit"}
         rotations = averaging.rotations
         if self.options.bundle_adjust:
             with self.clock("draft"):

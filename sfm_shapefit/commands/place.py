@@ -1,7 +1,7 @@
-"""`solve GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
+"""`place GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from sfm_shapefit.formats import (
 from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results import GraphResult
+from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import ViewGraph
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class _Rotations(NamedTuple):
     statement: str
 
 
-def solve_graph_file(
+def place_graph_file(
     path: "Path | str | pycolmap.PoseGraph",
     options: PlacementOptions | None = None,
     *,
@@ -49,6 +50,7 @@ def solve_graph_file(
     max_rotation_error_deg: float = MAX_ROTATION_ERROR_DEG,
     reverse: bool = False,
     progress: Progress | None = None,
+    **overrides: Any,
 ) -> GraphResult:
     """Place the nodes of a bare view graph by the same steps as `locate`: pieces, solve, verdicts.
 
@@ -63,12 +65,13 @@ def solve_graph_file(
             left out, as `locate` leaves them out.
         reverse: the directions of a bare graph point from i to j, as in 1DSfM's prob.txt.
         progress: called as stages advance.
+        **overrides: single options by name.
 
     Raises:
         InputError: if a file is malformed; the message names the line.
         UnsolvableError: if the directions determine nothing.
     """
-    options = options or PlacementOptions()
+    options = merge_options(options, PlacementOptions, overrides)
     clock = Clock(progress) if progress else Clock()
     found, statement = None, "directions as given"
     with clock("read"):

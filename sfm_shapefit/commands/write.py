@@ -65,7 +65,7 @@ def write_graph_result(
     """Write the tables and pictures of a bare graph like `write_result`; there is no model.
 
     Args:
-        found: what `solve_graph_file` returned.
+        found: what `place_graph_file` returned.
         out, overwrite, protect, report, scene: see `write_result`.
         g2o: also write `positions.g2o`, the placed nodes as vertices.
         onedsfm: also write a folder `1dsfm`: the pairs that agree with the solution, and the placed cameras.

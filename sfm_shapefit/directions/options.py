@@ -11,12 +11,10 @@ class DirectionOptions(Settings):
     """What a pair must show before its direction is believed."""
 
     min_inliers: int = option(
-        15,
-        "Least number of inlier matches with parallax whose point lies in front of both cameras.",
+        15, "Least number of inlier matches with parallax whose point lies in front of both cameras."
     )
     min_inlier_ratio: float = option(
-        0.5,
-        "Least share of inliers among the pair's matches; repeated facades show up below it.",
+        0.5, "Least share of inliers among the pair's matches; repeated facades show up below it."
     )
     max_rival_share: float = option(
         0.5,
@@ -24,20 +22,17 @@ class DirectionOptions(Settings):
         "the first only; repeated facades and moving things show up above it.",
     )
     min_sign_majority: float = option(
-        5.0,
-        "Points in front of both cameras must outnumber those behind both by this factor.",
+        5.0, "Points in front of both cameras must outnumber those behind both by this factor."
     )
     max_sigma_deg: float = option(
-        10.0,
-        "Largest standard deviation of the direction; beyond it there is no parallax to speak of.",
+        10.0, "Largest standard deviation of the direction; beyond it there is no parallax to speak of."
     )
     inlier_threshold_px: float = option(
         2.0,
         "Largest Sampson error of an inlier; a Sampson error of 2 px allows 2.8 px off the epipolar line.",
     )
     max_rotation_error_deg: float = option(
-        10.0,
-        "Largest angle between a stored relative rotation and the given ones (relative poses only).",
+        10.0, "Largest angle between a stored relative rotation and the given ones (relative poses only)."
     )
     num_hypotheses: int = option(200, "Two-match hypotheses per pair.")
 

@@ -31,8 +31,7 @@ class PlacementOptions(SolverOptions):
         "every objective.",
     )
     refine: bool = option(
-        True,
-        'Refine the start robustly in the angles of the directions; only for "auto" and "lud".',
+        True, 'Refine the start robustly in the angles of the directions; only for "auto" and "lud".'
     )
 
     @property

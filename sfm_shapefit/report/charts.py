@@ -7,10 +7,13 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.report.drawing import PairClass, Pairs
 
-_RANGE_DEG = (1e-3, 180.0)  # smaller residuals count in the first bin
+# Smaller residuals count in the first bin.
+_RANGE_DEG = (1e-3, 180.0)
 _BINS = 42
-MOST_CELLS = 200  # per side of the matrix; with more cameras, several share a cell
-_UNBINNED_RANK = np.array([1, 4, 2, 3])  # of each PairClass: cells show the worst of their pairs
+MOST_CELLS = 200
+"""Cells per side of the matrix; with more cameras, several share a cell."""
+# Rank of each PairClass; a cell shows the worst of its pairs.
+_UNBINNED_RANK = np.array([1, 4, 2, 3])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -65,7 +68,8 @@ def view_graph_matrix(pairs: Pairs, num_cameras: int) -> Matrix:
     side = -(-num_cameras // per_cell)
     i, j = (pairs.cameras // per_cell).T
     cells, counts = np.zeros((side, side)), np.zeros((side, side), dtype=np.int64)
-    inside = i == j  # such a pair counts once
+    # A pair inside a cell counts once, any other in two cells.
+    inside = i == j
     rows, columns = np.concatenate([i, j[~inside]]), np.concatenate([j, i[~inside]])
     classes = np.concatenate([pairs.classes, pairs.classes[~inside]])
     np.add.at(counts, (rows, columns), 1)

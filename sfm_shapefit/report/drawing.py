@@ -26,11 +26,17 @@ if TYPE_CHECKING:
 
 MAX_POINTS = 20_000
 """Points that are drawn; more are thinned evenly."""
-_FAR_POINT = 4.0  # times the distance from the median within which 90 % of points and cameras lie
-_FRUSTUM_SHARE = 0.4  # depth of a frustum, of the median distance between neighbours
-_FRUSTUM_OF_EXTENT = (0.008, 0.05)  # and its limits, of the extent
-_HALF_SIZES = (0.15, 1.2)  # limits of half a picture's side over its focal length: fisheyes have no pyramid
-_UPRIGHT = 0.1  # weight of "the pictures' y axes point down" beside "their x axes are level"
+# A point is left out if it is farther from the median than this many times the distance within which 90 % of
+# points and cameras lie.
+_FAR_POINT = 4.0
+# The depth of a frustum is a share of the median distance between neighbours, within limits that are shares
+# of the extent.
+_FRUSTUM_SHARE = 0.4
+_FRUSTUM_OF_EXTENT = (0.008, 0.05)
+# Half a picture's side over its focal length is limited to these, since a fisheye has no pyramid.
+_HALF_SIZES = (0.15, 1.2)
+# "The pictures' y axes point down" has this weight beside "their x axes are level".
+_UPRIGHT = 0.1
 
 
 class PairClass(enum.IntEnum):

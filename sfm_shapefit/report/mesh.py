@@ -24,7 +24,8 @@ PAIR_COLORS = np.array([[47, 120, 196], [208, 58, 43], [176, 125, 0], [139, 148,
 """Of each `PairClass`, as on the page."""
 _TRUST_STOPS = np.array([0.0, 0.4, 0.7, 1.0])
 _TRUST_COLORS = np.array([[179, 32, 44], [232, 116, 59], [233, 197, 74], [42, 157, 143]], dtype=np.float64)
-_RIBBON = 0.03  # width, of the depth of a frustum
+# A ribbon is this share of the depth of a frustum wide.
+_RIBBON = 0.03
 _PYRAMID = np.array([[0, 2, 1], [0, 3, 2], [0, 4, 3], [0, 1, 4], [1, 2, 3], [1, 3, 4]])
 """Faces around an apex, 0, and four corners."""
 _MARKER = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [-1, 0, 0], [0, -1, 0], [0, 0, -1]], dtype=np.float64)

@@ -30,11 +30,16 @@ from sfm_shapefit.results.tables import IN_MEMORY
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
-_MAX_BARS = 400  # of the chart of trust
-_MARGIN = 0.03  # of the drawing's size, around it
-_FLATTEST = 0.02  # least side of the box around the drawing, of the largest
-_MAX_HINGES = 20  # that are named per piece
-_STARTING_ITERATIONS = 2  # whose objectives may be far out of scale
+# The chart of trust has at most so many bars.
+_MAX_BARS = 400
+# The box around the drawing has a margin of this share of its largest side, and no side is smaller than the
+# other share of it.
+_MARGIN = 0.03
+_FLATTEST = 0.02
+# So many hinges are named per piece.
+_MAX_HINGES = 20
+# The objectives of the first iterations may be far out of scale.
+_STARTING_ITERATIONS = 2
 _AXES = "xyz"
 _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
@@ -69,7 +74,8 @@ def report_html(drawing: Drawing, facts: dict[str, Any]) -> str:
 def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
-    cameras = np.lexsort((trust, np.isnan(trust)))  # NaN last
+    # Cameras of unknown trust come last.
+    cameras = np.lexsort((trust, np.isnan(trust)))
     pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)

@@ -14,9 +14,12 @@ from sfm_shapefit.report.drawing import Drawing, PairClass
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
-_FAR_DEG = 1.0  # repeated structure and wrong rotations are off by more
-_LOW_TRUST = 0.75  # below it, reasons are given
-_SHOWN = 3  # items of a kind among the first things to look at
+# Repeated structure and wrong rotations are off by more than this.
+_FAR_DEG = 1.0
+# Below this trust, reasons are given.
+_LOW_TRUST = 0.75
+# So many items of a kind are among the first things to look at.
+_SHOWN = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,8 +28,10 @@ _CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
 _FEWEST_FITTED = 3
-_PICKED_DEG = 2.0  # between a click and the centre of the camera that is meant
-_LEAST_DEG = 0.01  # the slider is logarithmic, up to 180 degrees
+# A click means the camera whose centre is at most this far off.
+_PICKED_DEG = 2.0
+# The slider is logarithmic, from here to 180 degrees.
+_LEAST_DEG = 0.01
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +105,8 @@ def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "vis
         raise InputError(
             "the viewer needs viser: pip install '.[viewer]' in the folder of sfm_shapefit"
         ) from error
-    with redirect_stdout(io.StringIO()):  # its banner; the address is for the caller to tell
+    # The server prints a banner; the address is for the caller to tell.
+    with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
     server.scene.set_up_direction(tuple(drawing.axes[2].tolist()))
     _View(server, drawing, facts)

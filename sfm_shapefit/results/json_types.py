@@ -5,6 +5,9 @@ Keys may be added, never renamed, within a schema version. Numbers that are not 
 
 from typing import Annotated, Any, Literal, TypedDict
 
+from sfm_shapefit.evaluation import ErrorSummary, Recall
+from sfm_shapefit.placement.diagnosis import Diagnosis
+
 Options = Annotated[dict[str, Any], "The settings of the run, a key per option of the command."]
 Timings = Annotated[dict[str, float], "Wall-clock seconds per stage."]
 Versions = Annotated[dict[str, str], "Of the packages that the answer depends on."]
@@ -228,55 +231,6 @@ class MapSummary(TypedDict):
     warnings: Warnings
 
 
-class InspectedPiece(TypedDict):
-    """A parallel-rigid piece of the view graph, most cameras first."""
-
-    num_cameras: int
-    hinges: Annotated[list[str], "Cameras that it shares with other pieces."]
-
-
-class WeakCamera(TypedDict):
-    """A camera that little holds."""
-
-    name: str
-    num_pairs: int
-    spread: Annotated[float | None, "Least eigenvalue of its directions' scatter: 0 if all are parallel."]
-    reasons: list[str]
-
-
-class Corruption(TypedDict):
-    """Estimate of the share of wrong pairs, from triangles."""
-
-    share: float | None
-    num_checked: int
-    statement: str
-
-
-class Plan(TypedDict):
-    """What `locate` would do."""
-
-    solver: str
-    solver_reason: str
-    second_start: bool
-    finish: str
-
-
-class Diagnosis(TypedDict):
-    """The view graph, diagnosed without solving."""
-
-    dimension: int
-    num_cameras: int
-    num_points: int
-    num_pairs: int
-    components: Annotated[list[int], "Cameras of each connected component."]
-    pieces: list[InspectedPiece]
-    left_out: Annotated[dict[str, str], "Cameras that could not be placed, and why."]
-    weak: list[WeakCamera]
-    corruption: Corruption
-    plan: Plan | None
-    obstacle: Annotated[str, "Why nothing can be placed; empty if it can."]
-
-
 class Expected(TypedDict):
     """What `locate` will take on this machine."""
 
@@ -299,23 +253,6 @@ class InspectSummary(TypedDict):
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
 
 
-class Statistics(TypedDict):
-    """Of one kind of error over the common cameras."""
-
-    median: float
-    mean: float
-    rms: float
-    max: float
-
-
-class Recall(TypedDict):
-    """The share of the reference's cameras that are placed to within a threshold."""
-
-    threshold: Annotated[float, "In the reference's units."]
-    fraction_of_extent: Annotated[float | None, "Null for a threshold that was asked for in units."]
-    recall: float
-
-
 class Alignment(TypedDict):
     """The robust similarity of the centres."""
 
@@ -335,8 +272,8 @@ class EvaluateSummary(TypedDict):
     missing: list[str]
     extra: list[str]
     extent: Annotated[float, "Diagonal of the reference's cameras."]
-    position_error: Annotated[Statistics, "In the reference's units."]
-    rotation_error_deg: Statistics
+    position_error: Annotated[ErrorSummary, "In the reference's units."]
+    rotation_error_deg: ErrorSummary
     recall: list[Recall]
     ref_from_model: Alignment
     rotation_ref_from_model: list[list[float]]

@@ -5,6 +5,7 @@ python -m sfm_shapefit.results.schema           # writes sfm_shapefit/schemas/ou
 
 import json
 import types
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints, is_typeddict
 
@@ -45,15 +46,19 @@ def output_schema() -> dict[str, Any]:
 
 
 def _schema_of(kind: Any, definitions: dict[str, Any], names: dict[Any, str]) -> dict[str, Any]:
-    """Return the schema of a type; that of a TypedDict is added to the definitions, and referred to."""
-    if is_typeddict(kind):
+    """Return the schema of a type; that of one with fields is added to the definitions, and referred to."""
+    if is_typeddict(kind) or is_dataclass(kind):
         name = names.get(kind, kind.__name__)
         if name not in definitions:
-            definitions[name] = {}  # Holds the place: definitions stand in the order of their use.
+            # An empty value holds the place, so that definitions stand in the order of their use.
+            definitions[name] = {}
             hints = get_type_hints(kind, include_extras=True)
+            if is_dataclass(kind):
+                # The number may not be finite, and stands as null then.
+                hints = {key: float | None if hint is float else hint for key, hint in hints.items()}
             definitions[name] |= {
                 "type": "object",
-                "description": kind.__doc__,
+                "description": (kind.__doc__ or "").split("\n")[0],
                 "properties": {key: _schema_of(hint, definitions, names) for key, hint in hints.items()},
                 "required": list(hints),
                 "additionalProperties": False,
@@ -62,7 +67,11 @@ def _schema_of(kind: Any, definitions: dict[str, Any], names: dict[Any, str]) ->
     if get_origin(kind) is Annotated:
         described, sentence = get_args(kind)
         return _schema_of(described, definitions, names) | {"description": sentence}
-    inner = [_schema_of(one, definitions, names) for one in get_args(kind) if not isinstance(one, str | int)]
+    inner = [
+        _schema_of(one, definitions, names)
+        for one in get_args(kind)
+        if get_origin(kind) is not Literal and one is not ...
+    ]
     return _plain_schema_of(kind, inner)
 
 
@@ -73,7 +82,7 @@ def _plain_schema_of(kind: Any, inner: list[dict[str, Any]]) -> dict[str, Any]:
         return {"enum": list(get_args(kind))}
     if origin is types.UnionType:
         return {"anyOf": inner}
-    if origin is list:
+    if origin in (list, tuple):
         return {"type": "array", "items": inner[0]}
     if origin is dict:
         return {"type": "object", "additionalProperties": inner[1]}

@@ -12,15 +12,19 @@ from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
 from sfm_shapefit.refinement.starts import Finish
 from sfm_shapefit.solver.options import Status
 
-_ALARMING_SHARE = 0.5  # of pairs that contradict the solution
+# A larger share of pairs that contradict the solution, or the given rotations, is warned of.
+_ALARMING_SHARE = 0.5
 _ALARMING_LEVEL_DEG = 5.0
-_INSIDE = 30.0  # median distances from the median within which cameras say how large the scene is
-_UNCERTAIN_SHARE = 0.05  # standard deviation of a camera, of the extent of all
+# Cameras within so many median distances of the median say how large the scene is.
+_INSIDE = 30.0
+# A camera is uncertain if its standard deviation is more than this share of the extent of all.
+_UNCERTAIN_SHARE = 0.05
 _TWOFOLD_SHARE = 0.05
 """Of pairs on two directions among those on one or two. It was at most 0.005 on eight real scenes and 0.04 in
 drawn courtyards, which are placed well, and 0.31 before drawn facades of one house again and again, where
 half of the cameras were shifted by a house without a contradiction."""
-_FEWEST_TWOFOLD = 3  # fewer prove nothing
+# Fewer pairs on two directions prove nothing.
+_FEWEST_TWOFOLD = 3
 
 
 def quality_warnings(placement: Placement) -> Iterator[str]:

@@ -29,21 +29,17 @@ class SceneOptions(Settings):
     )
     num_images: int = option(25, "Number of images, all by one camera.")
     num_points: int = option(
-        2000,
-        "Number of surface points; those seen by fewer than two images stay out of the model.",
+        2000, "Number of surface points; those seen by fewer than two images stay out of the model."
     )
     pixel_noise_px: float = option(0.5, "Standard deviation of each keypoint coordinate.")
     wrong_match_fraction: float = option(
-        0.0,
-        "Fraction of each pair's matches that join random keypoints of the list.",
+        0.0, "Fraction of each pair's matches that join random keypoints of the list."
     )
     corrupted_pair_fraction: float = option(
-        0.0,
-        "Fraction of the pairs whose whole list agrees on a false baseline.",
+        0.0, "Fraction of the pairs whose whole list agrees on a false baseline."
     )
     rotation_noise_deg: float = option(
-        0.0,
-        "Standard deviation, about each axis, of the error of the rotations that the model states.",
+        0.0, "Standard deviation, about each axis, of the error of the rotations that the model states."
     )
     max_pairs_per_image: int = option(
         20,
@@ -52,18 +48,15 @@ class SceneOptions(Settings):
     )
     min_matches: int = option(30, "Images that share fewer points than this are no pair.")
     max_matches_per_pair: int | None = option(
-        None,
-        "So many of a pair's matches are kept, drawn at random; all if not given.",
+        None, "So many of a pair's matches are kept, drawn at random; all if not given."
     )
     max_keypoints_per_image: int = option(
-        1000,
-        "The points that appear largest (nearest and most frontal) are kept.",
+        1000, "The points that appear largest (nearest and most frontal) are kept."
     )
     image_width: int = option(1200, "In pixels.")
     image_height: int = option(900, "In pixels.")
     focal_length_px: float = option(
-        1000.0,
-        "One for both axes; the principal point is the centre of the image.",
+        1000.0, "One for both axes; the principal point is the centre of the image."
     )
     seed: int = option(0, "Decides every random draw.")
 
@@ -114,8 +107,7 @@ class RenderOptions(Settings):
         "of different ones are wrong and agree.",
     )
     radial_k1: float = option(
-        -0.05,
-        "First radial distortion coefficient of the lens, as OpenCV and COLMAP define it.",
+        -0.05, "First radial distortion coefficient of the lens, as OpenCV and COLMAP define it."
     )
     radial_k2: float = option(0.01, "Second radial distortion coefficient.")
     gray_noise: float = option(2.0, "Standard deviation of the sensor's noise, in grey levels of 255.")
@@ -142,12 +134,10 @@ class WorkspaceOptions(Settings):
         "rotations only, as from an inertial sensor: all centres at the origin, no points.",
     )
     database: bool = option(
-        True,
-        "Write database.db; without it the model's own tracks are the only source of directions.",
+        True, "Write database.db; without it the model's own tracks are the only source of directions."
     )
     relative_poses: bool = option(
-        False,
-        "Store cam2_from_cam1 in the two-view geometries; COLMAP leaves it out by default.",
+        False, "Store cam2_from_cam1 in the two-view geometries; COLMAP leaves it out by default."
     )
 
     def __post_init__(self) -> None:

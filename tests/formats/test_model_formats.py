@@ -389,7 +389,7 @@ def relative_poses_of_ring():
 
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
-    from sfm_shapefit.commands.place import solve_graph_file
+    from sfm_shapefit.commands.place import place_graph_file
     from sfm_shapefit.formats import EpipolarGeometries
 
     model, pairs, rotations, units = relative_poses_of_ring()
@@ -400,7 +400,7 @@ def test_relative_poses_come_back_and_are_solved(tmp_path):
     np.testing.assert_array_equal(back.pairs, pairs)
     np.testing.assert_allclose(back.rotations, rotations, atol=1e-14)
     np.testing.assert_allclose(back.to_second, units, atol=1e-14)
-    found = solve_graph_file(tmp_path / "relpose.txt")
+    found = place_graph_file(tmp_path / "relpose.txt")
     # Averaged rotations stop at 1e-3 rad, which bounds what positions can be.
     spread = found.placement.locations - found.placement.locations.mean(axis=0)
     true = model.centers - model.centers.mean(axis=0)

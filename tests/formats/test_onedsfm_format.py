@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.commands.place import solve_graph_file
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import (
     g2o_text,
@@ -229,7 +229,7 @@ def test_a_g2o_file_is_solved_from_the_rotations_of_its_vertices(tmp_path):
     file = tmp_path / "graph.g2o"
     vertices = g2o_text([str(10 * k) for k in range(6)], np.zeros((6, 3)), cam_from_world)
     file.write_text(edges_text(cam_from_world, centers) + vertices)
-    found = solve_graph_file(file, rotations=file)
+    found = place_graph_file(file, rotations=file)
     assert "6 of 6 rotations of" in found.statement
     placed, true = (x - x.mean(axis=0) for x in (found.placement.locations, centers))
     # Exact directions: positions come back but for scale, to the solve's tolerance.

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sfm_shapefit.commands.place import solve_graph_file
+from sfm_shapefit.commands.place import place_graph_file
 
 
 def test_the_order_of_a_graphs_lines_does_not_matter(tmp_path):
@@ -19,5 +19,5 @@ def test_the_order_of_a_graphs_lines_does_not_matter(tmp_path):
             (i, j), v = (pairs[e], units[e]) if rng.random() >= flip else (pairs[e][::-1], -units[e])
             lines.append(f"{i} {j} {' '.join(map(repr, v.tolist()))}\n")
         (tmp_path / "graph.txt").write_text("".join(lines))
-        located.append(solve_graph_file(tmp_path / "graph.txt").placement.locations)
+        located.append(place_graph_file(tmp_path / "graph.txt").placement.locations)
     assert np.abs(located[0] - located[1]).max() <= 1e-12 * np.ptp(located[0], axis=0).max()

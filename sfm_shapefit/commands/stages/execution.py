@@ -33,7 +33,8 @@ ExecutorKind = Literal["serial", "processes", "dask"]
 
 MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work, and 230 MB."""
-_RETRIES = 3  # of a task whose worker died, by dask
+# Dask gives a task whose worker died to another so many times.
+_RETRIES = 3
 _NO_DASK = "the executor dask needs dask.distributed: pip install '.[dask]' in the folder of sfm_shapefit"
 
 
@@ -129,7 +130,8 @@ def open_executor(
     if kind == "serial":
         yield None
     elif kind == "processes":
-        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:  # fork and threads clash
+        # Processes are spawned, because forking clashes with threads.
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
             yield pool
     else:
         with _dask_client(workers, scheduler) as client:

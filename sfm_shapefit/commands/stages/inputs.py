@@ -105,7 +105,8 @@ def choose_inputs(
         return Inputs(
             folder=folder, database=None, source=source, statement="the model's own tracks, as asked"
         )
-    is_folder = folder is not None and not folder.is_file()  # pixels of other programs' models may differ
+    # The pixels of other programs' model files may differ from those of a database beside them.
+    is_folder = folder is not None and not folder.is_file()
     found = find_database(folder) if folder is not None and is_folder else None
     path = Path(database) if database is not None else found
     if path is None:
