@@ -80,7 +80,7 @@ def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
     """Return the solver that is asked for, if it knows groups."""
     if options.solver == "admm":
         raise InputError(
-            "method 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
+            "solver 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
         )
     reason = "asked for"
     if options.solver == "auto":
