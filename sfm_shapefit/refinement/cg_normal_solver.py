@@ -40,7 +40,7 @@ class IterativeNormal:
 
     def __init__(self, graph: GraphShape) -> None:
         self._edges = graph.edges
-        self._neighbours = adjacency(graph.num_nodes, graph.edges)
+        self._neighbors = adjacency(graph.num_nodes, graph.edges)
         self._blocks: FloatArray = np.zeros((0, graph.dimension, graph.dimension))
         self._preconditioner: Preconditioner | None = None
 
@@ -48,7 +48,7 @@ class IterativeNormal:
         """Take the matrix of edge blocks (m, d, d)."""
         self._blocks = weights
         mean = np.trace(weights, axis1=1, axis2=2) / weights.shape[1]
-        self._preconditioner = approximate_cholesky(self._neighbours, mean, _SEED)
+        self._preconditioner = approximate_cholesky(self._neighbors, mean, _SEED)
 
     def solve(self, rhs: FloatArray, /) -> FloatArray:
         """Return the step of the locations, (n, d), to a hundredth of the residual."""

@@ -22,7 +22,7 @@ camera has to show evidence of its own for each of its three parameters, else it
 The floor of the level, nu, the share of pairs that must gain and this factor were chosen on these scenes,
 against their truth.
 
-Source of the ratio: the likelihood of normal residuals of unknown variance, maximised over it, is
+Source of the ratio: the likelihood of normal residuals of unknown variance, maximized over it, is
 proportional to (sum of squares)^(-nu / 2).
 """
 
@@ -44,15 +44,19 @@ from sfm_shapefit.rotations.joint_refinement import (
     turn_vectors,
 )
 
-_SCALES_PX = (8.0, 3.0, 1.0)  # of the Cauchy loss, one after the other
+# The scales of the Cauchy loss, one after the other.
+_SCALES_PX = (8.0, 3.0, 1.0)
 _FINAL_PX = _SCALES_PX[-1]
-_FIRST_LEVEL_RAD = np.radians(1.0)  # before anything is known of the turns
-_LEAST_LEVEL_RAD = np.radians(0.3)  # averaged rotations are off by that; most cameras less, a few more
-_FLOOR_PX = 0.05  # residuals below this are as good as any; keeps the ratios of exact matches sober
+# The level of the prior before anything is known of the turns, and at least: averaged rotations are off by
+# the latter, most cameras by less, a few by more.
+_FIRST_LEVEL_RAD, _LEAST_LEVEL_RAD = np.radians(1.0), np.radians(0.3)
+# Residuals below this are as good as any; it keeps the ratios of exact matches sober.
+_FLOOR_PX = 0.05
 _MIN_PAIRS = 3
 _MIN_GAINING_SHARE = 2.0 / 3.0
-_GOOD_GAIN = 0.02  # log of the factor by which the median pair gains, below which rotations are good already
-_ASKED_OF_GOOD = 3.0  # evidence for a turn then: one for each parameter
+# Rotations are good already if the median pair gains less than this, as a logarithm of its costs. A turn is
+# then asked for so much evidence: one for each parameter.
+_GOOD_GAIN, _ASKED_OF_GOOD = 0.02, 3.0
 _CENTER_STEPS = 12
 
 

@@ -36,6 +36,7 @@ and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells w
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -50,34 +51,48 @@ from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
-_ROUNDS = 8  # of clipping; three do mostly, but on loose communities the sixth still gained half of the gap
-_ROUND_REDUCTION = 0.1  # of the equality residual per round; exact solves would gain no round
-_NEGLIGIBLE = 0.03  # rounds end when the excess costs less than this share of the gap, or than this one
-_NEGLIGIBLE_MISSED = 0.3  # where the gap misses what was asked for in any case
-_RESIDUAL_FLOOR = 0.1  # least residual, relative to the mean one, that the metric takes seriously
-_ALONG_SURFACE = 0.97  # share of the metric across the surface of a ball that is taken away
-_ON_SURFACE = 0.99  # ||y_e|| / w_e from which a pair counts as on the surface
-_REPAIRS = 4  # each repair shrinks the equality residual to the rounding of the previous one
-_CG_STEPS = 500  # 10 to 60 on all but long chains
-_EDGE_BLOCKS, _LARGE = 4, 200_000  # pairs from which the passes over them run by blocks, on several threads
+# Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
+_ROUNDS = 8
+# A round shrinks the equality residual to this share; exact solves would gain no round.
+_ROUND_REDUCTION = 0.1
+# The rounds end when the excess costs less than this share of the gap; the second share is that where the gap
+# misses what was asked for in any case.
+_NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
+# The least residual, relative to the mean one, that the metric takes seriously.
+_RESIDUAL_FLOOR = 0.1
+# The share of the metric across the surface of a ball that is taken away.
+_ALONG_SURFACE = 0.97
+# A pair counts as on the surface of its ball from this ||y_e|| / w_e on.
+_ON_SURFACE = 0.99
+# Each repair shrinks the equality residual to the rounding of the previous one.
+_REPAIRS = 4
+# Conjugate gradients need 10 to 60 steps on all but long chains.
+_CG_STEPS = 500
+# From so many pairs on, the passes over them run by so many blocks, on several threads.
+_LARGE, _EDGE_BLOCKS = 200_000, 4
 _SEED = 1
-_EXACT_PER_GAP = 1e-5  # an equality residual that needs no repair, per gap: the bound moves by 100 times it
-_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10  # limits of it
-_ENOUGH = 0.8  # rounds end at this share of the gap asked for, with the excess that the exact repair
-_EXCESS_GROWTH = 5.0  # may make of the present one: 4 times it on boxes, 1 to 2 times on communities
-_UNREPAIRED = 1e-9  # an equality residual, relative to the largest degree, that no bound may rest on
-_STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
-_REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
-_REGULAR_SINGLE = 1e-3  # the same for a factor in single precision: far above its rounding, n d eps
-_SMALL, _LARGEST_DENSE = 450, 1800  # unknowns up to which any graph, or a dense one, has a dense factor
-_DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination saves much
-_SINGLE_FROM = 450  # unknowns from which a factor in single precision is tried first
-_UNIQUENESS_EDGES = 500_000  # beyond it uniqueness is not examined: ordering alone takes seconds
-_UNIQUENESS_FLOPS = 1e11  # a few seconds; beyond it uniqueness is not examined
+# An equality residual of so much per gap needs no repair, for the bound moves by 100 times it; within limits.
+_EXACT_PER_GAP = 1e-5
+_LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10
+# The rounds end where the gap is expected below this share of the one asked for. The exact repair is expected
+# to multiply the present excess by the second number: by 4 on boxes, by 1 to 2 on communities.
+_ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
+# No bound may rest on a larger equality residual, relative to the largest degree.
+_UNREPAIRED = 1e-9
+# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
+_STRICT = 1e-3
+# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this; in single
+# precision it must be far above the rounding of the factor, n d eps.
+_REGULAR, _REGULAR_SINGLE = 1e-9, 1e-3
+# From so many unknowns on a factor in single precision is tried first.
+_SINGLE_FROM = 450
+# Uniqueness is not examined beyond so many pairs, whose ordering alone takes seconds, or so many operations.
+_UNIQUENESS_EDGES, _UNIQUENESS_FLOPS = 500_000, 1e11
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,7 +136,7 @@ def certify(
         locations: (n, d) camera centres, in any scale, with L(T) > 0.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
-        uniqueness: also examine whether the optimum is unique; costs one sparse factorisation.
+        uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
         factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
             graph; it serves as preconditioner and cannot make the bound wrong.
         threads: of a repair; the bound does not depend on it.
@@ -370,8 +385,8 @@ def _preconditioner(
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32
-        neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-        return approximate_cholesky(neighbours, stiffness, _SEED)
+        neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+        return approximate_cholesky(neighbors, stiffness, _SEED)
     return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
 
 
@@ -480,13 +495,12 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     v, w = graph.directions, graph.weights
     longest = int(np.argmax(along(differences(t, graph.edges), v)))
     n, d = graph.num_nodes, graph.dimension
-    share = 2.0 * graph.num_edges / (n * (n - 1.0))
-    if n * d <= _SMALL or (n * d <= _LARGEST_DENSE and share >= _DENSE_GRAPH):
+    order = cache(lambda: best_order(adjacency(n, graph.edges)))
+    if prefers_dense_factor(graph, lambda: order().flops * d**3):
         return _is_regular_dense(graph, y, longest)
-    neighbours = adjacency(n, graph.edges)
-    symbolic = plan_factorisation(neighbours, graph.edges, best_order(neighbours))
-    if symbolic.flops * d**3 > _UNIQUENESS_FLOPS:
+    if order().flops * d**3 > _UNIQUENESS_FLOPS:
         return None
+    symbolic = plan_factorisation(adjacency(n, graph.edges), graph.edges, order())
     blocks = np.empty((graph.num_edges, d, d))
     _set_conditions(v, w, y, longest, blocks)
     try:

@@ -3,7 +3,7 @@
 The door to cvxpy and Clarabel. One cone of d rows per edge, in an orthonormal basis B_e of the
 complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
 
-    minimise    sum_e w_e s_e
+    minimize    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
 With groups (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, group 0 grounded.

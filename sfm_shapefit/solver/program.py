@@ -1,11 +1,11 @@
 """The ShapeFit program and its dual, as arrays.
 
-    minimise    R(T) = sum_e w_e || P_e (t_i - t_j) ||        e = (i, j), P_e = I - v_e v_e^T
+    minimize    R(T) = sum_e w_e || P_e (t_i - t_j) ||        e = (i, j), P_e = I - v_e v_e^T
     subject to  L(T) = sum_e w_e <t_i - t_j, v_e> = kappa,    sum_i t_i = 0
 
 With D the incidence operator, (D T)_e = t_i - t_j, and c = D^T (w v), L(T) = <c, T>. The dual is
 
-    maximise    lambda
+    maximize    lambda
     subject to  D^T y = lambda c,    <y_e, v_e> = 0,    ||y_e|| <= w_e
 
 and for every feasible pair R(T) - lambda L(T) = sum_e (w_e ||r_e|| - <y_e, r_e>) >= 0 with

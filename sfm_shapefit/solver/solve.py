@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ from sfm_shapefit.rigidity import is_parallel_rigid
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
+from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import (
     IterationInfo,
@@ -30,18 +31,16 @@ from sfm_shapefit.solver.program import (
     scale_functional,
 )
 from sfm_shapefit.solver.splitting.linear import Prediction, predict_factor
-from sfm_shapefit.solver.splitting.split_then_newton import Finish, solve_hybrid
+from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 
-_DIRECTIONS_CANCEL = 1e-9  # relative size of c below which the scale constraint says nothing
-_LARGEST_RESIDUAL = 1e-9  # of the dual's equality: beyond it the bound is not to be called rigorous
+# The scale constraint says nothing where c is smaller than this, relative to the sum of weights.
+_DIRECTIONS_CANCEL = 1e-9
+# The bound is not to be called rigorous where the dual violates its equality by more.
+_LARGEST_RESIDUAL = 1e-9
 ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
-
-# Newton's matrix is dense up to this many unknowns n d; a sparse factor does not pay below the first number,
-# whatever the graph, and beyond the second the dense one takes seconds.
-_SMALL, _LARGEST_DENSE = 450, 1800
-_DENSE_GRAPH = 0.3  # share of all pairs from which no order of elimination saves much
-_LARGEST_NEWTON_FLOPS = 4e9  # of one block factorisation: from here on splitting is faster to the same gap
+# From so many operations of one block factorization on, splitting is faster to the same gap.
+_LARGEST_NEWTON_FLOPS = 4e9
 
 
 class Run(NamedTuple):
@@ -179,31 +178,27 @@ def uncertified(
 
 def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
-    unknowns = graph.num_nodes * graph.dimension
     asked = options.solver != "auto"
     if options.solver == "conic":
         return Choice("conic", _run_conic, "asked for")
     if options.solver == "admm":
         return Choice("admm", _run_admm, "asked for")
-    if unknowns <= _SMALL:
-        return Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns: dense")
-    dense = Choice("newton", _run_dense, "asked for" if asked else f"{unknowns} unknowns, dense graph")
-    share = 2.0 * graph.num_edges / (graph.num_nodes * (graph.num_nodes - 1.0))
-    prediction, flops = None, np.inf
-    if unknowns > _LARGEST_DENSE or share < _DENSE_GRAPH:
-        prediction = predict_factor(graph)
-        flops = prediction.flops * graph.dimension**3
-    if unknowns <= _LARGEST_DENSE and flops > unknowns**3 / 12:
-        return dense
-    predicted = (
-        f"{flops / 1e9:.2g} Gflop for a sparse factor"
-        if flops < np.inf
-        else "no order would keep a factor sparse"
-    )
-    if asked or flops <= _LARGEST_NEWTON_FLOPS:
-        run_sparse = partial(_run_sparse, prediction=prediction)
+    predict = cache(partial(predict_factor, graph))
+
+    def flops() -> float:
+        return predict().flops * graph.dimension**3
+
+    if prefers_dense_factor(graph, flops):
+        unknowns = graph.num_nodes * graph.dimension
+        reason = f"{unknowns} unknowns{': dense' if unknowns <= FEW_UNKNOWNS else ', dense graph'}"
+        return Choice("newton", _run_dense, "asked for" if asked else reason)
+    predicted = "no order would keep a factor sparse"
+    if flops() < np.inf:
+        predicted = f"{flops() / 1e9:.2g} Gflop for a sparse factor"
+    if asked or flops() <= _LARGEST_NEWTON_FLOPS:
+        run_sparse = partial(_run_sparse, prediction=predict())
         return Choice("newton", run_sparse, "asked for" if asked else predicted)
-    return Choice("admm", partial(_run_admm, prediction=prediction), f"{predicted}: splitting is faster")
+    return Choice("admm", partial(_run_admm, prediction=predict()), f"{predicted}: splitting is faster")
 
 
 def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
@@ -237,7 +232,7 @@ def _run_admm(
         prediction=prediction,
         on_iteration=watch,
     )
-    note = "" if found.finish is Finish.CERTIFIED else found.finish.value
+    note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
     return Run(found.locations, found.certificate.dual, found.iterations, note)
 
 

@@ -384,15 +384,12 @@ def test_a_direction_counts_in_its_own_metric():
     np.testing.assert_allclose(none_known.locations, unknown.locations, atol=1e-6)
 
 
-def test_origin_scale_and_axes_of_the_start_do_not_matter():
+def test_origin_and_scale_of_the_start_do_not_matter():
     problem = random_graph_problem(30, 0.6, sigma=0.01, q=0.1, seed=10)
     graph, start = problem.view_graph, shaken(problem, 0.05)
     plain = refined(graph, start)
     moved = refined(graph, 1e4 * start + [300.0, -20.0, 7.0])
     np.testing.assert_allclose(moved.locations, plain.locations, atol=1e-7)
-    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((3, 3)))[0]
-    turned = refined(ViewGraph(30, graph.edges, graph.directions @ turn), start @ turn)
-    np.testing.assert_allclose(turned.locations, plain.locations @ turn, atol=1e-7)
     assert np.linalg.norm(plain.locations) == pytest.approx(1.0)
     np.testing.assert_allclose(plain.locations.mean(axis=0), 0.0, atol=1e-15)
 

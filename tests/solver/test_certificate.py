@@ -17,7 +17,7 @@ from sfm_shapefit.solver.program import across, adjoint, differences, objective,
 from sfm_shapefit.solver.splitting import Stop, solve_admm
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
-from sfm_shapefit.solver.splitting.split_then_newton import Finish, HybridResult, solve_hybrid
+from sfm_shapefit.solver.splitting.split_then_newton import HybridResult, HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
 from tests.problems import exact_graph, measure_graph
@@ -290,9 +290,9 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
 
 def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
     graph = draw_family("geo", 300, 16)
-    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
-    used, new = IterativeSolver(neighbours), IterativeSolver(neighbours)
+    used, new = IterativeSolver(neighbors), IterativeSolver(neighbors)
     used.refactor(graph.weights)
     for solver in (used, new):
         solver.refactor(weights)
@@ -316,30 +316,30 @@ def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma)
 def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     graph = draw_family(family, 400, degree, sigma=sigma)
     result = solve_hybrid(graph, 1e-8, 2000)
-    assert result.finish in (Finish.CERTIFIED, Finish.NEWTON)
+    assert result.stop in (HybridStop.CERTIFIED, HybridStop.NEWTON)
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
 def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
     graph = draw_family("seq", 300, 36, q=0.1)
     result = solve_hybrid(graph, 1e-8, 2000)
-    assert result.finish is Finish.NEWTON
-    assert result.factorisations > 0
+    assert result.stop is HybridStop.NEWTON
+    assert result.factorizations > 0
     assert result.certificate.gap <= 1e-8
-    assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).finish is Finish.TOO_LARGE
+    assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).stop is HybridStop.TOO_LARGE
     flops = laplacian_factor(graph).symbolic.flops  # of one scalar factor; blocks of 3 take 27 times as many
     monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 20.0 * flops)
-    assert solve_hybrid(graph, 1e-8, 2000).finish is Finish.TOO_LARGE
+    assert solve_hybrid(graph, 1e-8, 2000).stop is HybridStop.TOO_LARGE
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
     graph = draw_family("geo", 300, 24)
     limited = solve_hybrid(graph, 1e-8, 12)
-    assert limited.finish is Finish.MAX_ITERATIONS
+    assert limited.stop is HybridStop.MAX_ITERATIONS
     assert limited.iterations == 12
     assert_feasible(graph, limited.certificate)
     cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < 20)
-    assert cancelled.finish is Finish.CANCELLED
+    assert cancelled.stop is HybridStop.CANCELLED
     assert cancelled.iterations == 20
 
 
@@ -355,7 +355,7 @@ def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatc
     monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=2e-8))
     result = hybrid._split(SimpleNamespace(run=run), None, None, 1e-8, 2000, 1, None)
     np.testing.assert_allclose(asked, [0.3e-8, 0.3e-9, 0.3e-10, 0.3e-11], rtol=1e-12)
-    assert result.finish is Finish.INACCURATE
+    assert result.stop is HybridStop.INACCURATE
 
 
 def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_given_up(monkeypatch):
@@ -372,16 +372,16 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
 @pytest.mark.parametrize(
     ("gaps", "cheap", "stops", "begins", "finish"),
     [
-        ((1e-9,), True, False, ["there"], Finish.NEWTON),
-        ((1e-3, 1e-9), True, False, ["there", "anew"], Finish.NEWTON),
-        ((1e-3, 1e-4), True, False, ["there", "anew"], Finish.INACCURATE),
-        ((1e-3,), False, False, ["there"], Finish.INACCURATE),
-        ((1e-3,), True, True, ["there"], Finish.CANCELLED),
-        ((1e-9,), True, True, ["there"], Finish.NEWTON),
+        ((1e-9,), True, False, ["there"], HybridStop.NEWTON),
+        ((1e-3, 1e-9), True, False, ["there", "anew"], HybridStop.NEWTON),
+        ((1e-3, 1e-4), True, False, ["there", "anew"], HybridStop.INACCURATE),
+        ((1e-3,), False, False, ["there"], HybridStop.INACCURATE),
+        ((1e-3,), True, True, ["there"], HybridStop.CANCELLED),
+        ((1e-9,), True, True, ["there"], HybridStop.NEWTON),
     ],
 )
 def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
-    gaps, cheap, stops, begins, finish, monkeypatch
+    gaps, cheap, stops, begins, stop, monkeypatch
 ):
     graph = draw_family("geo", 60, 12)
     factor = laplacian_factor(graph)
@@ -405,17 +405,17 @@ def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
         locations=None,
         certificate=SimpleNamespace(gap=1e-2, dual=None),
         iterations=40,
-        factorisations=0,
-        finish=Finish.INACCURATE,
+        factorizations=0,
+        stop=HybridStop.INACCURATE,
     )
     result = hybrid._newton(
         graph, factor, split, 1e-8, 10**9, lambda info: seen.append(info) or (False if stops else None)
     )
     monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 26.9 * factor.symbolic.flops)
-    assert hybrid._newton(graph, factor, split, 1e-8, 10**9, None).finish is Finish.TOO_LARGE
+    assert hybrid._newton(graph, factor, split, 1e-8, 10**9, None).stop is HybridStop.TOO_LARGE
     assert begun == begins
-    assert result.finish is finish
-    assert result.factorisations == 10 * len(begins)
+    assert result.stop is stop
+    assert result.factorizations == 10 * len(begins)
     assert [(i.iteration, i.objective, i.dual_bound) for i in seen] == [(43, 0.5, 0.25)] * len(begins)
 
 
@@ -436,7 +436,6 @@ def test_uniqueness_is_judged_alike_by_a_dense_and_by_a_sparse_factor(n, slides,
         t = np.vstack([t, t[0] - [0.0, 0.0, 1.0]])
     dual = np.zeros(graph.directions.shape)
     by_dense = certify(graph, t, dual, uniqueness=True).unique
-    monkeypatch.setattr(certificate, "_SMALL", 0)
-    monkeypatch.setattr(certificate, "_LARGEST_DENSE", 0)
+    monkeypatch.setattr(certificate, "prefers_dense_factor", lambda *_: False)
     assert certify(graph, t, dual, uniqueness=True).unique is by_dense
     assert by_dense is not slides

@@ -284,6 +284,31 @@ def test_what_is_not_certified_is_not_called_converged(monkeypatch):
     assert solve_groups(graph, groups).status is Status.INACCURATE
 
 
+def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
+    graph, groups, _ = rig_problem(6, noise=0.02)
+    result = solve_groups(graph, groups)
+    conic = solve_groups(graph, groups, SolverOptions(solver="conic"))
+    assert (result.method, conic.method) == ("newton", "conic")
+    assert conic.objective == pytest.approx(result.objective, abs=2e-8)
+    for other in (SolverOptions(threads=2), SolverOptions(solver="newton")):
+        np.testing.assert_array_equal(solve_groups(graph, groups, other).locations, result.locations)
+    with pytest.raises(InputError, match="'admm' does not know rigs"):
+        solve_groups(graph, groups, SolverOptions(solver="admm"))
+    with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
+        ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)
+
+
+def test_iterations_over_groups_are_reported_and_may_be_cancelled():
+    graph, groups, _ = rig_problem(6, noise=0.02)
+    seen = []
+    whole = solve_groups(graph, groups, on_iteration=seen.append)
+    assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
+    assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
+    assert {info.limit for info in seen} == {100}
+    early = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
+    assert (early.status, early.iterations) == (Status.CANCELLED, 2)
+
+
 def test_the_same_problem_gives_the_same_bits():
     graph, groups, _ = rig_problem(8, noise=0.02)
     first, second = solve_groups(graph, groups), solve_groups(graph, groups)

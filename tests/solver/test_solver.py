@@ -1,4 +1,4 @@
-"""ShapeFit solved and certified: exactness, invariances, optimality, and refusals."""
+"""ShapeFit solved and certified: exactness, optimality, and refusals."""
 
 import importlib
 from types import SimpleNamespace
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import (
     across,
@@ -21,8 +22,8 @@ from sfm_shapefit.solver.program import (
     projected_length,
     scale_functional,
 )
-from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting.split_then_newton import Finish
+from sfm_shapefit.solver.solve import choose_method, solve
+from sfm_shapefit.solver.splitting.split_then_newton import HybridStop
 from sfm_shapefit.synthetic import box_graph_problem, expander_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import shape
@@ -145,53 +146,6 @@ def test_stationarity_holds_edge_by_edge():
     assert slack.max() <= 1e-9 * graph.num_edges
 
 
-def test_turning_the_world_turns_the_answer():
-    graph, _ = problem(4, sigma=0.05)
-    rotation = np.linalg.qr(np.random.default_rng(4).standard_normal((3, 3)))[0]
-    turned = solve(ViewGraph(graph.num_nodes, graph.edges, graph.directions @ rotation.T))
-    # The optimum is unique; a gap of 1e-8 leaves about the square root of it.
-    np.testing.assert_allclose(shape(turned.locations), shape(solve(graph).locations) @ rotation.T, atol=1e-5)
-
-
-def test_relabelling_cameras_relabels_the_answer():
-    graph, _ = problem(5, sigma=0.05)
-    order = np.random.default_rng(5).permutation(graph.num_nodes)
-    relabelled = solve(ViewGraph(graph.num_nodes, order[graph.edges], graph.directions))
-    np.testing.assert_allclose(shape(relabelled.locations)[order], shape(solve(graph).locations), atol=1e-5)
-
-
-def test_reversing_an_edge_and_its_direction_changes_nothing():
-    graph, _ = problem(6, sigma=0.05)
-    flip = np.random.default_rng(6).random(graph.num_edges) < 0.5
-    edges = np.where(flip[:, None], graph.edges[:, ::-1], graph.edges)
-    directions = np.where(flip[:, None], -graph.directions, graph.directions)
-    reversed_result = solve(ViewGraph(graph.num_nodes, edges, directions))
-    assert reversed_result.objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
-    np.testing.assert_allclose(shape(reversed_result.locations), shape(solve(graph).locations), atol=1e-5)
-
-
-def test_weight_two_is_a_pair_given_twice():
-    graph, _ = problem(7, sigma=0.05)
-    weights = np.where(np.arange(graph.num_edges) % 3 == 0, 2.0, 1.0)
-    weighted = solve(ViewGraph(graph.num_nodes, graph.edges, graph.directions, weights))
-    again = np.flatnonzero(weights == 2.0)
-    doubled = solve(
-        ViewGraph(
-            graph.num_nodes,
-            np.concatenate([graph.edges, graph.edges[again]]),
-            np.concatenate([graph.directions, graph.directions[again]]),
-        )
-    )
-    assert weighted.objective == pytest.approx(doubled.objective, abs=2 * TOL)
-    assert abs(weighted.objective - solve(graph).objective) > 1e-4  # weights matter at all
-
-
-def test_scaling_all_weights_changes_nothing():
-    graph, _ = problem(8, sigma=0.05)
-    scaled = ViewGraph(graph.num_nodes, graph.edges, graph.directions, np.full(graph.num_edges, 1e4))
-    assert solve(scaled).objective == pytest.approx(solve(graph).objective, abs=2 * TOL)
-
-
 def test_some_flipped_directions_do_no_harm_and_all_flipped_turn_the_answer_around():
     t, edges, v = tetrahedron()
     one_flipped = v * np.where(np.arange(6) == 2, -1.0, 1.0)[:, None]
@@ -295,91 +249,55 @@ def test_auto_says_what_it_chose_and_why():
     assert solve(box(60), SolverOptions(solver="admm", tol=1e-3)).method_reason == "asked for"
 
 
-def test_the_choice_follows_size_and_predicted_fill(monkeypatch):
-    from sfm_shapefit.solver import solve as module
-
-    def chosen(graph, method="auto"):
-        choice = module.choose_method(graph, SolverOptions(solver=method))
-        run = getattr(choice.run, "func", choice.run)
-        return choice.method, run.__name__, choice.reason, getattr(choice.run, "keywords", {})
-
-    sparse, clique = box(300), problem(1, n=160, p=0.5)[0]
-    assert chosen(problem(15)[0])[:3] == ("newton", "_run_dense", "60 unknowns: dense")
-    assert chosen(clique)[:3] == ("newton", "_run_dense", "480 unknowns, dense graph")
-    assert chosen(sparse)[:2] == ("newton", "_run_sparse")
-    assert chosen(sparse, "newton")[:3] == ("newton", "_run_sparse", "asked for")
-    assert chosen(sparse, "conic")[:3] == ("conic", "_run_conic", "asked for")
-    assert chosen(sparse, "admm")[:3] == ("admm", "_run_admm", "asked for")
-    prediction = chosen(sparse)[3]["prediction"]
-    flops = prediction.flops * 27
-    assert chosen(sparse)[2] == f"{flops / 1e9:.2g} Gflop for a sparse factor"
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, "_LARGEST_DENSE", 470)  # a larger graph is predicted, dense or not
-        assert chosen(clique)[3]["prediction"].flops > 0
-
-    monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", 0.99 * flops)
-    assert chosen(sparse)[:2] == ("admm", "_run_admm")
-    assert "splitting is faster" in chosen(sparse)[2]
-    assert chosen(sparse, "newton")[:2] == ("newton", "_run_sparse")
-    monkeypatch.setattr(module, "_LARGEST_NEWTON_FLOPS", flops)
-    assert chosen(sparse)[:2] == ("newton", "_run_sparse")
-
-    seen = []
-
-    def solved(*_, tree):
-        seen.append(tree)
-        return None, None, 0
-
-    monkeypatch.setattr(module, "solve_newton_sparse", solved)
-    module._run_sparse(sparse, SolverOptions(), 1, None, prediction)
-    module._run_sparse(sparse, SolverOptions(), 1, None)
-    assert seen == [prediction.tree, None]
+@pytest.mark.parametrize(
+    ("n", "share", "flops", "dense"),
+    [
+        (100, 0.05, 1.0, True),
+        (150, 0.05, 1.0, True),
+        (151, 0.05, 453**3 / 12 - 1, False),
+        (151, 0.29, 453**3 / 12 + 1, True),
+        (151, 0.3, 1.0, True),
+        (600, 0.3, 1.0, True),
+        (601, 0.3, np.inf, False),
+    ],
+)
+def test_small_and_dense_graphs_and_those_that_would_fill_in_have_a_dense_factor(n, share, flops, dense):
+    graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=int(np.ceil(share * n * (n - 1) / 2)))
+    assert prefers_dense_factor(graph, lambda: flops) is dense
 
 
 @pytest.mark.parametrize(
-    ("method", "n", "share", "flops", "run", "reason"),
+    ("method", "n", "flops", "chosen", "reason"),
     [
-        ("auto", 150, 0.05, 1.0, "_run_dense", "450 unknowns: dense"),
-        ("auto", 100, 0.05, 1.0, "_run_dense", "300 unknowns: dense"),
-        ("auto", 151, 0.3, 1.0, "_run_dense", "453 unknowns, dense graph"),
-        ("auto", 151, 0.29, 453**3 / 12 / 27 - 1, "_run_sparse", "0.0077 Gflop for a sparse factor"),
-        ("auto", 151, 0.29, 453**3 / 12 / 27 + 1, "_run_dense", "453 unknowns, dense graph"),
-        ("auto", 600, 0.3, 1.0, "_run_dense", "1800 unknowns, dense graph"),
-        ("auto", 601, 1.0, 1e8, "_run_sparse", "2.7 Gflop for a sparse factor"),
-        ("auto", 601, 0.1, 2e8, "_run_admm", "5.4 Gflop for a sparse factor: splitting is faster"),
-        ("auto", 601, 0.1, np.inf, "_run_admm", "no order would keep a factor sparse: splitting is faster"),
-        ("newton", 601, 0.1, np.inf, "_run_sparse", "asked for"),
-        ("newton", 100, 0.1, 1.0, "_run_dense", "asked for"),
-        ("newton", 151, 0.3, 1.0, "_run_dense", "asked for"),
-        ("admm", 100, 0.1, 1.0, "_run_admm", "asked for"),
-        ("conic", 100, 0.1, 1.0, "_run_conic", "asked for"),
+        ("auto", 150, 1.0, "newton", "450 unknowns: dense"),
+        ("auto", 151, 453**3 / 12 / 27 + 1, "newton", "453 unknowns, dense graph"),
+        ("auto", 151, 453**3 / 12 / 27 - 1, "newton", "0.0077 Gflop for a sparse factor"),
+        ("auto", 601, 4e9 / 27, "newton", "4 Gflop for a sparse factor"),
+        ("auto", 601, 2e8, "admm", "5.4 Gflop for a sparse factor: splitting is faster"),
+        ("auto", 601, np.inf, "admm", "no order would keep a factor sparse: splitting is faster"),
+        ("newton", 601, np.inf, "newton", "asked for"),
+        ("newton", 100, 1.0, "newton", "asked for"),
+        ("admm", 100, 1.0, "admm", "asked for"),
+        ("conic", 100, 1.0, "conic", "asked for"),
     ],
 )
-def test_the_table_of_choices(method, n, share, flops, run, reason, monkeypatch):
-    pairs = int(np.ceil(share * n * (n - 1) / 2))
-    graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=pairs)
+def test_the_table_of_choices(method, n, flops, chosen, reason, monkeypatch):
+    graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=n * (n - 1) // 20)
     monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops))
-    choice = solving.choose_method(graph, SolverOptions(solver=method))
-    assert getattr(choice.run, "func", choice.run).__name__ == run
-    assert choice.method == {"_run_admm": "admm", "_run_conic": "conic"}.get(run, "newton")
-    assert choice.reason == reason
+    choice = choose_method(graph, SolverOptions(solver=method))
+    assert (choice.method, choice.reason) == (chosen, reason)
 
 
-def test_the_splitting_is_given_the_options_in_bytes_and_says_how_it_ended(monkeypatch):
-    graph, options, seen = problem(1)[0], SolverOptions(tol=1e-5, factor_memory_mb=3, threads=2), {}
-
-    def solved(*arguments, **named):
-        seen.update(named, arguments=arguments)
-        certificate = SimpleNamespace(dual="dual")
-        return SimpleNamespace(locations="t", certificate=certificate, iterations=7, finish=seen["finish"])
-
-    monkeypatch.setattr(solving, "solve_hybrid", solved)
-    for finish, note in ((Finish.CERTIFIED, ""), (Finish.TOO_LARGE, Finish.TOO_LARGE.value)):
-        seen["finish"] = finish
-        assert solving._run_admm(graph, options, 9, None) == ("t", "dual", 7, note)
-    assert seen["arguments"] == (graph, 1e-5, 9)
-    assert (seen["memory_bytes"], seen["threads"]) == (3_000_000, 2)
+def test_a_factor_that_does_not_fit_is_replaced_and_the_answer_says_how_it_ended():
+    graph = box(1200)
+    within, beyond = (
+        solve(graph, SolverOptions(solver="admm", tol=1e-4, factor_memory_mb=memory)) for memory in (2000, 1)
+    )
+    assert not np.array_equal(within.locations, beyond.locations)  # iterations in place of the factor
+    assert within.objective == pytest.approx(beyond.objective, abs=2e-4)
+    assert within.method_reason == "asked for"
+    short = solve(graph, SolverOptions(solver="admm", max_iterations=2))
+    assert short.method_reason == f"asked for; {HybridStop.MAX_ITERATIONS.value}"
 
 
 def test_auto_leaves_newton_where_its_factor_would_explode(monkeypatch):
@@ -431,9 +349,6 @@ def test_threads_and_repetitions_change_no_bit(method):
 def test_uniqueness_is_certified_where_it_holds_and_not_where_it_does_not():
     assert solve(problem(16)[0]).unique is True
     assert solve(problem(16)[0], SolverOptions(uniqueness=False)).unique is None
-
-
-def test_a_tie_is_not_called_unique():
     # Four fixed cameras in the plane; the fifth is seen on x = 0, x = 1, y = 0 and on y = 1, which costs
     # the same anywhere in the unit square, and its terms of the scale constraint cancel.
     fixed = np.array([[0.0, -3.0], [1.0, 4.0], [-3.0, 0.0], [4.0, 1.0]])
@@ -442,8 +357,17 @@ def test_a_tie_is_not_called_unique():
     tied = np.array([[0.0, 1.0], [0.0, -1.0], [1.0, 0.0], [-1.0, 0.0]])
     directions = np.vstack([exact / np.linalg.norm(exact, axis=1, keepdims=True), tied])
     result = solve(ViewGraph(5, edges, directions, [100.0] * 6 + [1.0] * 4))
-    assert result.status is Status.CONVERGED
+    assert result.converged
     assert result.unique is False
+
+
+def test_a_result_is_one_line_that_says_whether_it_converged():
+    graph = problem(13, sigma=0.05)[0]
+    whole, short = solve(graph), solve(graph, SolverOptions(max_iterations=3))
+    assert (whole.converged, short.converged) == (True, False)
+    assert repr(whole).startswith("SolverResult(20 nodes in 3 dimensions, converged: objective 0.")
+    assert "max_iterations" in repr(short)
+    assert len(repr(short)) < 150
 
 
 @pytest.mark.parametrize(

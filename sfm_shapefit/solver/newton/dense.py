@@ -18,19 +18,19 @@ from sfm_shapefit.solver.newton.steps import (
     allocate,
     allowed_violation,
     answer,
-    closed,
+    close_cycle,
     dot,
     extend_step,
     is_cancelled,
-    linearise,
-    measured,
+    linearize,
+    measure_from_python,
     pays,
     scalars,
     set_gradient,
     set_residuals,
     smoothing,
     start_from,
-    take,
+    take_step,
 )
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.viewgraph import ViewGraph
@@ -40,11 +40,14 @@ _RIDGES = {4: (1e-8, 1e-8), 8: (1e-14, 1e-9)}
 _REFINEMENTS = {4: 8, 8: REFINEMENTS}
 """By bytes per number: in single precision each gains a digit or more, or M is too ill-conditioned."""
 _PATIENCE = {4: 3, 8: STALL}
-"""By bytes per number: factorisations without progress after which it is given up."""
-_SINGLE_FROM = 450  # unknowns from which a factor in single precision saves more than its refinements cost
-_EDGE_WORK = 1000.0  # a step passes over one edge in the time of so many operations of a dense factorisation
-_SOLVE_WORK = 10.0  # so many operations per entry of the matrix, in the same unit
-_OPERATIONS_PER_CALL = 4e9  # about 0.1 s: how long an interrupt may have to wait
+"""By bytes per number: factorizations without progress after which it is given up."""
+# From so many unknowns on a factor in single precision saves more than its refinements cost.
+_SINGLE_FROM = 450
+# A step passes over one edge, and over one entry of the matrix, in the time of so many operations of a dense
+# factorization.
+_EDGE_WORK, _SOLVE_WORK = 1000.0, 10.0
+# One call takes about 0.1 s: so long an interrupt may have to wait.
+_OPERATIONS_PER_CALL = 4e9
 
 
 class DenseFactor(NamedTuple):
@@ -64,7 +67,7 @@ class DenseFactor(NamedTuple):
     refinements: int
     """After which a step must fulfil its equations, or is not taken."""
     patience: int
-    """Factorisations without progress after which more of this precision will not help."""
+    """Factorizations without progress after which more of this precision will not help."""
 
 
 def solve_newton_dense(
@@ -75,29 +78,29 @@ def solve_newton_dense(
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
         tol: the gap wanted, in units of the objective.
-        max_iterations: limit of factorisations.
-        on_iteration: called after every factorisation and its steps.
+        max_iterations: limit of factorizations.
+        on_iteration: called after every factorization and its steps.
 
     Returns:
-        locations (n, d), the dual (m, d), and the number of factorisations.
+        locations (n, d), the dual (m, d), and the number of factorizations.
 
     Raises:
         UnsolvableError: if the directions do not determine any locations.
     """
-    problem, iterate, model, step = allocate(graph)
+    problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
     factor = _allocate_factor(n, d, np.float32 if single else np.float64)
     with one_blas_thread():
-        if not (approach(problem, iterate, step) or _start(problem, iterate, model, factor)):
+        if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measured(problem, iterate)
+        progress = measure_from_python(problem, iterate)
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
             limit = min(chunk, max_iterations - count)
             done, stalled, after = _newton(
-                problem, iterate, model, factor, step, progress, tol, limit, stalled
+                problem, iterate, linearization, factor, step, progress, tol, limit, stalled
             )
             progress = Progress(*after)
             count += done
@@ -127,7 +130,7 @@ def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFact
 def _newton(
     problem: Any,
     iterate: Any,
-    model: Any,
+    linearization: Any,
     factor: Any,
     step: Any,
     progress: Any,
@@ -140,7 +143,7 @@ def _newton(
     while count < limit and progress.gap > tol and stalled < factor.patience:
         before = progress.gap
         count += 1
-        progress = _cycle(problem, iterate, model, factor, step, progress, tol)
+        progress = _cycle(problem, iterate, linearization, factor, step, progress, tol)
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
         if progress.gap == before and factor.right.itemsize == 4:
             stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
@@ -149,56 +152,56 @@ def _newton(
 
 @kernel(inline=True)
 def _cycle(
-    problem: Any, iterate: Any, model: Any, factor: Any, step: Any, progress: Any, tol: float
+    problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, progress: Any, tol: float
 ) -> Progress:
     """Factor once, then step with that factor while it pays."""
     first = progress.gap
     mu = smoothing(progress, progress.mu)
     set_residuals(problem, iterate.t, iterate.r)
-    linearise(problem, iterate, mu, model)
-    if _factorise(problem, model, factor) != 0:
-        return closed(iterate, progress, mu, first)
+    linearize(problem, iterate, mu, linearization)
+    if _factorize(problem, linearization, factor) != 0:
+        return close_cycle(iterate, progress, mu, first)
     order = float(problem.c.size)
     step_work = _EDGE_WORK * len(problem.w) + _SOLVE_WORK * order**2
     work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = smoothing(progress, mu)
-        target, exact = _propose(problem, iterate, model, factor, step, mu, previous)
+        target, exact = _propose(problem, iterate, linearization, factor, step, mu, previous)
         if not exact:
             break
-        progress = take(problem, iterate, step, mu, progress, target)
+        progress = take_step(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return closed(iterate, progress, progress.mu, first)
+    return close_cycle(iterate, progress, progress.mu, first)
 
 
 @kernel()
-def _start(problem: Any, iterate: Any, model: Any, factor: Any) -> bool:
+def _start(problem: Any, iterate: Any, linearization: Any, factor: Any) -> bool:
     """Factor the projected Laplacian D^T W P D, which is M at rho = 1, y = r = 0, and start from it."""
-    if _factorise(problem, model, factor) != 0:
+    if _factorize(problem, linearization, factor) != 0:
         return False
-    return start_from(problem, model.a, iterate)
+    return start_from(problem, linearization.a, iterate)
 
 
 @kernel(inline=True)
-def _factorise(problem: Any, model: Any, factor: Any) -> int:
+def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if it worked."""
     order = problem.c.size
     size = 0.0  # mean eigenvalue
     for e in range(len(problem.w)):
-        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] * model.inverse[e] / order
+        size += 2.0 * (len(problem.axes) - 1) * problem.w[e] * linearization.inverse[e] / order
     ridge, last = factor.ridge
     info = 1
     while info != 0 and ridge <= last:
         _lift(problem, factor, size, ridge * size)
-        _add_edge_blocks(problem, model, factor)
+        _add_edge_blocks(problem, linearization, factor)
         info = potrf(factor.blas, (factor.matrix, 0, order), order)
         ridge *= 100.0
-    model.a[:] = problem.c
+    linearization.a[:] = problem.c
     if info == 0:
-        _solve(factor, model.a)
+        _solve(factor, linearization.a)
     return info
 
 
@@ -220,9 +223,9 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
 
 
 @kernel(inline=True)
-def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
+def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
     """Add D^T S D to the lower triangle of the matrix."""
-    edges, basis, s = problem.edges, problem.basis, model.s
+    edges, basis, s = problem.edges, problem.basis, linearization.s
     matrix, diagonal, half = factor.matrix, factor.diagonal, factor.half
     n, d = len(problem.c), len(problem.axes)
     order = n * d
@@ -254,19 +257,19 @@ def _add_edge_blocks(problem: Any, model: Any, factor: Any) -> None:
 
 @kernel(inline=True)
 def _propose(
-    problem: Any, iterate: Any, model: Any, factor: Any, step: Any, mu: float, gap: float
+    problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until D^T y+ = lambda+ c.
 
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
-    c, a, nodes = problem.c, model.a, step.nodes
+    c, a, nodes = problem.c, linearization.a, step.nodes
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
-    set_gradient(problem, iterate, model, mu, step)
+    set_gradient(problem, iterate, linearization, mu, step)
     _solve(factor, nodes)
     multiplier = dot(c, nodes) / scale
-    extend_step(problem, model, multiplier * a - nodes, step)
+    extend_step(problem, linearization, multiplier * a - nodes, step)
     for _ in range(factor.refinements):
         nodes[:] = multiplier * c - nodes
         if np.max(np.abs(nodes)) <= allowed:
@@ -274,7 +277,7 @@ def _propose(
         _solve(factor, nodes)
         shift = dot(c, nodes) / scale
         multiplier -= shift
-        extend_step(problem, model, nodes - shift * a, step)
+        extend_step(problem, linearization, nodes - shift * a, step)
     return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
 
 

@@ -8,7 +8,7 @@ residuals of the one before,
 where R is the mean residual and eps shrinks. The constraint is kept by projecting the gradient along the
 preconditioner, the weighted degrees of the cameras. On a graph without bottlenecks the gradients
 converge at a rate that does not depend on n: twenty passes over the edges lead nearer to the optimum than the
-factorisation of M for the plain least-squares locations and a Newton cycle from there. On the graphs of most
+factorization of M for the plain least-squares locations and a Newton cycle from there. On the graphs of most
 real scenes they do not converge, or nearly exact data make the least-squares locations the better start; both
 show in what the first steps leave of the energy.
 
@@ -23,10 +23,14 @@ import numpy as np
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.solver.newton.steps import LEAST_MU, MU_PER_GAP, dot, measure, set_residuals
 
-_FIRST_STEPS, _STEPS = 4, 2  # of conjugate gradients: for plain least squares, and for each reweighted one
-_ROUNDS = 7  # of reweighting; with half of them Newton needs a factorisation more, twice gain nothing
-_EPS, _SHRINK = 0.5, 0.7  # smoothing of the first weights, per mean residual; its factor per round
-_LEFT = 3e-3  # share of the energy that the first steps may leave; dense random graphs 1e-3, real ones 5e-2
+# Conjugate gradient steps for plain least squares, and for each reweighted problem.
+_FIRST_STEPS, _STEPS = 4, 2
+# Rounds of reweighting: with half of them Newton needs a factorization more, and twice as many gain nothing.
+_ROUNDS = 7
+# The smoothing of the first weights, per mean residual, and its factor per round.
+_EPS, _SHRINK = 0.5, 0.7
+# The first steps may leave this share of the energy; dense random graphs leave 1e-3, real ones 5e-2.
+_LEFT = 3e-3
 
 
 @kernel()

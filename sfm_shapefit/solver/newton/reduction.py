@@ -26,7 +26,7 @@ class Reduction(Protocol):
 
     @property
     def factor(self) -> CholeskyFactor:
-        """The sparse factor behind it, which says what a factorisation and a solve cost."""
+        """The sparse factor behind it, which says what a factorization and a solve cost."""
 
     @property
     def num_nodes(self) -> int:

@@ -26,31 +26,32 @@ from sfm_shapefit.solver.newton.steps import (
     STALL,
     STEPS_PER_FACTOR,
     Iterate,
-    Model,
+    Linearization,
     Problem,
     Progress,
     Step,
     allocate,
     allowed_violation,
     answer,
+    close_cycle_from_python,
     dot,
-    ended,
     extend_step,
     is_cancelled,
-    linearise,
-    measured,
+    linearize,
+    measure_from_python,
     pays,
     set_gradient,
     set_residuals,
     smoothing,
     start_from,
-    taken,
+    take_step_from_python,
 )
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
 
-_RIDGES = 0.0, 1e-12, 1e-10  # tried in turn, per stiffness of the edge
+# Added to the blocks in turn until the matrix is positive definite, per stiffness of the edge.
+_RIDGES = 0.0, 1e-12, 1e-10
 
 
 def solve_newton_sparse(
@@ -68,22 +69,22 @@ def solve_newton_sparse(
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
         tol: the gap wanted, in units of the objective.
-        max_iterations: limit of factorisations.
-        on_iteration: called after every factorisation and its steps.
+        max_iterations: limit of factorizations.
+        on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
-            steps then begin with the smoothing that their gap allows. The closer, the fewer factorisations.
-        plan: of the factorisation of the graph's Laplacian, if it is there already.
+            steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
+        plan: of the factorization of the graph's Laplacian, if it is there already.
         tree: or at least its order of elimination.
 
     Returns:
-        locations (n, d), the dual (m, d), and the number of factorisations.
+        locations (n, d), the dual (m, d), and the number of factorizations.
 
     Raises:
         UnsolvableError: if the directions do not determine any locations.
     """
     if plan is None:
-        neighbours = adjacency(graph.num_nodes, graph.edges)
-        plan = plan_factorisation(neighbours, graph.edges, tree or best_order(neighbours))
+        neighbors = adjacency(graph.num_nodes, graph.edges)
+        plan = plan_factorisation(neighbors, graph.edges, tree or best_order(neighbors))
     nodes = NodeUnknowns(allocate_factor(plan, graph.dimension))
     return solve_newton_reduced(graph, nodes, tol, max_iterations, on_iteration, start)
 
@@ -103,19 +104,19 @@ def solve_newton_reduced(
         reduction: of its locations, with memory for the factor.
         tol, max_iterations, on_iteration, start: as in `solve_newton_sparse`.
     """
-    problem, iterate, model, step = allocate(graph)
+    problem, iterate, linearization, step = allocate(graph)
     if start is None:
-        system = _factorise(problem, model, reduction, int(np.argmax(problem.w)))
+        system = _factorize(problem, linearization, reduction, int(np.argmax(problem.w)))
         first = None if system is None else system.solve(0.0 * reduction.reduce(problem.c), 1.0)[1]
         if first is None or not start_from(problem, reduction.expand(first), iterate):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measured(problem, iterate)
+        progress = measure_from_python(problem, iterate)
     else:
         progress = _begin_at(problem, *start, iterate)
     count, stalled = 0, 0
     while progress.gap > tol and count < max_iterations and stalled < STALL:
         before = progress.gap
-        progress = _cycle(problem, iterate, model, reduction, step, progress, tol)
+        progress = _cycle(problem, iterate, linearization, reduction, step, progress, tol)
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
         count += 1
         if is_cancelled(on_iteration, count, progress):
@@ -129,13 +130,13 @@ def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate
     iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
     set_residuals(problem, iterate.t, iterate.r)
     iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
-    return measured(problem, iterate)
+    return measure_from_python(problem, iterate)
 
 
 def _cycle(
     problem: Problem,
     iterate: Iterate,
-    model: Model,
+    linearization: Linearization,
     reduction: Reduction,
     step: Step,
     progress: Progress,
@@ -145,30 +146,36 @@ def _cycle(
     first = progress.gap
     mu = smoothing(progress, progress.mu)
     set_residuals(problem, iterate.t, iterate.r)
-    linearise(problem, iterate, mu, model)
+    linearize(problem, iterate, mu, linearization)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
-    system = _factorise(problem, model, reduction, longest)
+    system = _factorize(problem, linearization, reduction, longest)
     if system is None:
-        return ended(iterate, progress, mu, first)
+        return close_cycle_from_python(iterate, progress, mu, first)
     factor, edge_work = reduction.factor, EDGE_WORK * len(problem.w)
     step_work = edge_work + SOLVE_WORK * factor.panels.size
     work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
     for _ in range(STEPS_PER_FACTOR):
         previous = progress.gap
         mu = smoothing(progress, mu)
-        target, exact = _propose(problem, iterate, model, system, step, mu, previous)
+        target, exact = _propose(problem, iterate, linearization, system, step, mu, previous)
         if not exact:
             break
-        progress = taken(problem, iterate, step, mu, progress, target)
+        progress = take_step_from_python(problem, iterate, step, mu, progress, target)
         work += step_work
         if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
             break
-    return ended(iterate, progress, progress.mu, first)
+    return close_cycle_from_python(iterate, progress, progress.mu, first)
 
 
 def _propose(
-    problem: Problem, iterate: Iterate, model: Model, system: System, step: Step, mu: float, gap: float
+    problem: Problem,
+    iterate: Iterate,
+    linearization: Linearization,
+    system: System,
+    step: Step,
+    mu: float,
+    gap: float,
 ) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
 
@@ -178,29 +185,31 @@ def _propose(
     reduction = system.reduction
     c = reduction.reduce(problem.c)
     allowed = allowed_violation(problem, gap)
-    set_gradient(problem, iterate, model, mu, step)
+    set_gradient(problem, iterate, linearization, mu, step)
     drift = problem.kappa - dot(problem.c, iterate.t)
     multiplier, dx = system.solve(-reduction.reduce(step.nodes), drift)
-    extend_step(problem, model, reduction.expand(dx), step)
+    extend_step(problem, linearization, reduction.expand(dx), step)
     for _ in range(REFINEMENTS):
         violation = multiplier * c - reduction.reduce(step.nodes)
         if np.abs(violation).max() <= allowed:
             return multiplier, True
         shift, dx = system.solve(violation, drift - dot(problem.c, step.t))
         multiplier += shift
-        extend_step(problem, model, reduction.expand(dx), step)
+        extend_step(problem, linearization, reduction.expand(dx), step)
     return multiplier, bool(np.abs(multiplier * c - reduction.reduce(step.nodes)).max() <= allowed)
 
 
-def _factorise(problem: Problem, model: Model, reduction: Reduction, pinned: int) -> System | None:
+def _factorize(
+    problem: Problem, linearization: Linearization, reduction: Reduction, pinned: int
+) -> System | None:
     """Factor M' of the unknowns, with more ridge if it is not positive definite; None if it never is."""
     m, d = problem.v.shape
     v, (i, j) = problem.v[pinned], problem.edges[pinned].tolist()
     blocks = np.empty((m, d, d))
     c = reduction.reduce(problem.c)
-    stiffness = float(np.mean(problem.w * model.inverse))
+    stiffness = float(np.mean(problem.w * linearization.inverse))
     for ridge in _RIDGES:
-        _set_blocks(problem, model, ridge, blocks)
+        _set_blocks(problem, linearization, ridge, blocks)
         blocks[pinned] += stiffness * np.outer(v, v)
         system = factor_pinned(reduction, blocks, c, ((i, j), v), stiffness)
         if system is not None:
@@ -209,11 +218,11 @@ def _factorise(problem: Problem, model: Model, reduction: Reduction, pinned: int
 
 
 @kernel()
-def _set_blocks(problem: Any, model: Any, ridge: float, blocks: Any) -> None:
+def _set_blocks(problem: Any, linearization: Any, ridge: float, blocks: Any) -> None:
     """Write S_e, plus `ridge` times its stiffness times the identity."""
-    basis, s = problem.basis, model.s
+    basis, s = problem.basis, linearization.s
     for e in range(len(problem.w)):
-        stiffness = problem.w[e] * model.inverse[e]
+        stiffness = problem.w[e] * linearization.inverse[e]
         for k in range(len(problem.axes)):
             for q in range(len(problem.axes)):
                 x = ridge * stiffness if k == q else 0.0

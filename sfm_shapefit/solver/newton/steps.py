@@ -18,21 +18,29 @@ from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
-MU_PER_GAP = 0.1  # smoothing relative to the gap; .05 to .3 need the same number of factorisations
-_CLIPS_BELOW = 0.5  # a cycle that leaves more of the gap than this is the last one with a clipped dual
+# The smoothing relative to the gap; 0.05 to 0.3 need the same number of factorizations.
+MU_PER_GAP = 0.1
+# A cycle that leaves more of the gap than this is the last one with a clipped dual.
+_CLIPS_BELOW = 0.5
 STEPS_PER_FACTOR = 10
-LEAST_MU = 1e-8  # of S, not of the target: below it M is too ill-conditioned for refinement to converge
+# The least smoothing of S, not of the target: below it M is too ill-conditioned for refinement to converge.
+LEAST_MU = 1e-8
 REFINEMENTS = 3
-STALL = 6  # factorisations without progress after which more will not help
-EDGE_WORK = 500.0  # a step passes over one edge in the time of so many operations of a factorisation
-SOLVE_WORK = 5.0  # so many operations per entry of the factor, in the same unit: memory, not arithmetic
+# After so many factorizations without progress more will not help.
+STALL = 6
+# A step passes over one edge in the time of so many operations of a factorization, and over one entry of the
+# factor in that of so many: memory decides there, not arithmetic.
+EDGE_WORK, SOLVE_WORK = 500.0, 5.0
 
-_EQUALITY = 1e-3  # allowed violation of D^T y = lambda c, per squared gap and mean degree
-_LEAST_EQUALITY = 5e-13  # allowed in any case, per mean degree
-_TO_BOUNDARY = 0.99  # how far towards the surface of the ball
-_MARGIN = 0.01  # a scaled dual stays inside the ball by this fraction of its excess
+# The allowed violation of D^T y = lambda c, per mean degree: per squared gap, and in any case.
+_EQUALITY, _LEAST_EQUALITY = 1e-3, 5e-13
+# A dual moves so far towards the surface of the ball.
+_TO_BOUNDARY = 0.99
+# A scaled dual stays inside the ball by this fraction of its excess.
+_MARGIN = 0.01
 _HALVINGS = 20
-_CANCEL = 1e-12  # size of c, relative to the sum of weights, that is rounding
+# A c smaller than this, relative to the sum of weights, is rounding.
+_CANCEL = 1e-12
 
 
 class Problem(NamedTuple):
@@ -67,8 +75,8 @@ class Iterate(NamedTuple):
     """(m, d - 1) the dual of the best bound so far; it fulfils the equality too."""
 
 
-class Model(NamedTuple):
-    """The linearisation: S_e, 1 / rho_e, and a = M^-1 c."""
+class Linearization(NamedTuple):
+    """The linearization: S_e, 1 / rho_e, and a = M^-1 c."""
 
     s: FloatArray
     """(m, d - 1, d - 1), B_e^T S_e B_e."""
@@ -111,7 +119,7 @@ class Progress(NamedTuple):
     """Whether the next steps go on from the clipped dual."""
 
 
-def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
+def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Linearization, Step]:
     """Return the problem as arrays, and room for the iteration.
 
     Raises:
@@ -126,8 +134,8 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
         return np.empty((m, d - 1))
 
     basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
-    model = Model(np.empty((m, d - 1, d - 1)), np.ones(m), nodes())
-    set_up(graph.directions, graph.weights, basis, tilt, model.s)
+    linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), nodes())
+    set_up(graph.directions, graph.weights, basis, tilt, linearization.s)
     problem = Problem(
         graph.edges.astype(np.uint32),
         graph.directions,
@@ -142,7 +150,7 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Model, Step]:
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
     step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
-    return problem, Iterate(nodes(), edges(), edges(), edges()), model, step
+    return problem, Iterate(nodes(), edges(), edges(), edges()), linearization, step
 
 
 def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
@@ -239,7 +247,7 @@ def smoothing(progress: Any, mu: float) -> float:
 
 
 @kernel(inline=True)
-def closed(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
+def close_cycle(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
     """Return the scalars after a cycle that began with the gap `first`; clipping ends if it gained little."""
     clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
     if progress.clips and not clips:
@@ -264,7 +272,7 @@ def allowed_violation(problem: Any, gap: float) -> float:
 
 
 @kernel(inline=True)
-def linearise(problem: Any, iterate: Any, mu: float, model: Any) -> None:
+def linearize(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
     """Take S at the iterate."""
     y, r = iterate.y, iterate.r
     floor = max(mu, LEAST_MU)
@@ -272,17 +280,17 @@ def linearise(problem: Any, iterate: Any, mu: float, model: Any) -> None:
         rr = floor * floor
         for k in range(len(problem.transverse)):
             rr += r[e, k] * r[e, k]
-        model.inverse[e] = 1.0 / np.sqrt(rr)
+        linearization.inverse[e] = 1.0 / np.sqrt(rr)
     for e in range(len(problem.w)):
-        inverse = model.inverse[e]
+        inverse = linearization.inverse[e]
         for k in range(len(problem.transverse)):
             for q in range(len(problem.transverse)):
                 bend = 0.5 * inverse * (y[e, k] * r[e, q] + r[e, k] * y[e, q])
-                model.s[e, k, q] = inverse * ((problem.w[e] if k == q else 0.0) - bend)
+                linearization.s[e, k, q] = inverse * ((problem.w[e] if k == q else 0.0) - bend)
 
 
 @kernel(inline=True)
-def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -> None:
+def set_gradient(problem: Any, iterate: Any, linearization: Any, mu: float, step: Any) -> None:
     """Begin a step: dT = 0, y+ = g with g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, nodes = D^T g."""
     y, r = iterate.y, iterate.r
     step.t[:] = 0.0
@@ -291,7 +299,7 @@ def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -
         for k in range(len(problem.transverse)):
             rr += r[e, k] * r[e, k]
             step.r[e, k] = 0.0
-        rho, inverse = np.sqrt(rr), model.inverse[e]
+        rho, inverse = np.sqrt(rr), linearization.inverse[e]
         keep, pull = 1.0 - rho * inverse, problem.w[e] * inverse
         step.rho[e] = rho
         for k in range(len(problem.transverse)):
@@ -300,7 +308,7 @@ def set_gradient(problem: Any, iterate: Any, model: Any, mu: float, step: Any) -
 
 
 @kernel(inline=True)
-def extend_step(problem: Any, model: Any, dt: Any, step: Any) -> None:
+def extend_step(problem: Any, linearization: Any, dt: Any, step: Any) -> None:
     """Add dt to the step: dT += dt, y+_e += S_e P_e (dt_i - dt_j), nodes = D^T y+.
 
     A refinement adds its small dt to the dual that is there: y+ from the whole dT would carry the
@@ -314,7 +322,7 @@ def extend_step(problem: Any, model: Any, dt: Any, step: Any) -> None:
             step.r[e, k] += change[e, k]
             x = step.y[e, k]
             for q in range(len(problem.transverse)):
-                x += model.s[e, k, q] * change[e, q]
+                x += linearization.s[e, k, q] * change[e, q]
             step.y[e, k] = x
     sum_at_nodes(problem, step)
 
@@ -355,7 +363,7 @@ def set_residuals(problem: Any, t: Any, r: Any) -> None:
 
 
 @kernel(inline=True)
-def take(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Progress:
+def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Progress:
     """Move along the step as far as it helps; return the scalars there."""
     alpha, multiplier = 1.0, progress.multiplier
     while alpha > 0.0 and increase(problem, iterate, step, mu, alpha) > 0.0:
@@ -479,7 +487,8 @@ def dot(x: Any, y: Any) -> float:
 #
 # What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while
 # the kernel ran would be raised there, and end the process by a segmentation fault: kernels that Python
-# calls return plain tuples.
+# calls return plain tuples. So each operation has three names: the inlined kernel, the kernel around it that
+# returns plain numbers, and the function that makes a NamedTuple of these.
 
 Scalars = tuple[float, float, float, float, bool]
 
@@ -491,32 +500,34 @@ def scalars(progress: Any) -> Scalars:
 
 
 @kernel()
-def _measured(problem: Any, iterate: Any) -> Scalars:
+def _measure_plain(problem: Any, iterate: Any) -> Scalars:
     return scalars(measure(problem, iterate))
 
 
 @kernel()
-def _taken(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Scalars:
-    return scalars(take(problem, iterate, step, mu, progress, target))
+def _take_step_plain(
+    problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float
+) -> Scalars:
+    return scalars(take_step(problem, iterate, step, mu, progress, target))
 
 
 @kernel()
-def _closed(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
-    return scalars(closed(iterate, progress, mu, first))
+def _close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
+    return scalars(close_cycle(iterate, progress, mu, first))
 
 
-def measured(problem: Problem, iterate: Iterate) -> Progress:
+def measure_from_python(problem: Problem, iterate: Iterate) -> Progress:
     """Return the scalars at the iterate; see `measure`."""
-    return Progress(*_measured(problem, iterate))
+    return Progress(*_measure_plain(problem, iterate))
 
 
-def taken(
+def take_step_from_python(
     problem: Problem, iterate: Iterate, step: Step, mu: float, progress: Progress, target: float
 ) -> Progress:
-    """Take a step and return the scalars after it; see `take`."""
-    return Progress(*_taken(problem, iterate, step, mu, progress, target))
+    """Take a step and return the scalars after it; see `take_step`."""
+    return Progress(*_take_step_plain(problem, iterate, step, mu, progress, target))
 
 
-def ended(iterate: Iterate, progress: Progress, mu: float, first: float) -> Progress:
-    """Return the scalars after a cycle; see `closed`."""
-    return Progress(*_closed(iterate, progress, mu, first))
+def close_cycle_from_python(iterate: Iterate, progress: Progress, mu: float, first: float) -> Progress:
+    """Return the scalars after a cycle; see `close_cycle`."""
+    return Progress(*_close_cycle_plain(iterate, progress, mu, first))

@@ -2,7 +2,7 @@
 
 With t = A x, x = (f, s) (`sfm_shapefit.solver.rigs.groups`), the program is
 
-    minimise    R(A x) = sum_e w_e || P_e (t_i - t_j) ||      over the pairs between two groups
+    minimize    R(A x) = sum_e w_e || P_e (t_i - t_j) ||      over the pairs between two groups
     subject to  L(A x) = <c, A x> = kappa,  sum_b f_b = 0,         c = D^T (w v)
 
 It is as homogeneous and as convex as ShapeFit itself. Its Lagrangian, with y_e for the norms (||y_e|| <= w_e,
@@ -13,7 +13,7 @@ orthogonal to v_e, since ||P z|| = max <y, z> over these) and lambda for the con
 whose infimum over x is lambda kappa if  A^T D^T y = lambda A^T c  and minus infinity otherwise. So the dual
 is
 
-    maximise    lambda
+    maximize    lambda
     subject to  sum over the pairs that leave group b of signed y_e = lambda * the same of w_e v_e,  each b
                 sum_e <y_e, o_i - o_j> = lambda sum_e w_e <v_e, o_i - o_j>                        (for s)
                 <y_e, v_e> = 0,    ||y_e|| <= w_e

@@ -15,12 +15,18 @@ from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.viewgraph import ViewGraph
 
-_OFF_GROUPS = 1e-9  # distance of locations from those of rigid groups, of their extent, that is rounding
-_EXACT = 1e-12  # an equality residual that needs no repair
-_REPAIRS = 4  # each shrinks the equality residual to the rounding of the previous one
-_RESIDUAL_FLOOR = 0.1  # least residual, of the mean one, that the metric of the repair takes seriously
-_STRICT = 1e-3  # a pair counts as held by its fit if ||y_e|| < (1 - this) w_e
-_REGULAR = 1e-9  # least pivot, relative to its diagonal entry, of a matrix that counts as regular
+# Locations may be off those of rigid groups by this share of their extent, which is rounding.
+_OFF_GROUPS = 1e-9
+# An equality residual that needs no repair.
+_EXACT = 1e-12
+# Each repair shrinks the equality residual to the rounding of the previous one.
+_REPAIRS = 4
+# The least residual, relative to the mean one, that the metric of the repair takes seriously.
+_RESIDUAL_FLOOR = 0.1
+# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
+_STRICT = 1e-3
+# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this.
+_REGULAR = 1e-9
 
 
 def certify_groups(

@@ -22,7 +22,8 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
 
-_COINCIDENT = 1e-12  # offset from its group's other cameras, of the largest one, that counts as none
+# An offset within its group smaller than this, relative to the largest offset, counts as none.
+_COINCIDENT = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,8 +107,7 @@ class RigidGroups:
         return RigidGroups(group_of=self.group_of, offsets=moved)
 
     def normalize(self) -> "RigidGroups":
-        """Return the same groups centred, in a unit in which offsets have root mean square 1 unless all are
-        0."""
+        """Return the same groups centred, in a unit in which their offsets have root mean square 1."""
         centred = self.centred()
         moved = np.linalg.norm(centred.offsets, axis=1)
         size = float(np.sqrt(np.mean(moved[moved > 0.0] ** 2))) if moved.any() else 1.0

@@ -17,7 +17,8 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor, analyse
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
-_LEAST_SCHUR = 1e-13  # of eta: what is left of s when all groups may move, below which it is rounding
+# What is left of s when all groups may move is rounding below this share of eta.
+_LEAST_SCHUR = 1e-13
 
 
 class ReducedFactor:
@@ -30,7 +31,7 @@ class ReducedFactor:
     def __init__(
         self, edges: IntArray, groups: RigidGroups, *, threads: int = 1, max_bytes: int | None = None
     ) -> None:
-        """Plan the factorisation.
+        """Plan the factorization.
 
         Args:
             edges: (m, 2) pairs of nodes, each of two different groups, which they connect.

@@ -26,7 +26,8 @@ from sfm_shapefit.viewgraph import connected_components
 _EPSILON = 1e-10
 _STEPS = 4
 _PROBES = 3
-_ALIKE = 1e-3  # of the unit normal draws: null vectors that move two groups so alike move both the same
+# Two groups are tied if all null vectors, drawn with unit variance, move them equally to this.
+_ALIKE = 1e-3
 _SEED = 0
 
 

@@ -18,7 +18,8 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.solver.splitting.edges import EdgePasses
 
-_REGULARISATION = 1e-10  # relative to the mean squared column: the differences are kept to 1e-7
+# Added to the Gram matrix, relative to the mean squared column: the differences are kept to 1e-7.
+_REGULARIZATION = 1e-10
 
 
 class Anderson:
@@ -63,7 +64,7 @@ class Anderson:
         dots = self._dots[:, :used].sum(axis=0)
         self._gram[slot, :used] = self._gram[:used, slot] = dots[:, 0]
         gram = self._gram[:used, :used]
-        ridge = _REGULARISATION * np.trace(gram) / used
+        ridge = _REGULARIZATION * np.trace(gram) / used
         if not ridge > 0.0:
             return np.zeros(used)
         return np.asarray(np.linalg.solve(gram + ridge * np.eye(used), dots[:, 1]))

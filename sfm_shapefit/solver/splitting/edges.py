@@ -28,8 +28,10 @@ from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.viewgraph import ViewGraph
 
 _CHUNKS = 4
-_BLOCK = 64  # edges that are gathered and then worked on together
-_EDGES_WORTH_A_THREAD = 20_000  # below, handing work to a thread costs more than the work
+# So many edges are gathered and then worked on together.
+_BLOCK = 64
+# For fewer edges, handing work to a thread costs more than the work.
+_EDGES_WORTH_A_THREAD = 20_000
 
 OBJECTIVE, PAIRING, ALONG, CHANGE, INTERIOR = range(5)
 """Columns of the sums of a pass: w ||r(D T)||, <rho u, D T>, <rho u, v>, rho ||x' - x||^2, and the

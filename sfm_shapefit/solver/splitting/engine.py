@@ -1,6 +1,6 @@
 """The iteration that ShapeFit and LUD share: alternating directions with a factored graph Laplacian.
 
-    minimise  sum_e phi_e(y_e)    subject to  y = D T,  and for ShapeFit  <c, T> = kappa
+    minimize  sum_e phi_e(y_e)    subject to  y = D T,  and for ShapeFit  <c, T> = kappa
 
 with the edge state x of `edges` (y and the scaled multiplier u in one vector) and a penalty rho_e per
 edge. With L = D^T diag(rho) D one iteration is
@@ -31,23 +31,36 @@ from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor
 
-_PENALTY = 0.5  # rho_e = _PENALTY w_e / max(r_e, floor mean(r))
-_FLOORS = (0.1, 0.03, 0.01)  # of the successive renewals; the last one stays
-_ANDERSON_FLOOR = 0.3  # accelerated, on every renewal: even penalties leave more to the acceleration
-_BALANCE = 1.0  # primal over dual residual at which a renewal leaves the scale of the penalties alone
-_LATE_BALANCES = (4.0, 2.0)  # the same from the third renewal on, without acceleration: what has not
-# converged by then, as communities that hang together by few pairs, creeps along smooth modes, and smaller
-# penalties free them (community graph of 1e4 cameras to 1e-4: 222 iterations fell to 133)
+# Renewed penalties are rho_e = _PENALTY w_e / max(r_e, floor mean(r)), with the floors of the successive
+# renewals, of which the last one stays.
+_PENALTY = 0.5
+_FLOORS = (0.1, 0.03, 0.01)
+# While the iteration is accelerated every renewal has this floor: even penalties leave more to acceleration.
+_ANDERSON_FLOOR = 0.3
+# A renewal leaves the scale of the penalties alone where primal over dual residual has this value.
+_BALANCE = 1.0
+# The same from the third renewal on, without acceleration. What has not converged by then, as communities
+# that hang together by few pairs, creeps along smooth modes, and smaller penalties free them (community graph
+# of 1e4 cameras to 1e-4: 133 iterations instead of 222).
+_LATE_BALANCES = (4.0, 2.0)
 _ANDERSON_MEMORY = 6
-_ANDERSON_RELAXATION = 1.0  # over-relaxation and acceleration get in each other's way
-_ANDERSON_INTERIOR = 0.3  # fraction of edges inside their ball from which acceleration can pay, and the
-_ANDERSON_KEPT = 0.9  # share of the fraction one renewal earlier that noise would not have left
-_ANDERSON_GIVE_UP = 4.0  # growth of the step that discards the history
-_ASTRAY = 10.0  # times the first objective: acceleration with more history than a tiny problem has dimensions
-_LEAST_OBJECTIVE = 1e-6  # what a first objective counts as at least: of exact data it is rounding
-_STEPS_LEFT = 10.0  # that the fixed point is away at least, in steps of the present length
+# Over-relaxation and acceleration get in each other's way.
+_ANDERSON_RELAXATION = 1.0
+# Acceleration can pay from this fraction of edges inside their ball on, if noise has not taken away more than
+# a tenth of the fraction one renewal earlier.
+_ANDERSON_INTERIOR = 0.3
+_ANDERSON_KEPT = 0.9
+# The history is discarded where a step is so many times as long as the one before.
+_ANDERSON_GIVE_UP = 4.0
+# Restart without acceleration above 10 times the first objective, which happens where the history is longer
+# than a tiny problem has dimensions. Exact data begin at rounding: a first objective counts as 1e-6 at least.
+_ASTRAY_PER_FIRST = 10.0
+_LEAST_FIRST_OBJECTIVE = 1e-6
+# The fixed point is taken to be between so many steps of the present length away.
+_STEPS_LEFT = 10.0
 _MOST_STEPS_LEFT = 1000.0
-_CONTRACTION_WINDOW = 10  # iterations over which the shrinking of the steps is measured
+# The shrinking of the steps is measured over so many iterations.
+_CONTRACTION_WINDOW = 10
 _STALL_WINDOW = 150
 
 
@@ -182,7 +195,7 @@ class Iteration:
         """Return whether the accelerated iteration is far above the objective that it began with."""
         objective = self.objective(state)
         if k == 1:
-            self._astray = _ASTRAY * max(objective, _LEAST_OBJECTIVE)
+            self._astray = _ASTRAY_PER_FIRST * max(objective, _LEAST_FIRST_OBJECTIVE)
         return state.anderson is not None and not objective <= self._astray
 
     def _begin_again(self) -> State:

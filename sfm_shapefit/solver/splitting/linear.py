@@ -28,14 +28,19 @@ DEFAULT_MEMORY_BYTES = 2_000_000_000
 """What the factor may take if the caller says nothing."""
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
-# factorisations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of
+# factorizations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of
 # 1e5 cameras have 40,000, random graphs 300,000 at 3e3 cameras and millions at 1e4.
 _FLOPS_PER_EDGE = 150_000
-_REDUCTION = 0.1  # of the residual per solve; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some
-_MAX_STEPS = 60  # approximate Cholesky needs 2-5 for that reduction on every family tried
-_JACOBI_STEPS = 8  # if Jacobi solves a probe to 1e-2 in so many, the graph is an expander
-_HUGE = 400_000  # cameras, whose ordering takes a minute; a rough prediction of the work must do there first
-_LARGE = 5_000  # cameras; the factor of an expander this large takes longer than it saves
+# A solve shrinks the residual to this share; 0.03 and 0.01 save no ADMM iteration, 0.3 costs some.
+_REDUCTION = 0.1
+# Approximate Cholesky needs 2 to 5 steps for that reduction on every family tried.
+_MAX_STEPS = 60
+# If Jacobi solves a probe to 1e-2 in so many steps, the graph is an expander.
+_JACOBI_STEPS = 8
+# Ordering so many cameras takes a minute; a rough prediction of the work must do there first.
+_HUGE = 400_000
+# The factor of an expander of so many cameras takes longer than it saves.
+_LARGE = 5_000
 _SEED = 1
 
 
@@ -99,7 +104,7 @@ class Prediction:
 
     @property
     def flops(self) -> float:
-        """Operations of the scalar factorisation, infinite where no order was looked for."""
+        """Operations of the scalar factorization, infinite where no order was looked for."""
         return np.inf if self.tree is None else self.tree.flops
 
 
@@ -112,16 +117,16 @@ def predict_factor(graph: ViewGraph) -> Prediction:
     factor would take longer than it saves; some of them may have better separators than their levels, but
     approximate Cholesky serves them as well.
     """
-    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if graph.num_nodes >= _LARGE:
-        operator = LaplacianOperator(neighbours, graph.weights, Workers(1))
+        operator = LaplacianOperator(neighbors, graph.weights, Workers(1))
         if _diagonal_suffices(operator, JacobiPreconditioner(operator.diagonal())):
             return Prediction(None)
     if graph.num_nodes >= _HUGE:
-        rough_flops = 4.0 * (0.75 * widest_level(neighbours)) ** 3  # as on boxes of 1e4 and 1e5 cameras
+        rough_flops = 4.0 * (0.75 * widest_level(neighbors)) ** 3  # as on boxes of 1e4 and 1e5 cameras
         if rough_flops > 2.0 * _FLOPS_PER_EDGE * graph.num_edges:
             return Prediction(None)
-    return Prediction(best_order(neighbours))
+    return Prediction(best_order(neighbors))
 
 
 def laplacian_factor(
@@ -142,12 +147,12 @@ def laplacian_factor(
         threads: of the factor; its answers do not depend on it.
     """
     tree = (predict_factor(graph) if prediction is None else prediction).tree
-    neighbours = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
-        return IterativeSolver(neighbours, threads)
+        return IterativeSolver(neighbors, threads)
     if tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes:
-        return IterativeSolver(neighbours, threads)
-    plan = plan_factorisation(neighbours, np.ascontiguousarray(graph.edges), tree)
+        return IterativeSolver(neighbors, threads)
+    plan = plan_factorisation(neighbors, np.ascontiguousarray(graph.edges), tree)
     if plan.num_bytes(1, np.float32) > memory_bytes:
-        return IterativeSolver(neighbours, threads)
+        return IterativeSolver(neighbors, threads)
     return allocate_factor(plan, 1, np.float32, threads=threads)

@@ -1,11 +1,11 @@
 """LUD, least unsquared deviations: the convex start that does not collapse on long chains.
 
-    minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
+    minimize  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
 
 The bound on each length is a gauge that no stretch of a chain can escape, where ShapeFit's single
 constraint <c, T> = kappa lets all length gather on the cleanest stretch. The dual is
 
-    maximise  sum_e nu_e,  nu_e = -<y_e, v_e>    subject to  D^T y = 0,  ||y_e|| <= w_e,  nu_e >= 0
+    maximize  sum_e nu_e,  nu_e = -<y_e, v_e>    subject to  D^T y = 0,  ||y_e|| <= w_e,  nu_e >= 0
 
 An approximate y is made feasible by y' = y - N D h with (D^T N D) h = D^T y, where N_e = I on edges with
 nu_e > 0 and N_e = P_e (orthogonal to v_e) on the others, and by a common scaling. Edges whose nu_e turns
@@ -30,7 +30,8 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _LEAST_LENGTH = 1.0
 _REPAIRS = 12
-_CG_TOL = 1e-7  # twice, which makes 1e-14
+# The balance is restored twice to this residual, which makes 1e-14.
+_CG_TOL = 1e-7
 _CG_STEPS = 300
 
 

@@ -23,16 +23,21 @@ from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
 from sfm_shapefit.solver.splitting.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor, Prediction
 from sfm_shapefit.viewgraph import ViewGraph
 
-_SHARE = 0.3  # of the gap, that the splitting is asked for first
-_TIGHTER = 0.1  # of the first share, when it is asked again
+# The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
+_FIRST_TARGET_PER_TOL = 0.3
+# Where the certificate misses the tolerance, the splitting goes on to this share of the target before.
+_TARGET_SHRINKAGE = 0.1
 _CERTIFICATES = 4
 _NEWTON_STEPS = 30
-_CHEAP_FLOPS = 4e9  # of one factorisation in blocks: Newton's method may take over early, and begin twice
-_PATIENCE = 500  # iterations of the splitting after which it does
-_NEWTON_FLOPS = 2e12  # of one factorisation in blocks: about a minute
+# Where one factorization in blocks takes no more operations than the first number, Newton's method may begin
+# twice, and takes over after so many iterations of the splitting.
+_CHEAP_FLOPS = 4e9
+_SPLITTING_BEFORE_NEWTON = 500
+# Newton steps are not taken where one factorization in blocks takes more operations: about a minute.
+_NEWTON_FLOPS = 2e12
 
 
-class Finish(enum.Enum):
+class HybridStop(enum.Enum):
     """Why the solver returned; the value is the sentence shown to the user."""
 
     CERTIFIED = "the certified gap is below the tolerance"
@@ -57,9 +62,9 @@ class HybridResult:
     """Of these locations; its dual is feasible."""
     iterations: int
     """Of the splitting."""
-    factorisations: int
+    factorizations: int
     """Of the Newton steps, 0 if there were none."""
-    finish: Finish
+    stop: HybridStop
     """Why the solver returned."""
 
 
@@ -83,21 +88,25 @@ def solve_hybrid(
         threads: of the passes over edges and of the factor; the result does not depend on it.
         memory_bytes: what a factor may take.
         prediction: of the factor, if it is there already, to save a second ordering.
-        on_iteration: called after each iteration and each factorisation; returning False cancels. What
+        on_iteration: called after each iteration and each factorization; returning False cancels. What
             has been reached is certified all the same.
 
     Raises:
         UnsolvableError: if the graph is not connected.
     """
     factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
-    patience = min(max_iterations, _PATIENCE) if _is_cheap(factor, graph.dimension) else max_iterations
+    patience = (
+        min(max_iterations, _SPLITTING_BEFORE_NEWTON)
+        if _is_cheap(factor, graph.dimension)
+        else max_iterations
+    )
     splitting = Splitting(graph, factor, threads)
     try:
         result = _split(splitting, graph, factor, tol, patience, threads, on_iteration)
     finally:
         splitting.close()
-    gave_up = result.finish is Finish.MAX_ITERATIONS and patience < max_iterations
-    if not gave_up and result.finish is not Finish.INACCURATE:
+    gave_up = result.stop is HybridStop.MAX_ITERATIONS and patience < max_iterations
+    if not gave_up and result.stop is not HybridStop.INACCURATE:
         return result
     del splitting  # its arrays over edges make room for the factor
     return _newton(graph, factor, result, tol, memory_bytes, on_iteration)
@@ -113,7 +122,7 @@ def _split(
     on_iteration: OnIteration | None,
 ) -> HybridResult:
     """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
-    target = _SHARE * tol
+    target = _FIRST_TARGET_PER_TOL * tol
     for attempts_left in reversed(range(_CERTIFICATES)):
         step = splitting.run(0.0, target, max_iterations, on_iteration)
         t, y = step.locations, step.dual
@@ -123,23 +132,23 @@ def _split(
             certificate = certify(graph, t, y, tol=tol, factor=factor, threads=threads, overwrite_dual=True)
         if certificate is not None:
             break
-        target *= _TIGHTER
+        target *= _TARGET_SHRINKAGE
     assert certificate is not None, "the last one is taken as it is"
     return HybridResult(
         locations=t,
         certificate=certificate,
         iterations=step.iterations,
-        factorisations=0,
-        finish=_verdict(certificate, step.stop, tol),
+        factorizations=0,
+        stop=_verdict(certificate, step.stop, tol),
     )
 
 
-def _verdict(certificate: Certificate, stop: Stop, tol: float) -> Finish:
+def _verdict(certificate: Certificate, stop: Stop, tol: float) -> HybridStop:
     """Return what a certified answer of the splitting amounts to."""
     if certificate.gap <= tol:
-        return Finish.CERTIFIED
-    ends = {Stop.CANCELLED: Finish.CANCELLED, Stop.MAX_ITERATIONS: Finish.MAX_ITERATIONS}
-    return ends.get(stop, Finish.INACCURATE)
+        return HybridStop.CERTIFIED
+    ends = {Stop.CANCELLED: HybridStop.CANCELLED, Stop.MAX_ITERATIONS: HybridStop.MAX_ITERATIONS}
+    return ends.get(stop, HybridStop.INACCURATE)
 
 
 def _newton(
@@ -155,7 +164,7 @@ def _newton(
     plan = factor.symbolic if isinstance(factor, CholeskyFactor) else None
     fits = plan is not None and plan.num_bytes(d, np.float64) <= memory_bytes
     if plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
-        return replace(result, finish=Finish.TOO_LARGE)
+        return replace(result, stop=HybridStop.TOO_LARGE)
     cancelled = False
 
     def report(info: IterationInfo) -> bool | None:
@@ -176,14 +185,14 @@ def _newton(
         result, count = _better(graph, result, t, y, tol, factor), count + steps
         if cancelled or result.certificate.gap <= tol:
             break
-    finish = Finish.NEWTON if result.certificate.gap <= tol else Finish.INACCURATE
-    if cancelled and finish is Finish.INACCURATE:
-        finish = Finish.CANCELLED
-    return replace(result, factorisations=count, finish=finish)
+    stop = HybridStop.NEWTON if result.certificate.gap <= tol else HybridStop.INACCURATE
+    if cancelled and stop is HybridStop.INACCURATE:
+        stop = HybridStop.CANCELLED
+    return replace(result, factorizations=count, stop=stop)
 
 
 def _is_cheap(factor: LaplacianFactor, dimension: int) -> bool:
-    """Return whether a factorisation in blocks takes no time to speak of."""
+    """Return whether a factorization in blocks takes no time to speak of."""
     return isinstance(factor, CholeskyFactor) and factor.symbolic.flops * dimension**3 <= _CHEAP_FLOPS
 
 

@@ -1,0 +1,30 @@
+"""Dense or sparse: which factor of a matrix over the n d coordinates of a graph's nodes is the faster one."""
+
+from collections.abc import Callable
+
+from sfm_shapefit.viewgraph import ViewGraph
+
+FEW_UNKNOWNS = 450
+"""Up to so many unknowns a sparse factor does not pay, whatever the graph."""
+
+# Beyond so many unknowns a dense factor takes seconds.
+_MOST_DENSE_UNKNOWNS = 1800
+# From this share of all pairs on, no order of elimination saves much.
+_DENSE_SHARE = 0.3
+
+
+def prefers_dense_factor(graph: ViewGraph, predict_flops: Callable[[], float]) -> bool:
+    """Return whether the matrix of edge blocks (d, d) is better factored as a dense one.
+
+    Args:
+        graph: whose pairs are the blocks.
+        predict_flops: returns the operations of the sparse factorization in blocks; asked only where the
+            size and the density of the graph leave the answer open.
+    """
+    n, unknowns = graph.num_nodes, graph.num_nodes * graph.dimension
+    if unknowns <= FEW_UNKNOWNS:
+        return True
+    if unknowns > _MOST_DENSE_UNKNOWNS:
+        return False
+    share = 2.0 * graph.num_edges / (n * (n - 1.0))
+    return share >= _DENSE_SHARE or predict_flops() > unknowns**3 / 12
