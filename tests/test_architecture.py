@@ -20,6 +20,7 @@ LAYERS = [
     {"laplacian"},
     {"rigidity"},
     {"solver"},
+    {"measured"},
     {"directions"},
     {"baselines"},
     {"rotations"},

@@ -51,10 +51,13 @@ def place(
     **options: Any,
 ) -> "Placement":
     """Return the placement of the largest rigid piece: what the command does with a graph."""
+    from sfm_shapefit.measured import MeasuredGraph
     from sfm_shapefit.placement.place import place as place_graph
     from sfm_shapefit.refinement.options import PlacementOptions
 
-    return place_graph(graph, PlacementOptions(**options), covariance=covariance, num_cameras=num_cameras)
+    num_points = 0 if num_cameras is None else graph.num_nodes - num_cameras
+    measured = MeasuredGraph(graph, covariance=covariance, num_points=num_points)
+    return place_graph(measured, PlacementOptions(**options))
 
 
 def place_file(source: Path, **options: Any) -> Any:
@@ -67,13 +70,13 @@ def place_file(source: Path, **options: Any) -> Any:
 
 def lud_of(placement: "Placement") -> "FloatArray | None":
     """Return the locations of the LUD start that a placement was compared with, if there was one."""
-    lud = placement.finish.lud
+    lud = placement.refined.lud
     return None if lud is None else lud.locations
 
 
 def start_of(placement: "Placement") -> str:
     """Return which start was kept."""
-    return placement.finish.start
+    return placement.refined.start
 
 
 def warns(placement: "Placement") -> bool:

@@ -99,7 +99,7 @@ def _place_table(found: "GraphResult", out: Path, flags: OutputFlags) -> Rows:
         ),
         ("residuals", _describe_residuals(facts["residuals_deg"])),
         ("objective", describe_objective(found.certified)),
-        ("locations", placement.finish.statement()),
+        ("locations", placement.refined.statement()),
         *[("warning", warning) for warning in facts["warnings"]],
         ("time", describe_time(found.timings_s, flags.verbose)),
         ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),

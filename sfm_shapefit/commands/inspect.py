@@ -6,11 +6,16 @@ from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.economy import known_workload
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
-from sfm_shapefit.commands.stages.measure import evidence_of, joint_graph, measure_directions, view_graph
-from sfm_shapefit.commands.stages.memory import Forecast, forecast, measure_speed
-from sfm_shapefit.commands.stages.rigs import rigs_statement
+from sfm_shapefit.commands.stages.measure import (
+    build_graph,
+    collect_evidence,
+    count_work,
+    measure_directions,
+    view_graph,
+)
+from sfm_shapefit.commands.stages.memory import Forecast, describe_work, forecast
+from sfm_shapefit.commands.stages.rigs import group_frames, rigs_statement
 from sfm_shapefit.directions.pair_directions import DirectionStatus
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError
@@ -40,7 +45,7 @@ class Inspection(Displayed):
     theory: Theory | None
     """None if not asked for."""
     expected: Forecast | None = None
-    """What `locate` will take on this machine; None for a bare graph."""
+    """The memory that `locate` will take; None for a bare graph."""
     rigs: str = "none: every image is a frame of its own"
     """How many frames there are, and how many of them the pairs tie to one another in metric scale."""
 
@@ -48,7 +53,7 @@ class Inspection(Displayed):
         """Return plain values for JSON."""
         facts = asdict(self)
         if self.expected is not None:
-            facts["expected"] |= {"peak_mb": self.expected.peak_mb, "total_s": self.expected.total_s}
+            facts["expected"] |= {"peak_mb": self.expected.peak_mb}
         if self.theory is not None and self.theory.conditions is not None:
             conditions = self.theory.conditions
             facts["theory"]["conditions"] |= {
@@ -103,24 +108,20 @@ def inspect(
         with clock("directions"):
             directions = measure_directions(matches, options, clock)
         with clock("diagnosis"):
-            joint = joint_graph(matches, directions, options)
+            measured = build_graph(matches, directions, options)
+            measured = measured.with_evidence(collect_evidence(directions))
+            grouped = group_frames(model, measured)
+            work = describe_work(count_work(matches, directions), grouped, options)
             pairs = view_graph(model, directions)
             return Inspection(
                 directions=inputs.statement,
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
-                points=options.points_statement(model.num_images, joint.num_points),
-                diagnosis=diagnose(
-                    joint.graph,
-                    options,
-                    joint.num_cameras,
-                    evidence_of(directions).contradicting,
-                ),
+                points=options.points_statement(model.num_images, measured.num_points),
+                diagnosis=diagnose(measured, options),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
-                expected=forecast(
-                    known_workload(matches, directions, joint, options), matches.economy, measure_speed()
-                ),
-                rigs=rigs_statement(model, joint),
+                expected=forecast(work, matches.economy),
+                rigs=rigs_statement(model, grouped),
             )
 
 

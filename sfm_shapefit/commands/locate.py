@@ -8,27 +8,28 @@ from concurrent.futures import Executor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.economy import within_memory
-from sfm_shapefit.commands.stages.gauge_choice import chosen_gauge, read_priors
+from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import (
-    evidence_of,
-    joint_graph,
+    add_evidence,
+    build_graph,
+    count_work,
     measure_directions,
-    shared_errors,
-    with_points,
 )
-from sfm_shapefit.commands.stages.rigs import placed, rigid_gauge, rigid_parts
-from sfm_shapefit.commands.stages.rotations import refined_rotations
-from sfm_shapefit.commands.stages.seed import further_pieces, seeded_model, trusted
+from sfm_shapefit.commands.stages.memory import keep_within_memory
+from sfm_shapefit.commands.stages.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.commands.stages.rotations import refine_model_rotations
+from sfm_shapefit.commands.stages.seed import (
+    Located,
+    build_seeded_model,
+    place_further_pieces,
+    select_trusted,
+)
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.options import LocateOptions
-from sfm_shapefit.placement.gauge import Gauge
-from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.prior_refinement import pulled
+from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results import LocateResult, match_warnings, quality_warnings, trust_warnings
 from sfm_shapefit.settings import merge_options
 
@@ -82,31 +83,33 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
-        known = read_priors(model, inputs, options, priors)
-        rigid = rigid_parts(model, options, has_priors=known is not None)
+        priors_known = read_priors(model, inputs, options, priors)
+        rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     turned_deg = None
     if options.refine_rotations:
         with clock("rotations"):
-            model, turned_deg = refined_rotations(model, inputs, options, clock)
-    with open_source(model, inputs, options.max_memory_mb) as opened:
+            model, turned_deg = refine_model_rotations(model, inputs, options, clock)
+    with open_source(model, inputs, options) as opened:
         with clock("directions"):
             directions = measure_directions(opened, options, clock, executor)
         with clock("solve"):
-            joint = joint_graph(opened, directions, options)
-            source, joint, options = within_memory(opened, directions, joint, options)
-            evidence = with_points(evidence_of(directions, shared_errors(source, directions, options)), joint)
-            placement = placed(joint, rigid, evidence, options, clock)
-            kept = trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            gauge = rigid_gauge(
-                model, placement, rigid, kept, lambda: chosen_gauge(model, placement, kept, options, known)
-            )
-            if known is not None and options.refine_with_priors:
-                placement, gauge = pulled(placement, gauge, known, joint.covariance, evidence)
-                kept = trusted(placement, options.min_trust)
+            measured = rigid.apply(build_graph(opened, directions, options))
+            work = count_work(opened, directions)
+            economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
+            source = opened.with_economy(economy)
+            measured = add_evidence(measured, source, directions, options)
+            placement = place_cameras(measured, options, clock)
+            kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+            gauge = choose_gauge(model, placement, kept, rigid, options, priors_known)
+            if priors_known is not None and options.refine_with_priors:
+                settings = options
+                placement, gauge = pull_to_priors(placement, gauge, priors_known, settings)
+                kept = select_trusted(placement, options.min_trust)
         with clock("further pieces"):
-            further = further_pieces(source, placement, joint, evidence, options)
-        seeded, adjusted = seeded_model(source, placement, kept, gauge, options, clock, rigid.fixed, executor)
-        warnings = tuple(_warnings(source, directions, placement, kept, gauge, seeded.num_points3D()))
+            further = place_further_pieces(source, placement, options)
+        located = Located(placement, kept, gauge, rigid.fixed)
+        seeded, adjusted = build_seeded_model(source, located, options, clock, executor)
+        warnings = tuple(_collect_warnings(source, directions, located, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
         inputs=inputs,
@@ -125,20 +128,15 @@ def locate(
     )
 
 
-def _warnings(
-    source: MatchSource,
-    directions: PairDirections,
-    placement: Placement,
-    kept: BoolArray,
-    gauge: Gauge,
-    num_points: int,
+def _collect_warnings(
+    source: MatchSource, directions: PairDirections, located: Located, num_points: int
 ) -> Iterator[str]:
     """Yield what the user should know beyond the tables."""
     yield from match_warnings(directions)
-    yield from quality_warnings(placement)
-    yield from trust_warnings(placement, kept)
-    if gauge.warning:
-        yield gauge.warning
+    yield from quality_warnings(located.placement)
+    yield from trust_warnings(located.placement, located.kept)
+    if located.gauge.warning:
+        yield located.gauge.warning
     if source.economy.statement:
         yield f"to stay below max_memory_mb, {source.economy.statement}"
     if num_points == 0:

@@ -19,6 +19,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
 _PER_CAMERA = 20  # about 3 tracks started per camera, of 6 views each: what determines a straight road
@@ -56,22 +57,6 @@ class Tracks:
         offsets = np.concatenate([[0], np.cumsum(lengths)])
         rows = np.repeat(self.offsets[chosen] - offsets[:-1], lengths) + np.arange(offsets[-1])
         return Tracks(offsets=offsets, cameras=self.cameras[rows], rays=self.rays[rows])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JointGraph:
-    """A view graph with 3D points as further nodes."""
-
-    graph: ViewGraph
-    """Cameras 0..n-1, then points; pairs of cameras stand before directions from cameras to points."""
-    covariance: FloatArray
-    """(m, 2, 2) of each direction, rad^2, in `tangent_bases(graph.directions)`."""
-    num_cameras: int
-
-    @property
-    def num_points(self) -> int:
-        """Number of points that joined."""
-        return self.graph.num_nodes - self.num_cameras
 
 
 def build_tracks(
@@ -216,7 +201,7 @@ def _greedy_cover(
 
 def join_points(
     graph: ViewGraph, covariance: FloatArray, tracks: Tracks, pixel_angles: FloatArray, noise_px: float = 1.0
-) -> JointGraph:
+) -> MeasuredGraph:
     """Return the view graph with the tracks as further nodes.
 
     Args:
@@ -238,4 +223,4 @@ def join_points(
         names,
     )
     known = np.concatenate([covariance, own[:, None, None] * np.eye(2)])
-    return JointGraph(graph=joint, covariance=known, num_cameras=n)
+    return MeasuredGraph(joint, covariance=known, num_points=tracks.num_tracks)

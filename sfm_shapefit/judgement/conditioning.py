@@ -25,9 +25,13 @@ from sfm_shapefit.viewgraph import connected_components
 LOOSE_SHARE = 0.05
 """Standard deviation, of the cameras' median distance from their median, from which a camera is loose."""
 FEW_PAIRS = 2
-_PARALLEL = 0.02  # least over largest eigenvalue of sum I - u u^T: directions within about 8 degrees
-_SMALLEST_LINE = 3  # cameras
-_ON_A_LINE = 0.02  # second over first singular value of the positions
+"""Pairs of a camera up to which they are too few to check one another."""
+NEARLY_PARALLEL = 0.02
+"""The `direction_spread` below which directions are nearly parallel: within about 8 degrees."""
+# Cameras that can lie on a line, or not.
+_SMALLEST_LINE = 3
+# Second over first singular value of positions on a line.
+_ON_A_LINE = 0.02
 
 
 class Looseness(enum.Enum):
@@ -74,7 +78,7 @@ def condition(
     inliers: BoolArray,
     sigmas: FloatArray,
     num_cameras: int,
-    unheld: IntArray | None = None,
+    undetermined_nodes: IntArray | None = None,
 ) -> Conditioning:
     """Find the cameras that the pairs leave loose at the solution, and why.
 
@@ -84,13 +88,14 @@ def condition(
         inliers: (m,) pairs that agree with the solution.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
         num_cameras: k; nodes beyond are points.
-        unheld: nodes whose distance is known to be open, with infinite standard deviations; none if None.
+        undetermined_nodes: nodes whose distance is known to be open, with infinite standard deviations; none
+            if None.
     """
     n = len(locations)
-    is_unheld = np.isin(np.arange(n), [] if unheld is None else unheld)
+    is_undetermined = np.isin(np.arange(n), [] if undetermined_nodes is None else undetermined_nodes)
     used = edges[inliers]
     num_pairs = np.bincount(used.ravel(), minlength=n)
-    narrowness = _narrowness(locations, used)
+    narrowness = direction_spread(n, used, normalized(differences(locations, used)))
     largest = sigmas.max(axis=1)
     loose = largest > LOOSE_SHARE * median_spread(locations[:num_cameras])
     loose[num_cameras:] = False
@@ -104,7 +109,7 @@ def condition(
         if _is_straight(locations[members]):
             for camera in members.tolist():
                 causes[camera] = Looseness.ON_A_LINE
-        for camera in members[is_unheld[members]].tolist():
+        for camera in members[is_undetermined[members]].tolist():
             causes[camera] = Looseness.DISTANCE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
         groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
@@ -116,16 +121,25 @@ def condition(
     )
 
 
-def _narrowness(locations: FloatArray, edges: IntArray) -> FloatArray:
-    """Return least over largest eigenvalue of the sum of I - u u^T at each node, 0 without pairs."""
-    n, d = locations.shape
-    u = normalized(differences(locations, edges))
-    projectors = np.nan_to_num(np.eye(d) - u[:, :, None] * u[:, None, :]).reshape(-1, d * d)
+def direction_spread(num_nodes: int, edges: IntArray, directions: FloatArray) -> FloatArray:
+    """Return how far the directions at each node are from parallel, (n,) in [0, 1]; 0 without any.
+
+    The least over the greatest eigenvalue of the sum of I - u u^T: the squared ratio of the singular values
+    of the stacked projectors.
+
+    Args:
+        num_nodes: n.
+        edges: (m, 2) node indices.
+        directions: (m, d) unit vectors u; those that are not finite count as none.
+    """
+    d = directions.shape[1]
+    projectors = np.nan_to_num(np.eye(d) - directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
     sums = np.stack(
-        [np.bincount(edges.ravel(), np.repeat(column, 2), minlength=n) for column in projectors.T], axis=1
+        [np.bincount(edges.ravel(), np.repeat(column, 2), minlength=num_nodes) for column in projectors.T],
+        axis=1,
     )
-    values = np.linalg.eigvalsh(sums.reshape(n, d, d))
-    return np.asarray(values[:, 0] / np.maximum(values[:, -1], 1e-300))
+    values = np.linalg.eigvalsh(sums.reshape(num_nodes, d, d))
+    return np.asarray(np.maximum(values[:, 0], 0.0) / np.maximum(values[:, -1], 1e-300))
 
 
 def _groups(n: int, edges: IntArray, loose: BoolArray) -> IntArray:
@@ -137,7 +151,7 @@ def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:
     """Return what makes a single camera loose."""
     if num_pairs <= FEW_PAIRS:
         return Looseness.FEW_PAIRS
-    if narrowness < _PARALLEL:
+    if narrowness < NEARLY_PARALLEL:
         return Looseness.PARALLEL
     return Looseness.TOGETHER if np.isfinite(sigma) else Looseness.UNTIED
 

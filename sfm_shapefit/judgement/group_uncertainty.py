@@ -6,27 +6,38 @@ translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T
 cameras, or one group that stays where it is. All nodes of a group share its covariance.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
+from sfm_shapefit.judgement.uncertainty import MAX_BYTES, Uncertainty, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
-_RIDGE = 1e-12  # of each block's trace
-_SHORTEST = 1e-12  # of the longest baseline
-_MAX_BYTES = 2_000_000_000
+# Share of each block's trace that is added.
+_RIDGE = 1e-12
+# Share of the longest baseline below which a baseline counts as that long.
+_SHORTEST = 1e-12
+
+
+class GroupGauge(NamedTuple):
+    """Rigid groups, and what of them is held fixed."""
+
+    groups: RigidGroups
+    share: FloatArray
+    """(B,) F, not negative, with sum 1: the groups whose weighted mean is held fixed."""
 
 
 def propagate_groups(
     locations: FloatArray,
     edges: IntArray,
     information: FloatArray,
-    groups: RigidGroups,
-    share: FloatArray,
+    gauge: GroupGauge,
     errors: FloatArray | None = None,
+    max_bytes: int = MAX_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of groups from the information of the directions between them.
 
@@ -34,18 +45,18 @@ def propagate_groups(
         locations: (n, d) at the solution.
         edges: (m, 2) pairs that tie the groups, each between two of them.
         information: (m, d, d) of each direction, rad^-2; only what lies across the baseline counts.
-        groups: of the nodes.
-        share: (B,) F, not negative, with sum 1: the groups whose weighted mean is held fixed.
+        gauge: the groups of the nodes, and what of them is held fixed.
         errors: (m, s, d) samples of the errors of the directions in radians; independent ones of that
             information if None.
+        max_bytes: that the factor may take.
 
     Returns:
-        None if the factor would take more than 2 GB.
+        None if the factor would take more.
 
     Raises:
         UnsolvableError: if the groups hang loose.
     """
-    d = locations.shape[1]
+    (groups, share), d = gauge, locations.shape[1]
     baselines = differences(locations, edges)
     lengths = np.linalg.norm(baselines, axis=1)
     lengths = np.maximum(lengths, _SHORTEST * lengths.max())
@@ -55,7 +66,7 @@ def propagate_groups(
     blocks = across / lengths[:, None, None] ** 2
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyse(groups.num_groups, ends)
-    if plan.num_bytes(d) > _MAX_BYTES:
+    if plan.num_bytes(d) > max_bytes:
         return None
     traces = np.trace(blocks, axis1=1, axis2=2)
     factor = factorise(plan, blocks + _RIDGE * traces[:, None, None] * np.eye(d))

@@ -24,17 +24,21 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
-_LEAST_OF_AGREEING = 0.2  # pairs of the rival, of those that agree with the solution
-_LEAST_SHARE = 0.3  # of the pairs beyond what unknowns can fit
-_FEWEST_SPARE = 20.0  # of these; fewer prove nothing
+# Pairs of the second configuration, at least, of those that agree with the solution.
+_LEAST_OF_AGREEING = 0.2
+# Share that must agree of the pairs beyond those which unknowns can fit, and how many these must be at least.
+_LEAST_SHARE = 0.3
+_FEWEST_SPARE = 20.0
 _STEPS = 20
-_ANGLE_DEG = (3.0, 10.0)  # a pair agrees within 5 levels, but within so much at least and at most
+# A pair agrees within so many levels, but within so many degrees at least and at most.
 _LEVELS = 5.0
-_MAX_PAIRS = 1_000_000  # as for the second start of a placement
+_ANGLE_DEG = (3.0, 10.0)
+# As for the second start of a placement.
+_MAX_PAIRS = 1_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Rival:
+class SecondConfiguration:
     """Another placement that many of the rejected pairs agree on."""
 
     cameras: IntArray
@@ -53,7 +57,9 @@ class Rival:
         )
 
 
-def find_rival(graph: ViewGraph, judged: IntArray, inliers: BoolArray, level_deg: float) -> Rival | None:
+def find_second_configuration(
+    graph: ViewGraph, judged: IntArray, inliers: BoolArray, level_deg: float
+) -> SecondConfiguration | None:
     """Return the placement that the rejected pairs agree on, if they do.
 
     Args:
@@ -76,4 +82,4 @@ def find_rival(graph: ViewGraph, judged: IntArray, inliers: BoolArray, level_deg
     alike = int(np.sum(angles <= np.clip(_LEVELS * level_deg, *_ANGLE_DEG)))
     if alike - fitted < _LEAST_SHARE * (rigid.num_edges - fitted) or alike < _LEAST_OF_AGREEING * agreeing:
         return None
-    return Rival(cameras=nodes, num_pairs=alike, num_against=agreeing)
+    return SecondConfiguration(cameras=nodes, num_pairs=alike, num_against=agreeing)

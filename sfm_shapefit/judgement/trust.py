@@ -34,59 +34,48 @@ together they count at most half as much as all agreements.
 
 import heapq
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.judgement.conditioning import FEW_PAIRS, Conditioning, Looseness
+from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.viewgraph import ViewGraph
 
+# A pair agrees within this angle, or within so many of its standard deviations.
 _AGREEING_ANGLE_RAD = np.radians(3.0)
 _AGREEING_SIGMAS = 5.0
-_MAX_CLUSTERED_PAIRS = 1_000_000  # ten seconds; beyond, all cameras count as the consensus
-_LARGEST_CONTRADICTION = 0.5  # weight of all contradictions over that of all agreements
-_PRIOR = 30.0  # matches, half of them for the camera in a clean scene
+# Beyond so many pairs, which take ten seconds, all cameras count as the consensus.
+_MAX_CLUSTERED_PAIRS = 1_000_000
+# Largest weight of all contradictions over that of all agreements.
+_LARGEST_CONTRADICTION = 0.5
+# Matches that every camera has beforehand, half of them for it in a clean scene.
+_PRIOR = 30.0
 _LEAST_MEDIAN = 0.5
-_MAX_SUPPORT = 200.0  # of one pair: hundreds of matches are no independent witnesses
-_UNKNOWN_SUPPORT = 50.0  # of a pair that does not say
-_USUAL_SHARE = 0.75  # of the median agreement of all cameras: a camera with that much loses nothing
-_HOLD_SHARE = 0.1  # tau, of the cameras' spread
-_LOW = 0.75  # trust below which reasons are given
+# Matches of one pair that count at most: hundreds of them are no independent witnesses.
+_MAX_SUPPORT = 200.0
+# Matches of a pair that does not say how many it has.
+_UNKNOWN_SUPPORT = 50.0
+# Share of the median agreement of all cameras: a camera with that much loses nothing.
+_USUAL_SHARE = 0.75
+# The standard deviation tau that halves trust, as a share of the cameras' spread.
+_HOLD_SHARE = 0.1
+# Trust below which reasons are given.
+_LOW = 0.75
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Evidence:
-    """What the matches say beyond the directions of a graph."""
+class PairFit(NamedTuple):
+    """How well the directions of a solved graph fit its locations."""
 
-    support: IntArray
-    """(m,) matches of each pair of the graph."""
-    contradicting: IntArray
-    """(q, 2) other pairs, whose matches contradict the given rotations."""
-    contradicting_support: IntArray
-    """(q,) their number of matches."""
-    errors: FloatArray | None = None
-    """(m, s, d - 1) samples of the errors of the directions, in their tangent bases, radians, for pairs that
-    share keypoints (`shared_noise`); the pairs' errors are independent if None."""
-
-    def restricted_to(self, edges: IntArray, cameras: IntArray, num_cameras: int) -> "Evidence":
-        """Return the evidence for a graph of some of the edges and cameras, renumbered.
-
-        Args:
-            edges: indices of the pairs that are kept, in their new order.
-            cameras: indices of the cameras that are kept, in their new order.
-            num_cameras: of the graph this evidence belongs to.
-        """
-        new = np.full(num_cameras, -1, dtype=np.int64)
-        new[cameras] = np.arange(len(cameras))
-        pairs = new[self.contradicting.reshape(-1, 2)]
-        kept = (pairs >= 0).all(axis=1)
-        return Evidence(
-            support=self.support[edges],
-            contradicting=pairs[kept],
-            contradicting_support=self.contradicting_support[kept],
-            errors=None if self.errors is None else self.errors[edges],
-        )
+    angles_rad: FloatArray
+    """(m,) residual angles."""
+    sigmas_rad: FloatArray
+    """(m,) standard deviation of each direction, per axis."""
+    leverages: FloatArray
+    """(m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside the largest
+    rigid piece of those, and everywhere if unknown."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -104,41 +93,33 @@ class CameraTrust:
 
 
 def judge_cameras(
-    graph: ViewGraph,
+    measured: MeasuredGraph,
     locations: FloatArray,
-    angles: FloatArray,
-    sigmas_of_pairs: FloatArray,
+    fit: PairFit,
     sigmas: FloatArray,
     conditioning: Conditioning,
-    leverages: FloatArray,
-    evidence: Evidence | None = None,
-    rigid: IntArray | None = None,
 ) -> CameraTrust:
     """Return the trust of each camera and the reasons for a low one.
 
+    A rigid group, such as a frame, is judged by the pairs of all its cameras together. Rays to points speak
+    for or against a camera like pairs.
+
     Args:
-        graph: the solved graph.
+        measured: the solved graph.
         locations: (n, d) its solution.
-        angles: (m,) residual angles in radians.
-        sigmas_of_pairs: (m,) standard deviation of each direction in radians, per axis.
+        fit: of its directions.
         sigmas: (n, d) standard deviations of the locations, infinite where nothing holds them.
-        conditioning: how well the pairs hold its k cameras; nodes beyond are points, whose rays speak for or
-            against a camera like pairs.
-        leverages: (m,) share of its own fitted direction that each agreeing pair decides itself; NaN outside
-            the largest rigid piece of those, and everywhere if unknown.
-        evidence: support and contradicting pairs; unknown if None.
-        rigid: (n,) label of the rigid group of each node, such as its frame, which is judged by the pairs of
-            all its cameras together; every node is its own if None.
+        conditioning: how well the pairs hold its k cameras.
     """
-    num_cameras = len(conditioning.num_pairs)
-    votes = _votes(graph, angles, sigmas_of_pairs, evidence)
-    labels = np.arange(graph.num_nodes) if rigid is None else rigid
-    heard, votes = _checked(votes, leverages), votes.of_groups(labels)
+    graph, num_cameras = measured.graph, measured.num_cameras
+    votes = _collect_votes(graph, fit, measured.evidence)
+    labels = np.arange(graph.num_nodes) if measured.groups is None else measured.groups.group_of
+    checked, votes = _discount_unchecked(votes, fit.leverages), votes.of_groups(labels)
     consensus: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
         consensus = find_consensus(len(consensus), votes.pairs, signed)
-    agreement = _shares(heard.of_groups(labels), consensus, int(labels[:num_cameras].max()) + 1)[
+    agreement = _shares(checked.of_groups(labels), consensus, int(labels[:num_cameras].max()) + 1)[
         labels[:num_cameras]
     ]
     consensus = consensus[labels]
@@ -171,12 +152,10 @@ class _Votes:
         return _Votes(pairs[outer], self.agrees[outer], self.weights[outer])
 
 
-def _votes(
-    graph: ViewGraph, angles: FloatArray, sigmas_of_pairs: FloatArray, evidence: Evidence | None
-) -> _Votes:
+def _collect_votes(graph: ViewGraph, fit: PairFit, evidence: Evidence | None) -> _Votes:
     """Collect the pairs that speak, with the weight of their matches."""
     pairs = graph.edges
-    agrees = angles <= np.maximum(_AGREEING_ANGLE_RAD, _AGREEING_SIGMAS * sigmas_of_pairs)
+    agrees = fit.angles_rad <= np.maximum(_AGREEING_ANGLE_RAD, _AGREEING_SIGMAS * fit.sigmas_rad)
     weights = np.full(graph.num_edges, _UNKNOWN_SUPPORT)
     if evidence is not None:
         weights = np.concatenate([evidence.support, evidence.contradicting_support]).astype(np.float64)
@@ -189,7 +168,7 @@ def _votes(
     return _Votes(pairs, agrees, weights)
 
 
-def _checked(votes: _Votes, leverages: FloatArray) -> _Votes:
+def _discount_unchecked(votes: _Votes, leverages: FloatArray) -> _Votes:
     """Return the votes with agreeing pairs counted by how far others check them; as they are if unknown."""
     if not np.isfinite(leverages).any():
         return votes
@@ -207,11 +186,11 @@ def _shares(votes: _Votes, consensus: BoolArray, num_cameras: int) -> FloatArray
         for row, chosen in enumerate((votes.agrees, ~votes.agrees)):
             used = chosen & consensus[other]
             counts[row] += np.bincount(own[used], weights=votes.weights[used], minlength=n)
-    good, heard = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
-    spoken = heard > 0.0
-    median = float(np.median(good[spoken] / heard[spoken])) if spoken.any() else 1.0
+    good, total = counts[0, :num_cameras], counts[:, :num_cameras].sum(axis=0)
+    spoken = total > 0.0
+    median = float(np.median(good[spoken] / total[spoken])) if spoken.any() else 1.0
     median = max(median, _LEAST_MEDIAN)  # a collapsed answer, with which hardly anything agrees
-    return np.asarray((good + 0.5 * median**2 * _PRIOR) / (heard + _PRIOR))
+    return np.asarray((good + 0.5 * median**2 * _PRIOR) / (total + _PRIOR))
 
 
 def find_consensus(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:

@@ -16,9 +16,9 @@ orthogonal to u_e. Three facts make the inverse cheap and the gauge exact:
 F is the centroid and the scale of the cameras that are held and stand among the others; one that nearly
 nothing holds would lend its uncertainty to all, and one that stands far off would set the scale alone.
 
-Directions whose errors are correlated (`shared_noise`) do not have the covariance A^-1. For them the errors
-are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and the
-standard deviations are those of the samples.
+Directions whose errors are correlated (`correlated_errors`) do not have the covariance A^-1. For them the
+errors are sampled: each sample of all directions moves the locations by A^-1 D^T (B Lambda theta / l), and
+the standard deviations are those of the samples.
 
 The leverage of a direction is trace(Lambda_e Cov(B_e^T (t_i - t_j) / l_e)) / (d - 1), in [0, 1]: the share of
 its own fitted value that it decides itself. The leverages of all directions add up to the number of unknowns
@@ -39,12 +39,18 @@ from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
 
-_RIDGES = (1e-12, 1e-10, 1e-8)  # of each block's trace: what nothing holds becomes large, not singular
-_LOOSE = 0.2  # standard deviation, in spreads, from which a camera may not decide the gauge
-_FAR = 10.0  # spreads from the cameras' median, beyond which a camera may not either
+MAX_BYTES = 2_000_000_000
+"""What the factor may take unless something else is asked for; beyond, standard deviations are left out."""
+
+# Shares of each block's trace that are added: what nothing holds becomes large, not singular.
+_RIDGES = (1e-12, 1e-10, 1e-8)
+# A camera may not decide the gauge with a larger standard deviation, in spreads, ...
+_LOOSE = 0.2
+# ... nor if it stands farther from the cameras' median, in spreads.
+_FAR = 10.0
 _LOOSENING_ROUNDS = 20
-_MAX_BYTES = 2_000_000_000  # of the factor; beyond, standard deviations are left out
-_SHORTEST = 1e-12  # of the longest baseline
+# Share of the longest baseline below which a baseline counts as that long.
+_SHORTEST = 1e-12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,7 +78,7 @@ def propagate(
     information: FloatArray,
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
-    max_bytes: int = _MAX_BYTES,
+    max_bytes: int = MAX_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 
@@ -107,7 +113,7 @@ def propagate(
     relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
     leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
-    covariances, gauge = _held(factor, inverse, locations, is_camera)
+    covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
         pulls = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None]
         covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
@@ -168,7 +174,7 @@ def _grounded_factor(
     raise AssertionError("unreachable")
 
 
-def _held(
+def _fix_gauge(
     factor: CholeskyFactor, inverse: SelectedInverse, locations: FloatArray, is_camera: BoolArray
 ) -> tuple[FloatArray, BoolArray]:
     """Return the covariances in the gauge of the cameras that are held, and which these are."""

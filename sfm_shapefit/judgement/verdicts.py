@@ -19,7 +19,6 @@ camera say together is `trust`.
 import enum
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,32 +28,40 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import LooseGroup, condition
-from sfm_shapefit.judgement.group_uncertainty import propagate_groups
-from sfm_shapefit.judgement.trust import Evidence, judge_cameras
-from sfm_shapefit.judgement.uncertainty import propagate
+from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
+from sfm_shapefit.judgement.trust import PairFit, judge_cameras
+from sfm_shapefit.judgement.uncertainty import MAX_BYTES, propagate
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.solver.rigs import largest_tied
-from sfm_shapefit.solver.rigs.groups import RigidGroups
-from sfm_shapefit.viewgraph import ViewGraph
 
-_OUTLIER_PROBABILITY = 3.7e-6  # of a normal residual; in 3D a chi-square of 25, "5 sigma"
-_LARGEST_FITTED_SHARE = 0.3  # keeps the quantile below 0.65, so that a third of the pairs may be wrong
-_LARGEST_SHARE = 0.9  # of the equations taken up by unknowns: beyond, residuals hardly speak
-_EXACTLY_FITTED = 1e-3  # of the median residual; a normal residual is below it once in a million times
-_MIN_FITTED_SHARE = 0.02  # of the pairs: then the locations come from a sum of norms
-_MIN_LEVEL_RAD = 1e-9  # exact data: a finite information all the same
-_LEVEL_ROUNDS = 5  # of "who agrees?" and "how large are the residuals of those who do?"
+# Probability that a normal residual counts as wrong; in 3D a chi-square of 25, "5 sigma".
+_OUTLIER_PROBABILITY = 3.7e-6
+# Keeps the quantile below 0.65, so that a third of the pairs may be wrong.
+_LARGEST_FITTED_SHARE = 0.3
+# Share of the equations that unknowns take up, beyond which residuals hardly speak.
+_LARGEST_SHARE = 0.9
+# Of the median residual; a normal residual is below it once in a million times.
+_EXACTLY_FITTED = 1e-3
+# With so large a share of exactly fitted pairs the locations come from a sum of norms.
+_MIN_FITTED_SHARE = 0.02
+# Exact data have a finite information all the same.
+_MIN_LEVEL_RAD = 1e-9
+# Rounds of "who agrees?" and "how large are the residuals of those who do?".
+_LEVEL_ROUNDS = 5
 _BISECTIONS = 50
-_SMALLEST_RIGID = 3  # cameras; two have no shape, so nothing in it is uncertain
-_PART = 10_000  # directions whose error samples are worked on at a time
+# Cameras; two have no shape, so nothing in it is uncertain.
+_SMALLEST_RIGID = 3
+# Directions whose error samples are worked on at a time.
+_PART = 10_000
+# Noise for which it is asked at least which nodes are loose: with none, none would be.
 _LOOSENING_RAD = 1e-4
-"""Noise for which it is asked at least which nodes are loose: with none, none would be."""
+# Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
+# stands beyond the last does not say how large the scene is.
 _REACHES = (np.inf, 1e3, 30.0)
-"""Median distances within which nodes are asked how uncertain they are, the next where that is singular; what
-stands beyond the last does not say how large the scene is."""
+# Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size.
 _UNCHECKED_LEVERAGE = 0.99
-"""Leverage from which agreement means nothing: an error shows in the residual with 1 % of its size."""
 
 
 class Verdict(enum.Enum):
@@ -106,35 +113,27 @@ class Assessment:
 
 
 def assess(
-    graph: ViewGraph,
+    measured: MeasuredGraph,
     locations: FloatArray,
-    covariance: FloatArray | None = None,
-    evidence: Evidence | None = None,
-    num_cameras: int | None = None,
-    groups: RigidGroups | None = None,
-    held: int | None = None,
-    unheld: IntArray | None = None,
-    factor_memory_mb: int = 2000,
+    *,
+    undetermined_nodes: IntArray | None = None,
+    max_bytes: int = MAX_BYTES,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 
     Args:
-        graph: the solved view graph.
+        measured: the solved graph, with what is known of it; with rigid groups each pair joins two of them.
+            What it has fixed stays where it is; else the mean of the cameras does.
         locations: (n, d) its locations.
-        covariance: (m, d - 1, d - 1) covariance of each direction in `tangent_bases(graph.directions)`,
-            rad^2; NaN where it is unknown, None where all are.
-        evidence: support of the pairs, and pairs that have no direction because their matches contradict the
-            given rotations; unknown if None.
-        num_cameras: k, the first so many nodes are cameras and the others points; all if None.
-        groups: the rigid groups of the nodes, each pair between two of them; every node is its own if None.
-        held: the group that stays where it is; the mean of the cameras does if None.
-        unheld: nodes that stand where they do for want of anything better, such as those that the finish put
-            back: their standard deviations are infinite, and they hold no others; none if None.
-        factor_memory_mb: what the factor for standard deviations may take; of groups it is small.
+        undetermined_nodes: nodes whose position is a placeholder, such as those that the refinement reset:
+            their standard deviations are infinite, and they hold no others; none if None.
+        max_bytes: that the factor for standard deviations may take.
     """
+    graph, groups, k = measured.graph, measured.groups, measured.num_cameras
     freedom = graph.dimension - 1
-    k = graph.num_nodes if num_cameras is None else num_cameras
-    own = np.zeros((graph.num_edges, freedom, freedom)) if covariance is None else np.nan_to_num(covariance)
+    own = np.zeros((graph.num_edges, freedom, freedom))
+    if measured.covariance is not None:
+        own = np.nan_to_num(measured.covariance)
     baselines = differences(locations, graph.edges)
     residuals = _tangential_residuals(graph.directions, baselines)
     behind = along(baselines, graph.directions) <= 0.0
@@ -149,20 +148,19 @@ def assess(
     # Exact directions are propagated as if they had some noise, and scaled back.
     scale = min(float(np.median(sigma_of_pair)) / _LOOSENING_RAD, 1.0)
     information = scale**2 * (bases @ information @ bases.transpose(0, 2, 1))
-    errors = None if evidence is None else evidence.errors
+    errors = None if measured.evidence is None else measured.evidence.errors
     sampled = None if errors is None else _Sampled(errors, excess, scale)
-    separately = partial(_propagated, factor_memory_mb * 1_000_000)
-    propagated = separately if groups is None else partial(_propagated_over, groups, held)
-    holding = inliers if unheld is None else inliers & ~np.isin(graph.edges, unheld).any(axis=1)
-    covariances, leverages = propagated(graph, locations, holding, information, k, sampled)
+    holding = inliers
+    if undetermined_nodes is not None:
+        holding = inliers & ~np.isin(graph.edges, undetermined_nodes).any(axis=1)
+    propagate_all = _propagate_nodes if groups is None else _propagate_groups
+    covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
     leverages[inliers & ~holding] = np.nan
     covariances = scale**2 * covariances
     sigmas = _standard_deviations(covariances)
-    conditioning = condition(locations, graph.edges, inliers, sigmas, k, unheld)
-    rigid = None if groups is None else groups.group_of
-    judged = judge_cameras(
-        graph, locations, angles, sigma_of_pair, sigmas, conditioning, leverages, evidence, rigid
-    )
+    conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
+    fit = PairFit(angles, sigma_of_pair, leverages)
+    judged = judge_cameras(measured, locations, fit, sigmas, conditioning)
     return Assessment(
         residuals_deg=np.degrees(angles),
         inliers=inliers,
@@ -276,49 +274,49 @@ def _standard_deviations(covariances: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
 
 
-def _unheld(locations: FloatArray) -> FloatArray:
+def _infinite_covariances(locations: FloatArray) -> FloatArray:
     """Return the covariances (n, d, d) of locations that nothing holds."""
     n, d = locations.shape
     return np.tile(np.diag(np.full(d, np.inf)), (n, 1, 1))
 
 
-def _propagated(
-    max_bytes: int,
-    graph: ViewGraph,
+def _propagate_nodes(
+    measured: MeasuredGraph,
     locations: FloatArray,
     inliers: BoolArray,
     information: FloatArray,
-    num_cameras: int,
     sampled: _Sampled | None,
+    max_bytes: int,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the covariances (n, d, d) and the leverages (m,).
 
     Only the largest rigid piece of the inlier pairs has any: a loose camera would move the centroid. Where
     baselines of very different lengths make that singular, only its nodes within some radii have any.
     """
-    unknown = np.full_like(_unheld(locations), np.nan), np.where(inliers, np.nan, 0.0)
+    graph, num_cameras = measured.graph, measured.num_cameras
+    unknown = np.full_like(_infinite_covariances(locations), np.nan), np.where(inliers, np.nan, 0.0)
     distances = _distances(locations, num_cameras)
     for reach in _REACHES:
-        covariances = _unheld(locations)
+        covariances = _infinite_covariances(locations)
         leverages = np.where(inliers, np.nan, 0.0)
         used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
         rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
-        held, edges = np.unique(graph.edges[rows], return_inverse=True)
-        cameras = int(np.sum(held < num_cameras))
+        nodes, edges = np.unique(graph.edges[rows], return_inverse=True)
+        cameras = int(np.sum(nodes < num_cameras))
         if cameras < _SMALLEST_RIGID:
             return covariances, leverages
         try:
             samples = None if sampled is None else sampled.parts(graph.directions, rows)
             found = propagate(
-                locations[held], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
+                locations[nodes], edges.reshape(-1, 2), information[rows], cameras, samples, max_bytes
             )
         except UnsolvableError:  # singular in spite of the ridge
             continue
         if found is None:
             return unknown
-        inside = locations[held[distances[held] <= _REACHES[-1]]]
+        inside = locations[nodes[distances[nodes] <= _REACHES[-1]]]
         is_loose = (found.sigmas > _extent(inside)).any(axis=1)
-        covariances[held[~is_loose]] = found.covariances[~is_loose]
+        covariances[nodes[~is_loose]] = found.covariances[~is_loose]
         leverages[rows] = found.leverages
         return covariances, leverages
     return unknown
@@ -336,41 +334,39 @@ def _extent(locations: FloatArray) -> float:
     return float(np.ptp(locations, axis=0).max()) if len(locations) else 0.0
 
 
-def _propagated_over(
-    groups: RigidGroups,
-    held: int | None,
-    graph: ViewGraph,
+def _propagate_groups(
+    measured: MeasuredGraph,
     locations: FloatArray,
     inliers: BoolArray,
     information: FloatArray,
-    num_cameras: int,
     sampled: _Sampled | None,
+    max_bytes: int,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale held.
+    """Return the covariances (n, d, d) and the leverages (m,) of rigid groups, their scale given.
 
-    Only the groups that the inlier pairs tie at these locations have any: those around the one that is held,
-    or most cameras.
+    Only the groups that the inlier pairs tie at these locations have any: those around the fixed one, or most
+    cameras.
     """
-    covariances = _unheld(locations)
+    graph, groups, fixed = measured.graph, measured.groups, measured.fixed_group
+    assert groups is not None
+    covariances = _infinite_covariances(locations)
     leverages = np.where(inliers, np.nan, 0.0)
-    cameras = np.bincount(groups.group_of[:num_cameras], minlength=groups.num_groups)
-    tied = largest_tied(graph.edges[inliers], groups, cameras, locations, around=held)
+    cameras = measured.cameras_per_group
+    tied = largest_tied(graph.edges[inliers], groups, cameras, locations, around=fixed)
     inside = np.isin(groups.group_of, tied)
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
         return covariances, leverages
     nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
-    share = cameras[tied].astype(np.float64) if held is None else (tied == held).astype(np.float64)
+    share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
     samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
-    part = groups.restricted_to(nodes)
+    gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum())
     try:
-        found = propagate_groups(
-            locations[nodes], edges, information[rows], part, share / share.sum(), samples
-        )
+        found = propagate_groups(locations[nodes], edges, information[rows], gauge, samples, max_bytes)
     except UnsolvableError:
         found = None
     if found is None:
-        return np.full_like(covariances, np.nan), leverages
+        return np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
     extent = np.ptp(locations[nodes], axis=0).max()
     is_loose = (found.sigmas > extent).any(axis=1)
     covariances[nodes[~is_loose]] = found.covariances[~is_loose]

@@ -27,8 +27,9 @@ from scipy.sparse import coo_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.triangles import triangle_scores
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.judgement.conditioning import FEW_PAIRS
-from sfm_shapefit.placement.place import count_large, ordered_pieces, refuse_without_triangle
+from sfm_shapefit.judgement.conditioning import FEW_PAIRS, NEARLY_PARALLEL, direction_spread
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.place import count_large, order_pieces, refuse_without_triangle
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import has_second_start
 from sfm_shapefit.rigidity import RigidPiece, left_out_reasons
@@ -41,10 +42,12 @@ WRONG_SCORE_RAD = 0.3
 MAX_THEORY_CAMERAS = 2000
 """The constants of the theorems take time with the cube of the cameras: minutes here."""
 
-_MAX_SCORED_PAIRS = 200_000  # half a minute; beyond, nothing is said of corruption
-_PARALLEL = 0.02  # spread: directions within about 8 degrees, as `judgement.conditioning` has it
-_CONTRADICTED_SHARE = 0.5  # of a camera's pairs
-_SMALLEST_CHECKED = 3  # cameras: fewer have no triangle
+# Beyond so many pairs, which take half a minute, nothing is said of corruption.
+_MAX_SCORED_PAIRS = 200_000
+# Share of a camera's pairs that contradict their triangles, from which its rotation may be wrong.
+_CONTRADICTED_SHARE = 0.5
+# Cameras of a piece: fewer have no triangle.
+_SMALLEST_CHECKED = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,7 +83,7 @@ class Corruption:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
+class PlannedPlacement:
     """What a placement of the largest piece would do."""
 
     solver: str
@@ -110,7 +113,7 @@ class Diagnosis:
     """Cameras outside the largest piece, and why."""
     weak: tuple[WeakCamera, ...]
     corruption: Corruption
-    plan: Plan | None
+    plan: PlannedPlacement | None
     """None if nothing can be placed."""
     obstacle: str
     """Why nothing can be placed; empty if something can."""
@@ -124,25 +127,18 @@ class Theory:
     statement: str
 
 
-def diagnose(
-    graph: ViewGraph,
-    options: PlacementOptions | None = None,
-    num_cameras: int | None = None,
-    contradicting: IntArray | None = None,
-) -> Diagnosis:
+def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | None = None) -> Diagnosis:
     """Diagnose a view graph without solving.
 
     Args:
-        graph: any view graph.
+        measured: any view graph, best with what is known of its pairs.
         options: how it would be placed; defaults if None.
-        num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
-        contradicting: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
+    if isinstance(measured, ViewGraph):
+        measured = MeasuredGraph(measured)
     options = options or PlacementOptions()
-    n = graph.num_nodes if num_cameras is None else num_cameras
-    is_pair = (graph.edges < n).all(axis=1)
-    pairs = ViewGraph(n, graph.edges[is_pair], graph.directions[is_pair], graph.weights[is_pair])
-    pieces = ordered_pieces(graph, n)
+    graph, n, pairs = measured.graph, measured.num_cameras, measured.pair_graph
+    pieces = order_pieces(graph, n)
     obstacle = ""
     try:
         refuse_without_triangle(graph, pieces, n)
@@ -151,20 +147,22 @@ def diagnose(
     scores = triangle_scores(pairs) if pairs.num_edges <= _MAX_SCORED_PAIRS else None
     contradicted: BoolArray = np.zeros(graph.num_edges, dtype=np.bool_)
     if scores is not None:
-        contradicted[is_pair] = scores > WRONG_SCORE_RAD
-    against = np.zeros((0, 2), dtype=np.int64) if contradicting is None else contradicting
+        contradicted[measured.pairs] = scores > WRONG_SCORE_RAD
+    against = np.zeros((0, 2), dtype=np.int64)
+    if measured.evidence is not None:
+        against = measured.evidence.contradicting
     outside = left_out_reasons(graph, [] if obstacle else pieces)
     return Diagnosis(
         dimension=graph.dimension,
         num_cameras=n,
-        num_points=graph.num_nodes - n,
+        num_points=measured.num_points,
         num_pairs=pairs.num_edges,
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
         pieces=_piece_diagnoses(graph, pieces, n),
         left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
-        weak=() if obstacle else _weak_cameras(graph, pieces[0], n, contradicted, against),
+        weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against),
         corruption=_corruption(pairs, scores),
-        plan=None if obstacle else _plan(graph.restricted_to(pieces[0].edges)[0], options),
+        plan=None if obstacle else _plan_placement(graph.restricted_to(pieces[0].edges)[0], options),
         obstacle=obstacle,
     )
 
@@ -204,22 +202,21 @@ def _piece_diagnoses(
     )
 
 
-def _weak_cameras(
-    graph: ViewGraph, piece: RigidPiece, num_cameras: int, contradicted: BoolArray, against: IntArray
+def _find_weak_cameras(
+    measured: MeasuredGraph, piece: RigidPiece, contradicted: BoolArray, against: IntArray
 ) -> tuple[WeakCamera, ...]:
     """Return the cameras of the largest piece that little holds, or that most triangles contradict.
 
     Args:
-        graph: cameras and points.
+        measured: cameras and points.
         piece: its largest piece.
-        num_cameras: nodes beyond are points.
         contradicted: (m,) pairs that are wrong by their triangles; they hold nothing.
         against: (q, 2) pairs without a direction because their matches contradict the rotations.
     """
+    graph, num_cameras = measured.graph, measured.num_cameras
     n = graph.num_nodes
-    ends = graph.edges[piece.edges]
+    ends, is_pair = graph.edges[piece.edges], measured.is_pair[piece.edges]
     wrong = contradicted[piece.edges]
-    is_pair = (ends < num_cameras).all(axis=1)
     num_pairs = np.bincount(ends[is_pair].ravel(), minlength=n)
     num_wrong = np.bincount(ends[wrong].ravel(), minlength=n)
     num_ties = np.bincount(ends.ravel(), minlength=n)
@@ -240,7 +237,7 @@ def _weak_cameras(
                 f"the matches of {num_against[camera]} further pairs contradict the given rotations, more "
                 f"than its {num_pairs[camera]} usable ones: its rotation may be wrong, or the scene repeats"
             )
-        if num_ties[camera] > num_wrong[camera] and spread[camera] < _PARALLEL:
+        if num_ties[camera] > num_wrong[camera] and spread[camera] < NEARLY_PARALLEL:
             reasons.append("the directions that hold it are nearly parallel: it may slide along them")
         if reasons:
             weak.append(
@@ -252,27 +249,6 @@ def _weak_cameras(
                 )
             )
     return tuple(weak)
-
-
-def direction_spread(num_nodes: int, ends: IntArray, directions: FloatArray) -> FloatArray:
-    """Return how far the directions at each node are from parallel, (n,) in [0, 1]; 0 without any.
-
-    The least over the greatest eigenvalue of the sum of I - v v^T: the squared ratio of the singular values
-    of the stacked projectors.
-
-    Args:
-        num_nodes: n.
-        ends: (m, 2) node indices.
-        directions: (m, d) unit vectors.
-    """
-    d = directions.shape[1]
-    projectors = np.eye(d) - directions[:, :, None] * directions[:, None, :]
-    total = np.zeros((num_nodes, d, d))
-    for side in range(2):
-        np.add.at(total, ends[:, side], projectors)
-    eigenvalues = np.linalg.eigvalsh(total)
-    low, high = np.maximum(eigenvalues[:, 0], 0.0), eigenvalues[:, -1]
-    return np.asarray(np.divide(low, high, out=np.zeros(num_nodes), where=high > 0.0))
 
 
 def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
@@ -301,10 +277,10 @@ def _in_triangle(graph: ViewGraph) -> BoolArray:
     return found
 
 
-def _plan(piece: ViewGraph, options: PlacementOptions) -> Plan:
+def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlacement:
     """Return what a placement would do with the largest piece."""
     if not options.solves_shapefit:
-        return Plan(
+        return PlannedPlacement(
             solver=options.objective,
             solver_reason="as asked; ShapeFit is not solved, so nothing is certified",
             second_start=False,
@@ -322,7 +298,9 @@ def _plan(piece: ViewGraph, options: PlacementOptions) -> Plan:
         finish = "LUD is solved too, and the start that fits the angles better is kept"
     if options.objective != "shapefit":
         finish += ", refined in angles" if options.refine else ", unrefined, as asked"
-    return Plan(solver=choice.method, solver_reason=choice.reason, second_start=second, finish=finish)
+    return PlannedPlacement(
+        solver=choice.method, solver_reason=choice.reason, second_start=second, finish=finish
+    )
 
 
 def _granted_in_words(found: RecoveryConditions) -> str:

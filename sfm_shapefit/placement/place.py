@@ -1,7 +1,8 @@
-"""A view graph placed: its rigid pieces, solved, finished, judged. What `locate` and `solve` share.
+"""A measured graph placed: split into pieces, each solved, refined and judged.
 
 Directions say nothing of the scale between two rigid pieces, nor of where they lie, so each is a placement of
-its own. The largest is the answer; the others are kept apart.
+its own. The largest is the answer; the others are kept apart. Rigid groups, such as the frames of rigs and
+the fixed cameras, have one piece, the groups that the pairs tie to one another.
 """
 
 from collections.abc import Iterator
@@ -12,14 +13,16 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.judgement.second_configuration import Rival, find_rival
-from sfm_shapefit.judgement.trust import Evidence
+from sfm_shapefit.judgement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.judgement.verdicts import Assessment, assess
 from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, refuse_options_of_groups
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
-from sfm_shapefit.refinement.starts import Finish, finish
+from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
+from sfm_shapefit.solver.rigs import solve_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
@@ -32,36 +35,44 @@ _MOST_WATCHED = 100_000
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Placement:
-    """The locations of one rigid piece of a view graph, and the evidence for them.
+    """The locations of one rigid piece of a measured graph, and the evidence for them."""
 
-    Nodes of the graph from `num_cameras` on are 3D points, which only help to place the cameras.
-    """
-
-    graph: ViewGraph
+    measured: MeasuredGraph
     """The whole graph."""
-    num_cameras: int
-    """The nodes 0..num_cameras-1 are cameras."""
     dropped: IntArray
     """Its edges that the filter left out, ascending."""
     pieces: list[RigidPiece]
-    """The parallel-rigid pieces of the others, most cameras first."""
+    """The parallel-rigid pieces of the others, most cameras first; or the one of tied rigid groups."""
     piece: int
-    """The one that is solved: 0, the largest, or one of the further ones."""
+    """The one that is placed: 0, the largest, or one of the further ones."""
     solve: SolverResult
     """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
     `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
-    finish: Finish
+    refined: RefinedPlacement
     """The locations that are kept, of the same nodes, and how they were found from that optimum."""
     assessment: Assessment
     """Evidence at these locations for the same nodes and edges, in the solver's units."""
-    rival: Rival | None = None
+    second_configuration: SecondConfiguration | None
     """Another placement that many of the rejected pairs agree on, its nodes those of the graph."""
-    history: tuple[IterationInfo, ...] = ()
+    history: tuple[IterationInfo, ...]
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
-    groups: RigidGroups | None = None
-    """The rigid groups of all nodes of the graph, if nodes do not move one by one."""
-    unit: float | None = None
+    unit: float | None
     """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
+
+    @property
+    def graph(self) -> ViewGraph:
+        """The whole view graph."""
+        return self.measured.graph
+
+    @property
+    def groups(self) -> RigidGroups | None:
+        """The rigid groups of all nodes of the graph, if nodes do not move one by one."""
+        return self.measured.groups
+
+    @property
+    def num_cameras(self) -> int:
+        """The nodes 0..num_cameras-1 of the graph are cameras, the others 3D points."""
+        return self.measured.num_cameras
 
     @property
     def nodes(self) -> IntArray:
@@ -76,7 +87,7 @@ class Placement:
     @property
     def locations(self) -> FloatArray:
         """The centres (k, d) of `cameras`, in the solver's units."""
-        return self.finish.locations[: len(self.cameras)]
+        return self.refined.locations[: len(self.cameras)]
 
     @property
     def edges(self) -> IntArray:
@@ -86,17 +97,17 @@ class Placement:
     @property
     def pairs(self) -> IntArray:
         """Those of `edges` that join two cameras, as rows of everything per edge."""
-        return np.flatnonzero((self.graph.edges[self.edges] < self.num_cameras).all(axis=1))
+        return np.flatnonzero(self.measured.is_pair[self.edges])
 
     @property
     def num_pairs(self) -> int:
         """Pairs of cameras of the whole graph; they stand before the directions to points."""
-        return int(np.sum((self.graph.edges < self.num_cameras).all(axis=1)))
+        return len(self.measured.pairs)
 
     @property
     def considered(self) -> ViewGraph:
         """The whole graph without the edges that the filter left out."""
-        return _without(self.graph, self.dropped)
+        return _drop_edges(self.graph, self.dropped)
 
     @property
     def rejected_pairs(self) -> IntArray:
@@ -105,74 +116,154 @@ class Placement:
         pairs: IntArray = self.graph.edges[self.edges[rejected]]
         return pairs
 
+    def measured_part(self) -> MeasuredGraph:
+        """Return what was measured of the piece that is placed."""
+        return self.measured.part(self.edges)[0]
+
 
 def place(
-    graph: ViewGraph,
+    measured: MeasuredGraph | ViewGraph,
     options: PlacementOptions | None = None,
-    covariance: FloatArray | None = None,
-    evidence: Evidence | None = None,
-    num_cameras: int | None = None,
+    *,
     on_iteration: OnIteration | None = None,
 ) -> Placement:
-    """Solve the largest rigid piece of a view graph, finish it robustly, and judge its pairs and cameras.
+    """Place the cameras of a view graph: pieces, both convex starts, refinement, verdicts, trust.
+
+        graph = ViewGraph(num_cameras, edges, directions)     # (m, 2) pairs (i, j), (m, d) of t_i - t_j
+        placed = place(graph)
+        placed.cameras, placed.locations, placed.assessment.trust
+
+    This is what `sfm-shapefit place` does. `solve` is the certified program alone, whose optimum
+    collapses on long chains and under heavy corruption.
 
     Args:
-        graph: any view graph with at least one edge; what its largest rigid piece leaves out is not placed.
+        measured: any view graph with at least one edge, best with what is known of its directions; what its
+            largest rigid piece leaves out is not placed.
         options: settings; defaults if None.
-        covariance: (m, d - 1, d - 1) of each direction, see `assess`; unknown if None.
-        evidence: support of the edges, and pairs whose matches contradict the rotations, see `assess`.
-        num_cameras: nodes from here on are 3D points, joined to cameras only; none if None.
-        on_iteration: called after each iteration of the solve, on graphs where that costs little.
+        on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
+            False ends the solve there, and the placement goes on from the last iterate.
 
     Raises:
-        UnsolvableError: if a graph of many cameras has no three that are rigid, or see `solve`.
+        InputError: if an option does not go with rigid groups.
+        UnsolvableError: if a graph of many cameras has no three that are rigid, if the pairs do not tie its
+            rigid groups to one another, or see `solve`.
     """
+    if isinstance(measured, ViewGraph):
+        measured = MeasuredGraph(measured)
     options = options or PlacementOptions()
-    num_cameras = graph.num_nodes if num_cameras is None else num_cameras
-    dropped = _dropped_edges(graph, options.filter, num_cameras)
-    considered = _without(graph, dropped)
-    edge_of = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    pieces = [
-        RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges)
-        for piece in ordered_pieces(considered, num_cameras)
-    ]
-    refuse_without_triangle(considered, pieces, num_cameras)
-    parts = dropped, pieces
-    return _place_piece(graph, parts, 0, options, covariance, evidence, num_cameras, on_iteration)
+    dropped, pieces = _split(measured, options)
+    return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
 
 
-def place_further(
-    placement: Placement,
-    options: PlacementOptions | None = None,
-    covariance: FloatArray | None = None,
-    evidence: Evidence | None = None,
-) -> Iterator[Placement]:
-    """Solve the further rigid pieces of at least three cameras, each with a scale of its own.
+def place_further(placement: Placement, options: PlacementOptions | None = None) -> Iterator[Placement]:
+    """Place the further rigid pieces of at least three cameras, each with a scale of its own.
 
     Args:
         placement: the graph and its largest piece.
-        options, covariance, evidence: as they were given to `place`, for the whole graph.
+        options: as they were given to `place`.
 
     Yields:
         Placements, most cameras first; a piece that the solver refuses is left out.
     """
     options = options or PlacementOptions()
-    pieces, num_cameras = placement.pieces, placement.num_cameras
-    for k in range(1, count_large(pieces, num_cameras)):
+    for k in range(1, count_large(placement.pieces, placement.num_cameras)):
         try:
-            parts = placement.dropped, pieces
-            yield _place_piece(placement.graph, parts, k, options, covariance, evidence, num_cameras)
+            yield _place_piece(placement.measured, placement.dropped, placement.pieces, k, options)
         except UnsolvableError:
             continue
 
 
-def _dropped_edges(graph: ViewGraph, name: Filter, num_cameras: int) -> IntArray:
+@one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
+def _place_piece(
+    measured: MeasuredGraph,
+    dropped: IntArray,
+    pieces: list[RigidPiece],
+    k: int,
+    options: PlacementOptions,
+    on_iteration: OnIteration | None = None,
+) -> Placement:
+    """Solve piece k, refine it robustly, and judge its pairs and cameras."""
+    part, _ = measured.part(pieces[k].edges)
+    solved, history = _solve_part(part, options, on_iteration)
+    refined = refine_starts(part, solved, options)
+    unit = None if part.groups is None else measure_unit(part, refined.locations)
+    assessment, second = _judge(part, pieces[k].nodes, refined, options)
+    return Placement(
+        measured=measured,
+        dropped=dropped,
+        pieces=pieces,
+        piece=k,
+        solve=solved,
+        refined=refined,
+        assessment=assessment,
+        second_configuration=second,
+        history=history,
+        unit=unit,
+    )
+
+
+@one_blas_thread()
+def replace_locations(
+    placement: Placement, refined: RefinedPlacement, options: PlacementOptions
+) -> Placement:
+    """Return a placement with other locations of the same nodes, judged anew."""
+    assessment, second = _judge(placement.measured_part(), placement.nodes, refined, options)
+    return replace(placement, refined=refined, assessment=assessment, second_configuration=second)
+
+
+def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:
+    """Return the edges that the filter leaves out, and the pieces of the others, most cameras first."""
+    if measured.groups is not None:
+        refuse_options_of_groups(options)
+        return np.zeros(0, dtype=np.int64), [find_tied_piece(measured)]
+    dropped = _filter_pairs(measured, options.filter)
+    considered = _drop_edges(measured.graph, dropped)
+    edge_of = np.setdiff1d(np.arange(measured.graph.num_edges), dropped)
+    pieces = order_pieces(considered, measured.num_cameras)
+    refuse_without_triangle(considered, pieces, measured.num_cameras)
+    return dropped, [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
+
+
+def _solve_part(
+    part: MeasuredGraph, options: PlacementOptions, on_iteration: OnIteration | None
+) -> tuple[SolverResult, tuple[IterationInfo, ...]]:
+    """Return the optimum of the convex program, or a baseline's answer, and the iterations that led to it."""
+    history: list[IterationInfo] = []
+
+    def watch(info: IterationInfo) -> bool | None:
+        history.append(info)
+        return None if on_iteration is None else on_iteration(info)
+
+    watched = watch if part.graph.num_edges <= _MOST_WATCHED else None
+    if part.groups is not None:
+        solved = solve_groups(part.graph, part.groups, options, watched)
+    elif options.solves_shapefit:
+        solved = solve(part.graph, options, on_iteration=watched)
+    else:
+        solved = solve_baseline(part.graph, options.objective)
+    return solved, tuple(history)
+
+
+def _judge(
+    part: MeasuredGraph, nodes: IntArray, refined: RefinedPlacement, options: PlacementOptions
+) -> tuple[Assessment, SecondConfiguration | None]:
+    """Return the verdicts on a refined part, whose nodes these are in the whole graph."""
+    assessment = assess(
+        part,
+        refined.locations,
+        undetermined_nodes=refined.reset_nodes,
+        max_bytes=options.factor_memory_mb * 1_000_000,
+    )
+    second = find_second_configuration(part.graph, part.pairs, assessment.inliers, assessment.level_deg)
+    return assessment, None if second is None else replace(second, cameras=nodes[second.cameras])
+
+
+def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:
     """Return the edges that a filter leaves out; it looks at pairs of cameras only."""
-    pairs = np.flatnonzero((graph.edges < num_cameras).all(axis=1))
+    pairs = measured.pairs
     if name == "none":
         return pairs[:0]
-    between = ViewGraph(num_cameras, graph.edges[pairs], graph.directions[pairs], graph.weights[pairs])
-    dropped: IntArray = pairs[~FILTERS[name](between)]
+    dropped: IntArray = pairs[~FILTERS[name](measured.pair_graph)]
     if len(dropped) == len(pairs):
         raise UnsolvableError(
             f"the filter {name} leaves none of the {len(pairs)} pairs; use another, or none"
@@ -180,7 +271,7 @@ def _dropped_edges(graph: ViewGraph, name: Filter, num_cameras: int) -> IntArray
     return dropped
 
 
-def _without(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
+def _drop_edges(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
     """Return a graph of the same nodes without some of its edges."""
     if len(dropped) == 0:
         return graph
@@ -188,7 +279,7 @@ def _without(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
     return graph.subset(kept)
 
 
-def ordered_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
+def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:
     """Return the rigid pieces, most cameras first; nodes from `num_cameras` on are points."""
     return sorted(rigid_pieces(graph), key=lambda piece: -int(np.sum(piece.nodes < num_cameras)))
 
@@ -205,64 +296,3 @@ def refuse_without_triangle(graph: ViewGraph, pieces: list[RigidPiece], num_came
             f"the {graph.num_edges} usable directions tie no three cameras to one another; "
             "match more pairs, above all pairs that close triangles"
         )
-
-
-@one_blas_thread()  # as `solve`: bits must depend neither on the machine nor on what runs beside
-def _place_piece(
-    graph: ViewGraph,
-    parts: tuple[IntArray, list[RigidPiece]],
-    k: int,
-    options: PlacementOptions,
-    covariance: FloatArray | None,
-    evidence: Evidence | None,
-    num_cameras: int,
-    on_iteration: OnIteration | None = None,
-) -> Placement:
-    """Solve piece k, finish it robustly, and judge its pairs and cameras; arguments as of `place`.
-
-    `parts` are the edges that the filter left out, and the pieces of the others.
-    """
-    dropped, pieces = parts
-    nodes, edges = pieces[k].nodes, pieces[k].edges
-    piece, _ = graph.restricted_to(edges)
-    known = None if covariance is None else covariance[edges]
-    classes = np.max(graph.edges[edges] >= num_cameras, axis=1).astype(np.int64)
-    heard = evidence and evidence.restricted_to(edges, nodes, graph.num_nodes)
-    history: list[IterationInfo] = []
-
-    def watch(info: IterationInfo) -> bool | None:
-        history.append(info)
-        return None if on_iteration is None else on_iteration(info)
-
-    solved, finished = _solved(piece, options, known, classes, watch)
-    placed = int(np.sum(nodes < num_cameras))
-    memory, back = options.factor_memory_mb, finished.put_back
-    assessment = assess(piece, finished.locations, known, heard, placed, unheld=back, factor_memory_mb=memory)
-    rival = find_rival(piece, np.flatnonzero(classes == 0), assessment.inliers, assessment.level_deg)
-    return Placement(
-        graph=graph,
-        num_cameras=num_cameras,
-        dropped=dropped,
-        pieces=pieces,
-        piece=k,
-        solve=solved,
-        finish=finished,
-        assessment=assessment,
-        rival=None if rival is None else replace(rival, cameras=nodes[rival.cameras]),
-        history=tuple(history),
-    )
-
-
-def _solved(
-    piece: ViewGraph,
-    options: PlacementOptions,
-    covariance: FloatArray | None,
-    classes: IntArray,
-    watch: OnIteration,
-) -> tuple[SolverResult, Finish]:
-    """Solve and finish a rigid graph."""
-    if options.solves_shapefit:
-        solved = solve(piece, options, on_iteration=watch if piece.num_edges <= _MOST_WATCHED else None)
-    else:
-        solved = solve_baseline(piece, options.objective)
-    return solved, finish(piece, solved, options, covariance, classes)

@@ -1,58 +1,57 @@
-"""Let position priors pull the cameras: opt-in, after they have set scale, origin and axes."""
+"""Position priors that pull the cameras: opt-in, after they have set scale, origin and axes."""
 
 from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH
-from sfm_shapefit.judgement.trust import Evidence
-from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors
-from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.place import Placement, replace_locations
 from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
-from sfm_shapefit.refinement.angular import Metric
+from sfm_shapefit.refinement.angular import KERNEL_WIDTH, Metric
+from sfm_shapefit.refinement.options import PlacementOptions
 
 
-def pulled(
-    placement: Placement,
-    gauge: Gauge,
-    priors: PositionPriors,
-    covariance: FloatArray,
-    evidence: Evidence,
+def pull_to_priors(
+    placement: Placement, gauge: Gauge, priors: PositionPriors, options: PlacementOptions
 ) -> tuple[Placement, Gauge]:
     """Return the placement refined on directions and priors together and judged anew, and its gauge.
+
+    A camera that the refinement had thrown out of the scene and put back stays undetermined, unless a prior
+    holds it where it is now.
 
     Args:
         placement: cameras placed by directions, and points with them.
         gauge: in which the priors are, from `prior_gauge`.
         priors: of the images.
-        covariance: (m, 2, 2) of the directions of the whole graph.
-        evidence: for the whole graph.
+        options: as they were given to `place`.
+
+    Raises:
+        UnsolvableError: if the factor would take more memory than the options allow.
     """
-    nodes, edges = placement.nodes, placement.edges
-    piece, _ = placement.graph.restricted_to(edges)
-    known = covariance[edges]
-    classes = np.max(placement.graph.edges[edges] >= placement.num_cameras, axis=1).astype(np.int64)
-    own = priors.of(nodes)
-    start = gauge.similarity.apply(placement.finish.locations)
-    anchors = _anchors(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
-    levels = np.radians(np.array(placement.finish.levels_deg))
-    moved = refine_anchored(piece, start, Metric(known, classes), levels, anchors)
-    locations = (moved - gauge.similarity.translation) / gauge.similarity.scale
-    heard = evidence.restricted_to(edges, nodes, placement.graph.num_nodes)
+    part, refined = placement.measured_part(), placement.refined
+    own = priors.of(placement.nodes)
+    start = gauge.similarity.apply(refined.locations)
+    anchors = _anchor(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
+    levels = np.radians(np.array(refined.levels_deg))
+    metric = Metric(part.covariance, part.classes)
+    moved = refine_anchored(
+        part.graph, start, metric, levels, anchors, max_bytes=options.factor_memory_mb * 1_000_000
+    )
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
+    kept = replace(
+        refined,
+        locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
+        reset_nodes=np.setdiff1d(refined.reset_nodes, _find_held_nodes(moved, anchors)),
+    )
     return (
-        replace(
-            placement,
-            finish=replace(placement.finish, locations=locations),
-            assessment=assess(piece, locations, known, heard, len(placement.cameras)),
-        ),
+        replace_locations(placement, kept, options),
         replace(gauge, statement=f"{gauge.statement}; the priors moved cameras by {by:.3g} (median)"),
     )
 
 
-def _anchors(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anchors:
+def _anchor(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anchors:
     """Return the priors in the input's axes; those of unknown covariance get that of their residuals."""
     positions = priors.positions @ axes
     residuals = np.linalg.norm(start[priors.cameras] - positions, axis=1)
@@ -61,3 +60,10 @@ def _anchors(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anc
     covariances[~np.isfinite(covariances).all(axis=(1, 2))] = level**2 * np.eye(3)
     information = np.linalg.inv(axes.T @ covariances @ axes)
     return Anchors(priors.cameras, positions, np.asarray(information, dtype=np.float64))
+
+
+def _find_held_nodes(locations: FloatArray, anchors: Anchors) -> IntArray:
+    """Return the nodes whose prior agrees with their location (n, 3): it has half its weight or more."""
+    off = locations[anchors.nodes] - anchors.positions
+    chi2 = np.einsum("ka,kab,kb->k", off, anchors.information, off)
+    return np.asarray(anchors.nodes[chi2 <= KERNEL_WIDTH**2])

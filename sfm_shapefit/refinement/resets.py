@@ -24,17 +24,26 @@ from sfm_shapefit.geometry import fit_similarity_l1, median_spread
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
-_REACH = 3.0  # times the largest distance of the start, both in median distances; a sound fit moves by shares
-_FARTHER = 10.0  # from one radius to the next
-_LEAST_AGREEMENT = 0.5  # of the pairs that leave a group
-_FEWEST_AGREEING = 2  # of them with the rest: along a single direction a group may slide
-_FEWEST_OTHERS = 3  # nodes that say where the start lies
-_ROUNDING = 1e-14  # of the largest eigenvalue
-_UNKNOWN = 1e-12  # information instead: a standard deviation of a million distances
-_OPEN_SHARE = 1.0 / 3.0  # standard deviation of a distance, of itself: three of them reach to the rest
+# Distance of a stray, in the largest distance of the start, both in median distances. A sound refinement
+# moves cameras by a fraction of the radius, not by 3 radii.
+_REACH = 3.0
+# Each radius at which strays are looked for, in the one before.
+_FARTHER = 10.0
+# Share of the pairs that leave a group which must agree if the rest holds the group.
+_LEAST_AGREEMENT = 0.5
+# Pairs with the rest that must agree: along a single direction a group may slide.
+_FEWEST_AGREEING = 2
+# Nodes that must stay in the scene to say where the start lies.
+_FEWEST_OTHERS = 3
+# Eigenvalues below this share of the largest are rounding; they count as this much information instead,
+# which is a standard deviation of a million distances.
+_ROUNDING = 1e-14
+_UNKNOWN = 1e-12
+# A distance is open if its standard deviation is a larger share of it: three of them reach to the rest.
+_OPEN_SHARE = 1.0 / 3.0
 
 
-def strays(
+def find_strays(
     graph: ViewGraph, start: FloatArray, refined: FloatArray, agreeing: BoolArray, noise_rad: FloatArray
 ) -> IntArray:
     """Return the nodes that left the scene and that the rest does not hold where they are, ascending.
@@ -48,7 +57,7 @@ def strays(
     found: BoolArray = np.zeros(graph.num_nodes, dtype=np.bool_)
     reach = _REACH
     while (far := left_scene(start, refined, reach)).any():
-        found |= _unheld(graph, refined, far, agreeing, noise_rad)
+        found |= _find_drifting(graph, refined, far, agreeing, noise_rad)
         reach *= _FARTHER
     return np.flatnonzero(found).astype(np.int64)
 
@@ -64,7 +73,7 @@ def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) ->
     return far if np.sum(~far) >= _FEWEST_OTHERS else np.zeros_like(far)
 
 
-def _unheld(
+def _find_drifting(
     graph: ViewGraph, refined: FloatArray, far: BoolArray, agreeing: BoolArray, noise_rad: FloatArray
 ) -> BoolArray:
     """Return those of the far nodes, (n,), whose group the others do not hold where it is."""

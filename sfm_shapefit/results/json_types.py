@@ -232,12 +232,10 @@ class MapSummary(TypedDict):
 
 
 class Expected(TypedDict):
-    """What `locate` will take on this machine."""
+    """The memory that `locate` will take."""
 
     memory_mb: Annotated[dict[str, float], "Peak of each stage in millions of bytes."]
-    seconds: Annotated[dict[str, float], "Processor time of each stage on this machine."]
     peak_mb: float
-    total_s: float
 
 
 class InspectSummary(TypedDict):

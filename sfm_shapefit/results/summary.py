@@ -10,7 +10,7 @@ from sfm_shapefit import __version__
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.refinement.starts import Finish
+from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.results import json_types
 from sfm_shapefit.results.json_types import (
     BundleAdjustment,
@@ -64,7 +64,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "rigid_groups": _summarize_groups(found),
         "pieces": _pieces_of(found),
         "solve": cast("Solve", found.certified.summary()),
-        "finish": _summarize_finish(placement.finish),
+        "finish": _summarize_finish(placement.refined),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": None if found.adjusted is None else _summarize_adjustment(found.adjusted),
         "timings_s": found.timings_s,
@@ -93,7 +93,7 @@ def summarize_graph(found: "GraphResult") -> GraphSummary:
             placement, [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)]
         ),
         "solve": cast("Solve", placement.solve.summary()),
-        "finish": _summarize_finish(placement.finish),
+        "finish": _summarize_finish(placement.refined),
         "timings_s": found.timings_s,
         "warnings": list(graph_warnings(placement)),
         "versions": _versions(),
@@ -154,19 +154,19 @@ def _loose_groups(placement: Placement) -> list[LooseGroup]:
     ]
 
 
-def _summarize_finish(finish: Finish) -> json_types.Finish:
-    lud = finish.lud
+def _summarize_finish(refined: RefinedPlacement) -> json_types.Finish:
+    lud = refined.lud
     return {
-        "start": finish.start,
-        "refined": finish.refined,
-        "reason": finish.reason,
-        "disagreement": finish.disagreement,
-        "costs": finish.costs,
-        "levels_deg": list(finish.levels_deg),
-        "moved_median": finish.moved[0],
-        "moved_max": finish.moved[1],
-        "num_turned_pairs": finish.num_turned_pairs,
-        "num_put_back": finish.num_put_back,
+        "start": refined.start,
+        "refined": refined.is_refined,
+        "reason": refined.reason,
+        "disagreement": refined.disagreement,
+        "costs": refined.costs,
+        "levels_deg": list(refined.levels_deg),
+        "moved_median": refined.moved[0],
+        "moved_max": refined.moved[1],
+        "num_turned_pairs": refined.num_turned_pairs,
+        "num_put_back": len(refined.reset_nodes),
         "lud": None
         if lud is None
         else {

@@ -17,8 +17,14 @@ if TYPE_CHECKING:  # numpy is not cheap
 
 Solver = Literal["auto", "newton", "admm", "conic"]
 
+NO_FACTOR = 0
+"""The `factor_memory_mb` with which nothing is factored that can be left out."""
+
 MAX_THREADS = 256
 """Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
+
+NO_FACTOR = 0
+"""The `factor_memory` with which nothing is factored that can be left out."""
 
 
 class Status(enum.Enum):
@@ -92,7 +98,7 @@ class SolverOptions(Settings):
             raise ValueError(f"tol must lie in (0, 1), got {self.tol}")
         if self.max_iterations is not None:
             self.check_range("max_iterations", 1)
-        self.check_range("factor_memory_mb", 1)
+        self.check_range("factor_memory_mb", NO_FACTOR)
         self.check_range("threads", 0, MAX_THREADS)
 
     def num_threads(self) -> int:

@@ -10,6 +10,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.tracks import Tracks, build_tracks, covering_set, join_points
 from sfm_shapefit.evaluation import evaluate_poses
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
 
 PIXEL = 1e-3  # rad
@@ -206,8 +207,8 @@ def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_can
     joint = join_points(graph, covariance, tracks, np.full(len(centers), 1e-3))
     errors = {}
     for name, placement in (
-        ("pairs", place(graph, covariance=covariance)),
-        ("points", place(joint.graph, covariance=joint.covariance, num_cameras=joint.num_cameras)),
+        ("pairs", place(MeasuredGraph(graph, covariance=covariance))),
+        ("points", place(joint)),
     ):
         assert len(placement.cameras) == len(centers)
         names = [str(k) for k in range(len(centers))]
@@ -236,7 +237,7 @@ def test_a_camera_that_the_points_do_not_determine_is_left_out():
     graph = ViewGraph(len(centers), pairs[keep], directions[keep])
     covariance = np.broadcast_to(1e-6 * np.eye(2), (graph.num_edges, 2, 2))
     joint = join_points(graph, covariance, without, np.full(len(centers), 1e-3))
-    placement = place(joint.graph, covariance=joint.covariance, num_cameras=joint.num_cameras)
+    placement = place(joint)
     np.testing.assert_array_equal(placement.cameras, np.arange(len(centers) - 1))
 
 

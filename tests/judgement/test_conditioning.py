@@ -6,6 +6,7 @@ import pytest
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import Looseness
 from sfm_shapefit.judgement.verdicts import assess
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
@@ -19,7 +20,11 @@ def judged(t, edges):
     errors = SIGMA * np.random.default_rng(0).standard_normal((len(edges), t.shape[1] - 1))
     v = normalized(v + np.einsum("edk,ek->ed", tangent_bases(v), errors))
     return assess(
-        ViewGraph(len(t), edges, v), t, np.tile(SIGMA**2 * np.eye(t.shape[1] - 1), (len(edges), 1, 1))
+        MeasuredGraph(
+            ViewGraph(len(t), edges, v),
+            covariance=np.tile(SIGMA**2 * np.eye(t.shape[1] - 1), (len(edges), 1, 1)),
+        ),
+        t,
     )
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.judgement.second_configuration import find_rival
+from sfm_shapefit.judgement.second_configuration import find_second_configuration
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import quality_warnings
 from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
@@ -13,7 +13,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 def judged(problem, inliers=None, level_deg=0.5):
     graph = problem.view_graph
     inliers = ~problem.corrupted if inliers is None else inliers
-    return find_rival(graph, np.arange(graph.num_edges), inliers, level_deg)
+    return find_second_configuration(graph, np.arange(graph.num_edges), inliers, level_deg)
 
 
 @pytest.mark.parametrize("q", [0.25, 0.4])
@@ -45,7 +45,7 @@ def test_pairs_that_just_suffice_to_place_their_cameras_are_no_rival():
     inliers[few] = False
     kept = np.concatenate([few, np.flatnonzero(inliers)[:300]])  # so that they are many enough to matter
     graph = ViewGraph(60, problem.edges[kept], problem.directions[kept])
-    assert find_rival(graph, np.arange(len(kept)), inliers[kept], 0.5) is None
+    assert find_second_configuration(graph, np.arange(len(kept)), inliers[kept], 0.5) is None
 
 
 def test_a_few_pairs_that_agree_are_no_rival():
@@ -56,7 +56,9 @@ def test_a_few_pairs_that_agree_are_no_rival():
 def test_directions_to_points_are_not_heard():
     problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.4, seed=5, corruption="self-consistent")
     graph = problem.view_graph
-    assert find_rival(graph, np.flatnonzero(~problem.corrupted), ~problem.corrupted, 0.5) is None
+    assert (
+        find_second_configuration(graph, np.flatnonzero(~problem.corrupted), ~problem.corrupted, 0.5) is None
+    )
 
 
 def test_a_placement_with_a_rival_warns_and_names_its_cameras():
@@ -66,7 +68,7 @@ def test_a_placement_with_a_rival_warns_and_names_its_cameras():
     )  # camera 0 stays out, and the others keep their numbers
     graph = ViewGraph(62, edges, np.concatenate([[[1.0, 0.0, 0.0]], problem.directions]))
     placement = place(graph)
-    assert placement.rival is not None
-    assert set(placement.rival.cameras.tolist()) <= set(range(1, 61))
-    assert len(placement.rival.cameras) > 55
+    assert placement.second_configuration is not None
+    assert set(placement.second_configuration.cameras.tolist()) <= set(range(1, 61))
+    assert len(placement.second_configuration.cameras) > 55
     assert any("agree with one another" in sentence for sentence in quality_warnings(placement))

@@ -6,8 +6,9 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.judgement.conditioning import condition
-from sfm_shapefit.judgement.trust import Evidence, find_consensus, judge_cameras
+from sfm_shapefit.judgement.trust import PairFit, find_consensus, judge_cameras
 from sfm_shapefit.judgement.verdicts import assess
+from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -34,7 +35,7 @@ def supported(count, support=100):
 
 def test_cameras_of_a_clean_graph_are_fully_trusted_without_reasons():
     t, edges, v = clean(20, 0)
-    found = assess(ViewGraph(20, edges, v), t, evidence=supported(len(edges)))
+    found = assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=supported(len(edges))), t)
     assert found.trust.min() > 0.99
     assert set(found.reasons) == {""}
 
@@ -51,7 +52,7 @@ def test_a_group_that_agrees_only_with_itself_is_not_trusted():
         contradicting=np.zeros((0, 2), dtype=np.int64),
         contradicting_support=np.zeros(0, dtype=np.int64),
     )
-    found = assess(ViewGraph(30, edges, v), t, evidence=evidence)
+    found = assess(MeasuredGraph(ViewGraph(30, edges, v), evidence=evidence), t)
     assert found.trust[:7].max() < 0.3
     assert found.trust[7:].min() > 0.9
     assert "rotation" in found.reasons[0]
@@ -63,7 +64,7 @@ def test_pairs_without_a_direction_speak_against_their_cameras_too():
     own = int(np.sum(edges == 3))
     heavy = np.full(len(against), 200 * own // len(against))
     evidence = Evidence(support=np.full(len(edges), 30), contradicting=against, contradicting_support=heavy)
-    found = assess(ViewGraph(20, edges, v), t, evidence=evidence)
+    found = assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=evidence), t)
     assert np.argmin(found.trust) == 3
     assert found.trust[3] < 0.5
     assert np.delete(found.trust, 3).min() > 0.6
@@ -74,7 +75,7 @@ def test_where_a_part_of_the_pairs_is_wrong_everywhere_nobody_is_blamed():
     rng = np.random.default_rng(3)
     bad = rng.random(len(edges)) < 0.35
     v[bad] = normalized(rng.standard_normal((int(bad.sum()), 3)))
-    assert assess(ViewGraph(40, edges, v), t, evidence=supported(len(edges))).trust.min() > 0.7
+    assert assess(MeasuredGraph(ViewGraph(40, edges, v), evidence=supported(len(edges))), t).trust.min() > 0.7
 
 
 def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
@@ -86,7 +87,7 @@ def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
         contradicting=against,
         contradicting_support=np.full(len(against), 60),
     )
-    assert assess(ViewGraph(40, edges, v), t, evidence=evidence).trust.min() > 0.6
+    assert assess(MeasuredGraph(ViewGraph(40, edges, v), evidence=evidence), t).trust.min() > 0.6
 
 
 def judged(n, seed, wrong_share, leverages_of_5):
@@ -97,9 +98,8 @@ def judged(n, seed, wrong_share, leverages_of_5):
     angles, sigmas = np.where(wrong, 1.0, 1e-3), np.full((n, 3), 1e-6)
     leverages = np.where(own, leverages_of_5, 0.1)
     held = condition(t, edges, ~wrong, sigmas, n)
-    return judge_cameras(
-        ViewGraph(n, edges, v), t, angles, np.full(len(edges), 1e-3), sigmas, held, leverages
-    ).trust
+    fit = PairFit(angles, np.full(len(edges), 1e-3), leverages)
+    return judge_cameras(MeasuredGraph(ViewGraph(n, edges, v)), t, fit, sigmas, held).trust
 
 
 def test_pairs_that_nothing_checks_are_no_evidence():
@@ -122,7 +122,10 @@ def test_one_pair_of_thousands_of_matches_does_not_outvote_the_others():
     v[own[1:]] = normalized(np.random.default_rng(7).standard_normal((len(own) - 1, 3)))
     support = np.full(len(edges), 100)
     support[own[0]] = 100_000
-    assert assess(ViewGraph(20, edges, v), t, evidence=supported(len(edges), support)).trust[3] < 0.5
+    assert (
+        assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=supported(len(edges), support)), t).trust[3]
+        < 0.5
+    )
 
 
 def test_evidence_follows_its_cameras_and_pairs():
@@ -132,7 +135,7 @@ def test_evidence_follows_its_cameras_and_pairs():
         contradicting_support=np.array([7, 8, 9]),
         errors=np.arange(3.0)[:, None, None] * np.ones((3, 5, 2)),
     )
-    part = evidence.restricted_to(np.array([2, 0]), np.array([0, 2, 4]), 5)
+    part = evidence.part(np.array([2, 0]), np.array([0, 2, 4]), 5)
     assert part.support.tolist() == [30, 10]
     assert part.contradicting.tolist() == [[0, 2], [1, 2]]
     assert part.contradicting_support.tolist() == [7, 8]

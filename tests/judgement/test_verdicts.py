@@ -5,8 +5,8 @@ import pytest
 
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import Looseness
-from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.judgement.verdicts import Verdict, assess
+from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
@@ -48,7 +48,7 @@ def test_wrong_and_reversed_directions_are_outliers_and_good_ones_are_not():
     v[3] = normalized(np.cross(v[3], v[4]))
     v[7] = -v[7]
     t = fitted(t, edges, v, np.delete(np.arange(len(edges)), [3, 7]))
-    found = assess(ViewGraph(12, edges, v), t, covariances(len(edges)))
+    found = assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=covariances(len(edges))), t)
     assert np.flatnonzero(~found.inliers).tolist() == [3, 7]
     assert found.residuals_deg[3] == pytest.approx(90.0, abs=5.0)
     assert found.residuals_deg[7] == pytest.approx(180.0, abs=5.0)
@@ -62,8 +62,8 @@ def test_a_pair_that_knows_it_is_uncertain_is_not_blamed():
     sure, unsure = covariances(len(edges)), covariances(len(edges))
     unsure[3] = 0.1**2 * np.eye(2)
     graph = ViewGraph(12, edges, v)
-    assert not assess(graph, t, sure).inliers[3]
-    assert assess(graph, t, unsure).inliers[3]
+    assert not assess(MeasuredGraph(graph, covariance=sure), t).inliers[3]
+    assert assess(MeasuredGraph(graph, covariance=unsure), t).inliers[3]
 
 
 def test_a_reversed_direction_is_an_outlier_however_uncertain_it_is():
@@ -71,13 +71,13 @@ def test_a_reversed_direction_is_an_outlier_however_uncertain_it_is():
     v[3] = -v[3]
     unsure = covariances(len(edges))
     unsure[3] = 2.0**2 * np.eye(2)
-    assert not assess(ViewGraph(12, edges, v), t, unsure).inliers[3]
+    assert not assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=unsure), t).inliers[3]
 
 
 def test_unknown_covariances_are_judged_by_the_common_level():
     t, edges, v = measured(3)
     v[3] = normalized(np.cross(v[3], v[4]))
-    found = assess(ViewGraph(12, edges, v), t, np.full((len(edges), 2, 2), np.nan))
+    found = assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=np.full((len(edges), 2, 2), np.nan)), t)
     assert np.flatnonzero(~found.inliers).tolist() == [3]
 
 
@@ -88,7 +88,9 @@ def test_standard_deviations_cover_the_errors_of_least_squares(stated):
     for seed in range(20):
         t, edges, v = measured(100 + seed, n=14)
         found = fitted(t, edges, v)
-        judged = assess(ViewGraph(14, edges, v), found, covariances(len(edges), stated * SIGMA))
+        judged = assess(
+            MeasuredGraph(ViewGraph(14, edges, v), covariance=covariances(len(edges), stated * SIGMA)), found
+        )
         centred, truth = found - found.mean(axis=0), t - t.mean(axis=0)
         errors = centred - truth * np.sum(centred**2) / np.sum(centred * truth)
         within.append(np.abs(errors) < judged.sigmas)
@@ -100,10 +102,10 @@ def test_the_excess_is_what_the_covariances_leave_unexplained():
     t, edges, v = measured(4, n=30)
     t = fitted(t, edges, v)
     graph = ViewGraph(30, edges, v)
-    assert assess(graph, t, covariances(len(edges), 0.6 * SIGMA)).excess_deg == pytest.approx(
-        np.degrees(0.8 * SIGMA), rel=0.15
-    )
-    assert assess(graph, t, covariances(len(edges), 1.2 * SIGMA)).excess_deg < 1e-6
+    assert assess(
+        MeasuredGraph(graph, covariance=covariances(len(edges), 0.6 * SIGMA)), t
+    ).excess_deg == pytest.approx(np.degrees(0.8 * SIGMA), rel=0.15)
+    assert assess(MeasuredGraph(graph, covariance=covariances(len(edges), 1.2 * SIGMA)), t).excess_deg < 1e-6
 
 
 def test_a_pair_that_no_other_checks_is_undetermined():
@@ -115,7 +117,7 @@ def test_a_pair_that_no_other_checks_is_undetermined():
     v = np.concatenate([v, normalized(differences(t, own))])
     sure = covariances(len(edges))
     sure[-2] *= 1e4  # two directions hold a point; of an exact and a rough one nothing checks the exact one
-    found = assess(ViewGraph(9, edges, v), t, sure)
+    found = assess(MeasuredGraph(ViewGraph(9, edges, v), covariance=sure), t)
     assert found.verdict(len(edges) - 1) is Verdict.UNDETERMINED
     assert found.verdict(0) is Verdict.INLIER
     assert found.leverages[-1] > 0.99
@@ -125,7 +127,7 @@ def test_a_camera_that_no_agreeing_pair_holds_has_infinite_uncertainty():
     t, edges, v = measured(6)
     own = np.flatnonzero((edges == 4).any(axis=1))
     v[own] = -v[own]
-    found = assess(ViewGraph(12, edges, v), t, covariances(len(edges)))
+    found = assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=covariances(len(edges))), t)
     assert np.isinf(found.sigmas[4]).all()
     assert np.isfinite(np.delete(found.sigmas, 4, axis=0)).all()
     assert found.trust[4] == 0.0
@@ -134,7 +136,7 @@ def test_a_camera_that_no_agreeing_pair_holds_has_infinite_uncertainty():
 def test_coincident_cameras_do_not_produce_nan():
     t, edges, v = measured(7)
     t[1] = t[0]
-    found = assess(ViewGraph(12, edges, v), t, covariances(len(edges)))
+    found = assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=covariances(len(edges))), t)
     assert np.isfinite(found.residuals_deg).all()
     assert not np.isnan(found.sigmas).any()
     assert not found.inliers[0]
@@ -148,11 +150,11 @@ def test_cameras_that_fly_far_outside_are_not_trusted_and_cost_the_others_nothin
     v = normalized(differences(t, edges))
     noise = SIGMA * np.random.default_rng(8).standard_normal((len(edges), 2))
     v = normalized(v + np.einsum("edk,ek->ed", tangent_bases(v), noise))
-    found = assess(ViewGraph(20, edges, v), t)
+    found = assess(MeasuredGraph(ViewGraph(20, edges, v)), t)
     assert found.trust[17:].max() < 1e-6
     assert (found.sigmas[17:].max(axis=1) > 1.0).all()
     without = edges.max(axis=1) < 17
-    alone = assess(ViewGraph(17, edges[without], v[without]), t[:17])
+    alone = assess(MeasuredGraph(ViewGraph(17, edges[without], v[without])), t[:17])
     assert found.trust[:17].min() > 0.9
     np.testing.assert_allclose(found.sigmas[:17], alone.sigmas, rtol=0.5)
 
@@ -160,7 +162,7 @@ def test_cameras_that_fly_far_outside_are_not_trusted_and_cost_the_others_nothin
 def test_nodes_that_nothing_is_said_to_hold_hold_no_others():
     t, edges, v = measured(9)
     graph, own = ViewGraph(12, edges, v), (edges == 5).any(axis=1)
-    found = assess(graph, t, unheld=np.array([5]))
+    found = assess(MeasuredGraph(graph), t, undetermined_nodes=np.array([5]))
     assert np.isinf(found.sigmas[5]).all()
     assert found.trust[5] == 0.0
     assert found.reasons[5] == Looseness.DISTANCE.value
@@ -170,10 +172,10 @@ def test_nodes_that_nothing_is_said_to_hold_hold_no_others():
     first = int(np.flatnonzero(own)[0])
     assert found.verdict(first) is Verdict.UNDETERMINED
     others, _ = graph.restricted_to(np.flatnonzero(~own))
-    alone = assess(others, np.delete(t, 5, axis=0))
+    alone = assess(MeasuredGraph(others), np.delete(t, 5, axis=0))
     np.testing.assert_allclose(np.delete(found.sigmas, 5, axis=0), alone.sigmas, rtol=0.1)
     assert np.delete(found.trust, 5).min() > 0.9
-    assert assess(graph, t, unheld=np.empty(0, dtype=np.int64)).trust[5] > 0.9
+    assert assess(MeasuredGraph(graph), t, undetermined_nodes=np.empty(0, dtype=np.int64)).trust[5] > 0.9
 
 
 def test_errors_that_pairs_share_widen_the_standard_deviations():
@@ -189,6 +191,8 @@ def test_errors_that_pairs_share_widen_the_standard_deviations():
             contradicting_support=np.zeros(0, dtype=np.int64),
             errors=size * SIGMA * unit,
         )
-        return assess(graph, where, covariances(len(edges)), evidence).sigmas
+        return assess(
+            MeasuredGraph(graph, covariance=covariances(len(edges)), evidence=evidence), where
+        ).sigmas
 
     np.testing.assert_allclose(sigmas(6.0), 3.0 * sigmas(2.0), rtol=0.25)  # 1 if only the excess counted

@@ -8,7 +8,9 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
 from sfm_shapefit.formats import graph_text
-from sfm_shapefit.placement.diagnosis import diagnose, direction_spread, theory_of
+from sfm_shapefit.judgement.conditioning import direction_spread
+from sfm_shapefit.measured import Evidence, MeasuredGraph
+from sfm_shapefit.placement.diagnosis import diagnose, theory_of
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import (
@@ -91,8 +93,11 @@ def test_a_camera_of_contradicting_matches_is_weak():
     t = np.random.default_rng(3).standard_normal((8, 3))
     graph = exact_graph(t, [pair for pair in all_pairs(8) if pair not in {(0, 7), (1, 7), (2, 7), (3, 7)}])
     against = np.array([(0, 7), (1, 7), (2, 7), (3, 7)])
+    evidence = Evidence(
+        support=np.full(graph.num_edges, 50), contradicting=against, contradicting_support=np.full(4, 50)
+    )
     assert diagnose(graph).weak == ()
-    (weak,) = diagnose(graph, contradicting=against).weak
+    (weak,) = diagnose(MeasuredGraph(graph, evidence=evidence)).weak
     assert weak.name == "7"
     assert "matches of 4 further pairs contradict the given rotations" in weak.reasons[0]
 
@@ -100,7 +105,7 @@ def test_a_camera_of_contradicting_matches_is_weak():
 def test_rays_to_points_hold_a_camera_too():
     t = np.random.default_rng(4).standard_normal((9, 3))
     edges = all_pairs(5) + [(0, 5), (1, 5)] + [(k, p) for p in (6, 7, 8) for k in (0, 2, 3, 5)]
-    seen = diagnose(exact_graph(t, edges), num_cameras=6)
+    seen = diagnose(MeasuredGraph(exact_graph(t, edges), num_points=3))
     assert (seen.num_cameras, seen.num_points, seen.num_pairs) == (6, 3, 12)
     assert seen.weak == ()
     assert [camera.name for camera in diagnose(exact_graph(t[:6], edges[:12])).weak] == ["5"]
@@ -120,7 +125,7 @@ def test_the_plan_is_what_a_placement_does(method):
     plan, done = diagnose(graph, options).plan, place(graph, options)
     assert plan.solver == done.solve.method
     assert done.solve.method_reason.startswith(plan.solver_reason)
-    assert plan.second_start == (done.finish.lud is not None)
+    assert plan.second_start == (done.refined.lud is not None)
     assert isinstance(options, SolverOptions)
 
 

@@ -7,6 +7,7 @@ import pytest
 
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
 from sfm_shapefit.solver.program import differences
@@ -45,8 +46,8 @@ def test_covariances_belong_to_the_pairs_of_the_solved_piece():
     soft = sharp.copy()
     soft[bent] = 0.1**2 * np.eye(2)
     # The pair is wrong by 50 of its own sigmas, or by half of one.
-    assert place(graph, covariance=sharp).rejected_pairs.tolist() == [edges[bent].tolist()]
-    assert len(place(graph, covariance=soft).rejected_pairs) == 0
+    assert place(MeasuredGraph(graph, covariance=sharp)).rejected_pairs.tolist() == [edges[bent].tolist()]
+    assert len(place(MeasuredGraph(graph, covariance=soft)).rejected_pairs) == 0
 
 
 def test_rows_speak_of_the_whole_graph():

@@ -71,7 +71,7 @@ def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
     placement = place(problem.view_graph)
     best = shape_error(oracle(problem), problem.locations)
     assert len(placement.cameras) == len(problem.locations)
-    assert not placement.finish.collapsed
+    assert not placement.refined.collapsed
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best  # measured 1.02 to 1.04
     assert shape_error(placement.solve.locations, problem.locations) > 1.5 * best
 
@@ -80,7 +80,7 @@ def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
 def test_chains_on_which_shapefit_collapses_are_placed(family):
     problem = CHAINS[family]()
     placement = place(problem.view_graph)
-    finish = placement.finish
+    finish = placement.refined
     assert finish.lud is not None
     assert shape_error(placement.solve.locations, problem.locations) > 0.3
     assert finish.collapsed

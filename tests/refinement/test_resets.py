@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import median_spread, normalized
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.refinement.resets import left_scene, openness, put_back, strays
-from sfm_shapefit.refinement.starts import finish
+from sfm_shapefit.refinement.resets import find_strays, left_scene, openness, put_back
+from sfm_shapefit.refinement.starts import refine_starts
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic import random_graph_problem
@@ -35,7 +36,7 @@ def joining(graph: ViewGraph, *nodes: int):
 
 def found_strays(graph: ViewGraph, start, refined, agreeing, noise_rad=1e-4) -> list[int]:
     noise = np.full(graph.num_edges, noise_rad)
-    return strays(graph, start, refined, agreeing, noise).tolist()
+    return find_strays(graph, start, refined, agreeing, noise).tolist()
 
 
 def test_a_node_far_away_that_contradicts_the_rest_is_a_stray():
@@ -122,12 +123,12 @@ def test_cameras_without_a_right_pair_stay_in_the_scene():
     edges = np.concatenate([problem.edges[sound], wrong])
     random_ones = normalized(rng.standard_normal((len(wrong), 3)))
     graph = ViewGraph(60, edges, np.concatenate([problem.directions[sound], random_ones]))
-    found = finish(graph, solve(graph), PlacementOptions())
+    found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
     distances = np.linalg.norm(found.locations - np.median(found.locations, axis=0), axis=1)
     # A convex start has all within about 10 median distances here, and 3 times that is allowed.
     assert distances.max() < 30.0 * median_spread(found.locations)
-    assert found.num_put_back > 0
-    assert f"{found.num_put_back} thrown out of the scene and put back" in found.statement()
+    assert len(found.reset_nodes) > 0
+    assert f"{len(found.reset_nodes)} thrown out of the scene and put back" in found.statement()
     body, truth = found.locations[:loose], problem.locations[:loose]
     assert shape_error(body, truth) < 0.01
 
@@ -135,8 +136,8 @@ def test_cameras_without_a_right_pair_stay_in_the_scene():
 def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     problem = random_graph_problem(40, 0.5, sigma=0.02, q=0.2, seed=2)
     graph = problem.view_graph
-    found = finish(graph, solve(graph), PlacementOptions())
-    assert found.num_put_back == 0
+    found = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions())
+    assert len(found.reset_nodes) == 0
     start = solve(graph).locations if found.start == "ShapeFit" else found.lud.locations
     before, after = (
         np.linalg.norm(normalized(differences(t, graph.edges)) - graph.directions, axis=1)
@@ -145,8 +146,8 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     )
     assert found.num_turned_pairs == np.sum(before != after) > 0
     assert f"{found.num_turned_pairs} directions of theirs went from agreeing" in found.statement()
-    unrefined = finish(graph, solve(graph), PlacementOptions(refine=False))
-    assert (unrefined.num_turned_pairs, unrefined.num_put_back) == (0, 0)
+    unrefined = refine_starts(MeasuredGraph(graph), solve(graph), PlacementOptions(refine=False))
+    assert (unrefined.num_turned_pairs, len(unrefined.reset_nodes)) == (0, 0)
 
 
 # --- what nothing holds at its distance ------------------------------------------------------------

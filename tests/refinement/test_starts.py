@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, finish
+from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refine_starts
 from sfm_shapefit.results import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
@@ -24,7 +25,7 @@ from tests.problems import shape_error
 
 def finished(problem, **options):
     graph, settings = problem.view_graph, PlacementOptions(**options)
-    return finish(graph, solve(graph, settings), settings)
+    return refine_starts(MeasuredGraph(graph), solve(graph, settings), settings)
 
 
 @pytest.fixture(scope="module")
@@ -68,9 +69,9 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
     options = PlacementOptions(objective="shapefit")
     placement = place(graph, options)
     assert np.array_equal(placement.locations, placement.solve.locations)
-    assert not placement.finish.refined
-    assert placement.finish.start == "ShapeFit"
-    assert "as asked" in placement.finish.statement()
+    assert not placement.refined.is_refined
+    assert placement.refined.start == "ShapeFit"
+    assert "as asked" in placement.refined.statement()
     warnings = [w for w in quality_warnings(placement) if "disagree about lengths" in w]
     assert len(warnings) == 1
     assert "--objective auto" in warnings[0]
@@ -78,23 +79,23 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
 
 def test_lud_is_taken_whatever_its_fit_if_asked(expander):
     found = finished(expander, objective="lud")
-    assert (found.start, found.refined) == ("LUD", True)
+    assert (found.start, found.is_refined) == ("LUD", True)
     raw = finished(expander, objective="lud", refine=False)
     assert shape_error(raw.locations, raw.lud.locations) < 1e-12
-    assert not raw.refined
+    assert not raw.is_refined
     assert raw.statement() == "LUD, not refined: LUD, as asked"
 
 
 def test_without_refinement_the_start_that_fits_better_is_kept_as_it_is(chain):
     found = finished(chain, refine=False)
     assert found.start == "LUD"
-    assert not found.refined
+    assert not found.is_refined
     assert found.moved == (0.0, 0.0)
     assert shape_error(found.locations, found.lud.locations) < 1e-12
 
 
 def start(name: str) -> Start:
-    return Start(name=name, locations=np.eye(3), refined=None, put_back=np.empty(0, dtype=np.int64))
+    return Start(name=name, locations=np.eye(3), refined=None, reset_nodes=np.empty(0, dtype=np.int64))
 
 
 @pytest.mark.parametrize(
@@ -124,7 +125,7 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
         assert found.lud is None
         assert found.disagreement is None
         assert not found.collapsed
-        assert found.refined
+        assert found.is_refined
         assert "no second start" in found.reason
 
 
@@ -136,7 +137,7 @@ def test_noise_free_answers_are_exact_and_not_made_worse(d):
     problem = random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
     graph = problem.view_graph
     certified = solve(graph)
-    found = finish(graph, certified, PlacementOptions())
+    found = refine_starts(MeasuredGraph(graph), certified, PlacementOptions())
     assert shape_error(found.locations, problem.locations) < 1e-9
     # Rounding apart: the certified answer is exact to 1e-9 itself, or better.
     assert (
@@ -166,10 +167,10 @@ def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
     with monkeypatch.context() as patch:
         patch.setattr(angular, "_MAX_FLOPS", 10.0)
         found = finished(expander)  # without a factor, and as good
-        assert found.refined
+        assert found.is_refined
         np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
     found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
-    assert not found.refined
+    assert not found.is_refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
 
@@ -214,13 +215,15 @@ def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
     street = street_problem(60, 10, seed=3)
     n = street.num_cameras
     graph = ViewGraph(len(street.locations), street.edges, street.directions)
-    joint = place(graph, covariance=street.covariance, num_cameras=n)
+    joint = place(MeasuredGraph(graph, covariance=street.covariance, num_points=graph.num_nodes - n))
     assert shape_error(joint.locations, street.locations[joint.cameras]) < 0.01
     pairs = (street.edges < n).all(axis=1)
     bare = place(
-        ViewGraph(n, street.edges[pairs], street.directions[pairs]), covariance=street.covariance[pairs]
+        MeasuredGraph(
+            ViewGraph(n, street.edges[pairs], street.directions[pairs]), covariance=street.covariance[pairs]
+        )
     )
     assert shape_error(bare.locations, street.locations[bare.cameras]) > 0.03
-    pair_level, ray_level = joint.finish.levels_deg  # 0.01 / sqrt(3) and 0.001 / sqrt(3) rad, and some excess
+    pair_level, ray_level = joint.refined.levels_deg  # 0.01 and 0.001 rad over sqrt(3), and some excess
     assert pair_level == pytest.approx(0.33, rel=0.5)
     assert ray_level == pytest.approx(0.033, rel=0.5)

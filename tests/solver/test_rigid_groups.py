@@ -7,7 +7,8 @@ import pytest
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.placement.rigs import place_groups
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.reduction import factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
@@ -336,7 +337,7 @@ def test_without_offsets_nothing_is_tied_for_the_scale_is_open():
     flat = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(groups.offsets))
     assert len(largest_tied(graph.edges, flat, np.bincount(flat.group_of))) == 1
     with pytest.raises(UnsolvableError, match="nothing determines the scale"):
-        place_groups(graph, flat)
+        place(MeasuredGraph(graph, groups=flat))
 
 
 def test_the_set_around_a_group_is_found_even_where_another_is_larger():
@@ -393,10 +394,10 @@ def test_the_placement_has_the_errors_that_it_states():
     noise, errors, stated = 0.003, [], []
     for seed in range(3):
         graph, groups, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
-        placed = place_groups(graph, groups)
+        placed = place(MeasuredGraph(graph, groups=groups))
         errors.append(centred(placed.locations / placed.unit) - centred(t))
         stated.append(placed.assessment.sigmas / placed.unit)
-        assert placed.finish.refined
+        assert placed.refined.is_refined
         assert placed.assessment.trust.min() > 0.9
         assert groups.fit(placed.locations)[1] < 1e-9
     rms, said = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, stated))
@@ -410,7 +411,7 @@ def test_a_frame_whose_pairs_are_wrong_is_not_trusted_as_a_whole():
     v = graph.directions.copy()
     touched = (groups.group_of[graph.edges] == 4).any(axis=1)
     v[touched] = normalized(rng.normal(size=v.shape))[touched]
-    placed = place_groups(ViewGraph(graph.num_nodes, graph.edges, v, graph.weights), groups)
+    placed = place(MeasuredGraph(ViewGraph(graph.num_nodes, graph.edges, v, graph.weights), groups=groups))
     trust = placed.assessment.trust
     spoilt = groups.group_of[placed.cameras] == 4
     assert len(set(trust[spoilt])) == 1  # one judgement for all cameras of a frame
@@ -427,7 +428,9 @@ def test_fixed_nodes_keep_their_shape_and_the_others_find_their_scale():
     wrong = rng.random(len(edges)) < 0.2
     v[wrong] = normalized(rng.normal(size=v.shape))[wrong]
     fixed = np.arange(24) < 8
-    placed = place_groups(ViewGraph(24, edges, v), separate(24, 3).with_fixed(fixed, t), held=0)
+    placed = place(
+        MeasuredGraph(ViewGraph(24, edges, v), groups=separate(24, 3).with_fixed(fixed, t), fixed_group=0)
+    )
     still = fixed[placed.cameras]
     found = placed.locations / placed.unit
     found = found + (t[placed.cameras][still] - found[still]).mean(axis=0)
@@ -443,4 +446,4 @@ def test_offsets_that_the_directions_contradict_are_an_error_not_a_scale():
     graph, groups, _ = rig_problem(14, wrong=0.0)
     mirrored = RigidGroups(group_of=groups.group_of, offsets=-groups.offsets)
     with pytest.raises(UnsolvableError, match="contradict the known offsets"):
-        place_groups(graph, mirrored)
+        place(MeasuredGraph(graph, groups=mirrored))

@@ -2,16 +2,21 @@
 
 from pathlib import Path
 
+import numpy as np
+
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.priors import database_priors, table_priors
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.commands.stages.rigs import Rigid
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.gauge import (
     Gauge,
     PositionPriors,
     distance_gauge,
     input_gauge,
+    metric_gauge,
+    moved_gauge,
     prior_gauge,
     unit_gauge,
 )
@@ -40,21 +45,56 @@ def read_priors(
     return database_priors(inputs.database, model)
 
 
-def chosen_gauge(
+def choose_gauge(
+    model: PosedModel,
+    placement: Placement,
+    kept: BoolArray,
+    rigid: Rigid,
+    options: LocateOptions,
+    priors: PositionPriors | None,
+) -> Gauge:
+    """Return scale, origin and axes of the output.
+
+    Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
+    given, else the input. A single fixed camera moves only the origin.
+
+    Args:
+        model: the input.
+        placement: its solution.
+        kept: which of the placement's cameras are in the output.
+        rigid: what of the model is rigid.
+        options: what is asked for.
+        priors: of the images; None if they are not wanted.
+
+    Raises:
+        InputError: if what is asked for is not determined.
+        UnsolvableError: if the only fixed image is not placed.
+    """
+    cameras = placement.cameras[kept]
+    locations, centers = placement.locations[kept], model.centers[cameras]
+    fixed = rigid.fixed[cameras]
+    if placement.unit is not None:
+        return metric_gauge(locations, placement.unit, centers, fixed, has_rigs=model.has_rigs)
+    gauge = _choose_scale(model, placement, kept, options, priors)
+    if not rigid.fixed.any():
+        return gauge
+    name = model.names[int(np.argmax(rigid.fixed))]
+    if not fixed.any():
+        raise UnsolvableError(f"{name} is to stay where it is, but the matches do not tie it to the others")
+    return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
+
+
+def _choose_scale(
     model: PosedModel,
     placement: Placement,
     kept: BoolArray,
     options: LocateOptions,
     priors: PositionPriors | None,
 ) -> Gauge:
-    """Return the gauge asked for; "auto" takes a known distance, else priors that are given, else the input.
-
-    Raises:
-        InputError: if what is asked for is not determined.
-    """
+    """Return the gauge that is asked for, where no group knows the scale."""
     cameras, locations = placement.cameras[kept], placement.locations[kept]
     if options.known_distance:
-        return _known_distance(model, placement, kept, options.known_distance)
+        return _gauge_of_distance(model, placement, kept, options.known_distance)
     if priors is not None:
         return prior_gauge(locations, priors.of(cameras))
     if options.scale == "unit":
@@ -62,7 +102,7 @@ def chosen_gauge(
     return input_gauge(locations, model.centers[cameras])
 
 
-def _known_distance(
+def _gauge_of_distance(
     model: PosedModel, placement: Placement, kept: BoolArray, known: tuple[str, str, float]
 ) -> Gauge:
     """Return the gauge of the known distance of two cameras, by their names."""

@@ -12,7 +12,7 @@ from sfm_shapefit.colmap.model import PosedModel, track_matches
 from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.options import Source
+from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.results import Inputs
 
 if TYPE_CHECKING:
@@ -63,21 +63,25 @@ class MatchSource:
             num_matches=0 if database is None else database.num_matches,
             num_edges=num_pairs,
             num_nodes=model.num_images,
-            num_sampled=0,
-            has_points=False,
-            factor_entries=0,
-            factor_flops=0.0,
         )
+
+    def with_economy(self, economy: Economy) -> "MatchSource":
+        """Return the same source, which gives up so much for memory."""
+        if self.database is not None:
+            self.database.limit_rays(economy.rays_bytes)
+        return replace(self, economy=economy)
 
 
 @contextmanager
-def open_source(model: PosedModel, inputs: Inputs, max_memory_mb: int = 0) -> Iterator[MatchSource]:
+def open_source(
+    model: PosedModel, inputs: Inputs, options: LocateOptions | None = None
+) -> Iterator[MatchSource]:
     """Open the matches that were chosen, and close them in the end.
 
     Args:
         model: whose images they belong to.
         inputs: what was chosen.
-        max_memory_mb: limit of the peak memory in MB, which decides the economy; 0 for none.
+        options: whose limit of memory decides what is given up; None for no limit.
 
     Raises:
         InputError: if the matches cannot be read, or there is no way to stay below the limit.
@@ -87,10 +91,10 @@ def open_source(model: PosedModel, inputs: Inputs, max_memory_mb: int = 0) -> It
         return
     with open_database(inputs.database, model) as database:
         source = MatchSource(model=model, kind=inputs.source, database=database)
-        if max_memory_mb:
-            economy = choose_economy(source.workload(), max_memory_mb)
-            database.limit_rays(economy.rays_bytes)
-            source = replace(source, economy=economy)
+        if options is not None and options.max_memory_mb:
+            bare = source.workload()
+            work = replace(bare, has_points=options.uses_points(model.num_images))
+            source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
         yield source
 
 

@@ -10,6 +10,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.execution import directions_of, shared_out
 from sfm_shapefit.commands.stages.inputs import MatchSource
+from sfm_shapefit.commands.stages.memory import Workload
 from sfm_shapefit.directions.pair_directions import (
     CONTRADICTIONS,
     DirectionStatus,
@@ -17,16 +18,17 @@ from sfm_shapefit.directions.pair_directions import (
     concatenate,
 )
 from sfm_shapefit.directions.relative_poses import from_relative_poses
-from sfm_shapefit.directions.tracks import JointGraph, build_tracks, covering_set, join_points
+from sfm_shapefit.directions.tracks import build_tracks, covering_set, join_points
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
-from sfm_shapefit.judgement.trust import Evidence
+from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"
-_MAX_SAMPLED_PAIRS = 100_000  # beyond, standard deviations take the pairs as independent
+# Beyond so many pairs standard deviations take the pairs as independent.
+_MAX_SAMPLED_PAIRS = 100_000
 _ADVICE = {
     DirectionStatus.TOO_FEW_MATCHES: "match more, or lower min_inliers",
     DirectionStatus.FEW_INLIERS: "match more, or lower min_inliers",
@@ -83,12 +85,12 @@ def view_graph(model: PosedModel, directions: PairDirections) -> ViewGraph:
     )
 
 
-def joint_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> JointGraph:
-    """Return the view graph, with 3D points as further nodes if the options want them."""
+def build_graph(source: MatchSource, directions: PairDirections, options: LocateOptions) -> MeasuredGraph:
+    """Return the measured graph, with 3D points as further nodes if the options want them."""
     model = source.model
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
     if not (options.uses_points(model.num_images) and source.economy.points):
-        return JointGraph(graph=graph, covariance=covariance, num_cameras=model.num_images)
+        return MeasuredGraph(graph, covariance=covariance)
     pixel_angles = 1.0 / model.focal_lengths_px
     tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
     chosen = tracks.subset(covering_set(tracks, model.num_images))
@@ -102,16 +104,17 @@ def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
     return len(directions.usable()) <= _MAX_SAMPLED_PAIRS
 
 
-def without_points(joint: JointGraph) -> JointGraph:
-    """Return the pairs of cameras alone; they stand before the rays to points."""
-    graph, k = joint.graph, joint.num_cameras
-    rows = np.flatnonzero((graph.edges < k).all(axis=1))
-    names = None if graph.names is None else graph.names[:k]
-    pairs = ViewGraph(k, graph.edges[rows], graph.directions[rows], graph.weights[rows], names)
-    return JointGraph(graph=pairs, covariance=joint.covariance[rows], num_cameras=k)
+def count_work(source: MatchSource, directions: PairDirections) -> Workload:
+    """Return what there is to do, as far as it is known once the directions are measured."""
+    return replace(
+        source.workload(),
+        num_pairs=len(directions.pairs),
+        num_matches=int(directions.num_matches.sum()),
+        num_sampled=len(directions.usable()) if samples_errors(source, directions) else 0,
+    )
 
 
-def shared_errors(
+def sample_errors(
     source: MatchSource, directions: PairDirections, options: LocateOptions
 ) -> FloatArray | None:
     """Return samples of the usable directions' errors, which share keypoints; None if not known."""
@@ -136,7 +139,7 @@ def shared_errors(
     return errors[usable]
 
 
-def evidence_of(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
+def collect_evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
     """Return what the matches say of the cameras beyond the usable directions."""
     usable = directions.usable()
     against = [k for k, status in enumerate(directions.status) if status in CONTRADICTIONS]
@@ -148,13 +151,20 @@ def evidence_of(directions: PairDirections, errors: FloatArray | None = None) ->
     )
 
 
-def with_points(evidence: Evidence, joint: JointGraph) -> Evidence:
-    """Return the evidence with a row for each direction to a point: one match, errors of their own."""
-    own = joint.covariance[len(evidence.support) :]
+def add_evidence(
+    measured: MeasuredGraph, source: MatchSource, directions: PairDirections, options: LocateOptions
+) -> MeasuredGraph:
+    """Return the measured graph with what the matches say; a direction to a point has one match.
+
+    The errors of directions to points are independent draws of their own covariance.
+    """
+    evidence = collect_evidence(directions, sample_errors(source, directions, options))
+    assert measured.covariance is not None
+    own = measured.covariance[len(evidence.support) :]
     support = np.concatenate([evidence.support, np.ones(len(own), dtype=np.int64)])
-    if evidence.errors is None:
-        return replace(evidence, support=support)
-    draws = np.random.default_rng(0).standard_normal((len(own), *evidence.errors.shape[1:]))
-    sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
-    errors = np.concatenate([evidence.errors, sigmas[:, None, :] * draws])
-    return replace(evidence, support=support, errors=errors)
+    errors = evidence.errors
+    if errors is not None:
+        draws = np.random.default_rng(0).standard_normal((len(own), *errors.shape[1:]))
+        sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
+        errors = np.concatenate([errors, sigmas[:, None, :] * draws])
+    return measured.with_evidence(replace(evidence, support=support, errors=errors))

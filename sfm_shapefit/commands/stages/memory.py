@@ -1,41 +1,45 @@
-"""How much memory and time `locate` will take, told from the counts of its input and its graph.
+"""How much memory `locate` will take, told beforehand, and what is given up to stay below a limit.
 
-Every stage is linear in what it works on: keypoints, matches, pairs, edges of the graph, entries of the
-factor and multiplications of the factorisation, which the symbolic analysis knows beforehand. The rates
-below were fitted to runs on six sets of 25 to 10,000 images (scripts/results/endtoend.md). Memory is
-counted in bytes per item, time in multiples of a small kernel that is timed on the machine at hand: some
-sorting, which is bound by the scalar processor and the caches, and some multiplication of matrices, as the
-stages are.
+The peak is that of the worst stage, for memory is handed back between stages. Every stage is linear in what
+it works on: keypoints, matches, pairs, edges of the graph, and entries of the factor, which the symbolic
+analysis knows beforehand. The bytes per item below were fitted to runs on six sets of 25 to 10,000 images
+(scripts/results.md, Reliability).
 
-The peak is that of the worst stage, for memory is handed back between stages. What can be saved is listed
-in `ECONOMIES`, the cheapest first; `choose_economy` takes the first that fits.
+The limit is looked at twice before anything is solved: with the counts of the database, and once the graph is
+known. What can be given up is listed in `ECONOMIES`, the cheapest first; the first that fits is taken.
 """
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.laplacian.cholesky import analyse
+from sfm_shapefit.laplacian.operators import adjacency
+from sfm_shapefit.laplacian.ordering import best_order
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.solver.solve import choose_method
+from sfm_shapefit.solver.splitting.linear import predict_factor
 
 _MB = 1e6
-_REFERENCE_S = 0.017  # the kernel's time where the rates were measured
-_REPETITIONS = 5
-
-_STARTED_B = 195e6  # the interpreter with all that `locate` imports
-_KERNELS_B = 110e6  # compiled code, thread pools, database pages
-_SAMPLES = 96  # of each sampled direction error, two numbers each
-_BLOCK = 9  # entries of a block of the factor
-_STEPS = 36.0  # factorisations of both refinements together, and about as much for the convex starts
+# The interpreter with all that `locate` imports.
+_STARTED_BYTES = 195e6
+# Compiled code, thread pools, pages of the database.
+_KERNELS_BYTES = 110e6
+# Samples of each direction error, two numbers each.
+_SAMPLES = 96
+# Entries of a block of the factor.
+_BLOCK = 9
 
 BATCH = 2_000_000
 """Matches that are read at a time where memory is no concern."""
 RAYS_BYTES = 1_000_000_000
 """Of the rays of keypoints that are kept for the next pair, where memory is no concern."""
-FACTOR_BYTES = 2_000_000_000
-"""What one factor may take where memory is no concern."""
+_SMALL_BATCH, _FEW_RAYS_BYTES = 200_000, 50_000_000
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,21 +55,21 @@ class Workload:
     """Directions that are solved, those from cameras to points included."""
     num_nodes: int
     """Cameras and points that are solved."""
-    num_sampled: int
+    num_sampled: int = 0
     """Directions whose errors are sampled; 0 where they count as independent."""
-    has_points: bool
+    has_points: bool = False
     """Whether 3D points join the graph."""
-    factor_entries: int
+    factor_entries: int = 0
     """Blocks of the factor, its stack included; 0 where there is none."""
-    factor_flops: float
-    """Multiplications of the factorisation, in blocks."""
+    needs_factor: bool = False
+    """Whether the factor cannot be given up, since the solve itself, or priors that pull, work with it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Economy:
     """What is given up for memory."""
 
-    statement: str
+    statement: str = ""
     """What that is, for the user; empty for nothing."""
     batch: int = BATCH
     """Matches that are read at a time."""
@@ -79,41 +83,32 @@ class Economy:
     """Whether there is a factor for the refinement and the standard deviations."""
 
 
-_SMALL_BATCH, _FEW_RAYS_BYTES = 200_000, 50_000_000
-_BATCHES = "matches are read in small batches"
-_INDEPENDENT = "directions count as independent in standard deviations"
-_NO_POINTS = "no 3D points join the view graph"
-_UNREFINED = "locations are neither refined nor have they standard deviations"
-
-
-def _economies() -> Iterator[Economy]:
-    """Yield what can be given up, the cheapest first."""
-    economy = Economy(statement="")
+def _list_economies() -> Iterator[Economy]:
+    """Yield what can be given up, the cheapest first, each with all that comes before it."""
+    economy = Economy()
     yield economy
     given_up: list[str] = []
     for what, changes in (
-        (_BATCHES, {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
-        (_INDEPENDENT, {"samples": False}),
-        (_NO_POINTS, {"points": False}),
-        (_UNREFINED, {"factor": False}),
+        ("matches are read in small batches", {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
+        ("directions count as independent in standard deviations", {"samples": False}),
+        ("no 3D points join the view graph", {"points": False}),
+        ("locations are neither refined nor have they standard deviations", {"factor": False}),
     ):
         given_up.append(what)
         economy = replace(economy, statement=", ".join(given_up), **changes)
         yield economy
 
 
-ECONOMIES = tuple(_economies())
+ECONOMIES = tuple(_list_economies())
 """The cheapest first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """Peak memory and time of `locate`, by stage."""
+    """Peak memory of `locate`, by stage."""
 
     memory_mb: dict[str, float]
     """Peak of each stage in millions of bytes."""
-    seconds: dict[str, float]
-    """Processor time of each stage on this machine."""
 
     @property
     def peak_mb(self) -> float:
@@ -121,63 +116,101 @@ class Forecast:
         return max(self.memory_mb.values())
 
     @property
-    def total_s(self) -> float:
-        """Processor time in all; the wall clock shows less where threads help, more where others compete."""
-        return sum(self.seconds.values())
-
-    @property
     def statement(self) -> str:
         """What to expect, a sentence for the user."""
         worst = max(self.memory_mb, key=self.memory_mb.__getitem__)
-        longest = max(self.seconds, key=self.seconds.__getitem__)
-        return (
-            f"about {self.peak_mb:.0f} MB at most (while {worst}) and {self.total_s:.0f} s of processor time "
-            f"(most of it {longest})"
-        )
+        return f"about {self.peak_mb:.0f} MB at most (while {worst})"
 
 
-def forecast(work: Workload, economy: Economy = ECONOMIES[0], speed: float = 1.0) -> Forecast:
-    """Return what a run will take.
+def forecast(work: Workload, economy: Economy = ECONOMIES[0]) -> Forecast:
+    """Return what a run will take, if so much is given up for memory."""
+    return Forecast(memory_mb={stage: size / _MB for stage, size in _peaks(work, economy).items()})
+
+
+def choose_economy(
+    work: Workload, without_points: Workload, limit_mb: float, least: Economy = ECONOMIES[0]
+) -> Economy:
+    """Return the cheapest economy whose forecast stays below a limit.
 
     Args:
         work: what there is to do.
-        economy: what is given up for memory.
-        speed: of this machine, from `measure_speed`; 1 is that on which the rates were measured.
-    """
-    memory = {stage: size / _MB for stage, size in _peaks(work, economy).items()}
-    return Forecast(
-        memory_mb=memory, seconds={stage: s / speed for stage, s in _times(work, economy).items()}
-    )
-
-
-def choose_economy(work: Workload, limit_mb: float) -> Economy:
-    """Return the cheapest economy whose forecast stays below a limit.
+        without_points: what there is to do if no 3D points join the graph.
+        limit_mb: that the peak may not exceed.
+        least: what is given up already.
 
     Raises:
         InputError: if none does; the message has the number needed.
     """
-    for economy in ECONOMIES:
-        if forecast(work, economy).peak_mb <= limit_mb:
+    needed = np.inf
+    for economy in ECONOMIES[ECONOMIES.index(least) :]:
+        needed = forecast(work if economy.points else without_points, economy).peak_mb
+        if needed <= limit_mb:
             return economy
-    needed = forecast(work, ECONOMIES[-1]).peak_mb
     raise InputError(
         f"this takes about {needed:.0f} MB even with every economy, and max_memory_mb allows {limit_mb:.0f}; "
         f"raise it to {np.ceil(needed / 10.0) * 10.0:.0f} or more, or split the model"
     )
 
 
-def measure_speed() -> float:
-    """Return how fast this machine is, in units of the one on which the rates were measured; 0.2 s."""
-    values = np.random.default_rng(0).standard_normal(200_000)
-    matrix = values[: 300 * 300].reshape(300, 300)
-    best = np.inf
-    with one_blas_thread():
-        for _ in range(_REPETITIONS):
-            start = time.process_time()
-            np.argsort(values, kind="stable")
-            _ = matrix @ matrix
-            best = min(best, time.process_time() - start)
-    return _REFERENCE_S / max(best, 1e-6)
+def keep_within_memory(
+    work: Workload, measured: MeasuredGraph, options: LocateOptions, least: Economy
+) -> tuple[Economy, MeasuredGraph, LocateOptions]:
+    """Return what is given up to stay below `options.max_memory_mb`, and the graph and options then.
+
+    Args:
+        work: what there is to do but for the graph.
+        measured: the graph, with its rigid groups.
+        options: the settings; a limit of 0 is none.
+        least: what is given up already.
+
+    Raises:
+        InputError: with the number needed, if there is no way.
+    """
+    if not options.max_memory_mb:
+        return least, measured, options
+    bare = measured.without_points()
+    economy = choose_economy(
+        describe_work(work, measured, options),
+        describe_work(work, bare, options),
+        options.max_memory_mb,
+        least,
+    )
+    if not economy.factor:
+        options = replace(options, factor_memory_mb=NO_FACTOR, refine=False)
+    return economy, measured if economy.points else bare, options
+
+
+def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOptions) -> Workload:
+    """Return what there is to do once the graph is known: its factor is planned, nothing is solved."""
+    graph, entries = measured.graph, 0
+    needs_factor = measured.groups is not None or options.refine_with_priors
+    if graph.num_edges:
+        plan = _plan_factor(measured)
+        needs_factor = needs_factor or choose_method(graph, options).method == "newton"
+        max_bytes = np.inf if needs_factor else options.factor_memory_mb * 1_000_000
+        if plan is not None and plan.num_bytes(graph.dimension, np.float64) <= max_bytes:
+            entries = plan.num_bytes(1, np.uint8)
+    return replace(
+        work,
+        num_edges=graph.num_edges,
+        num_nodes=graph.num_nodes,
+        num_sampled=graph.num_edges if work.num_sampled else 0,
+        has_points=measured.num_points > 0,
+        factor_entries=entries,
+        needs_factor=needs_factor,
+    )
+
+
+def _plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
+    """Return the plan of the largest factor of a placement; None where no order keeps one sparse."""
+    edges = np.ascontiguousarray(measured.graph.edges)
+    if measured.groups is not None:
+        ends = measured.groups.group_of[edges[measured.groups.joins(edges)]]
+        return analyse(measured.groups.num_groups, np.ascontiguousarray(ends))
+    if predict_factor(measured.graph).tree is None:
+        return None
+    neighbours = adjacency(measured.graph.num_nodes, edges)
+    return plan_factorisation(neighbours, edges, best_order(neighbours))
 
 
 def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
@@ -186,47 +219,20 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     model = 30e6 + 55.0 * work.num_keypoints
     rays = min(24.0 * work.num_keypoints, economy.rays_bytes)
     results = 350.0 * work.num_pairs + 3000.0 * work.num_images
-    held = _STARTED_B + _KERNELS_B + model + rays + results
+    throughout = _STARTED_BYTES + _KERNELS_BYTES + model + rays + results
     peaks = {
-        "reading": _STARTED_B + model + 40.0 * work.num_keypoints,
-        "measuring directions": held + batch,
+        "reading": _STARTED_BYTES + model + 40.0 * work.num_keypoints,
+        "measuring directions": throughout + batch,
     }
     if work.has_points and economy.points:
-        peaks["building tracks"] = held + batch + 160.0 * min(work.num_matches, 10_000_000)
-    edges, nodes = _graph_size(work, economy)
+        peaks["building tracks"] = throughout + batch + 160.0 * min(work.num_matches, 10_000_000)
     samples = 16.0 * _SAMPLES * (work.num_sampled if economy.samples else 0)
-    solving = 900.0 * edges + 3000.0 * nodes
-    factor = (2.2 * 8.0 * _BLOCK * work.factor_entries) if economy.factor else 0.0
-    moved = 8.0 * 3 * _SAMPLES * 3.0 * nodes if samples else 0.0
-    peaks["placing"] = held + solving + 2.5 * samples + moved + factor
+    solving = 900.0 * work.num_edges + 3000.0 * work.num_nodes
+    has_factor = economy.factor or work.needs_factor
+    factor = 2.2 * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
+    moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
+    peaks["placing"] = throughout + solving + 2.5 * samples + moved + factor
     seeds = 66.0 * work.num_keypoints
-    peaks["triangulating"] = held + 300.0 * edges + seeds + 46.0 * work.num_matches + 0.5 * batch
+    matches = 46.0 * work.num_matches
+    peaks["triangulating"] = throughout + 300.0 * work.num_edges + seeds + matches + 0.5 * batch
     return peaks
-
-
-def _times(work: Workload, economy: Economy) -> dict[str, float]:
-    """Return the processor seconds of each stage on the machine of reference."""
-    edges, _ = _graph_size(work, economy)
-    samples = work.num_sampled if economy.samples else 0
-    has_points = work.has_points and economy.points
-    times = {
-        "reading": 1.7 + 4.5e-7 * work.num_keypoints,
-        "measuring directions": 0.2 + 1.4e-6 * work.num_matches,
-        "placing": 0.5
-        + 8e-5 * edges
-        + _STEPS * work.factor_flops * 27 / 8e9 * (2.0 if economy.factor else 1.0),
-        "triangulating": 3.2e-6 * work.num_matches,
-        "writing": 1.0 + 5e-5 * work.num_pairs,
-    }
-    if has_points:
-        times["building tracks"] = 1.5e-6 * work.num_matches
-    if samples:
-        times["sampling errors"] = 1.7e-6 * work.num_matches + 5e-5 * samples
-    return times
-
-
-def _graph_size(work: Workload, economy: Economy) -> tuple[int, int]:
-    """Return the edges and nodes that are solved."""
-    if work.has_points and not economy.points:
-        return min(work.num_edges, work.num_pairs), min(work.num_nodes, work.num_images)
-    return work.num_edges, work.num_nodes

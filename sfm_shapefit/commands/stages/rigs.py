@@ -5,7 +5,8 @@ has them: two or more are one group, whose offsets are their centres; of a singl
 taken.
 """
 
-from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,19 +15,17 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
-from sfm_shapefit.commands.stages.measure import without_points
-from sfm_shapefit.directions.tracks import JointGraph
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats import refuse_irregular_file
-from sfm_shapefit.judgement.trust import Evidence
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
-from sfm_shapefit.placement.gauge import Gauge, metric_gauge, moved_gauge
 from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.placement.rigs import is_scaled, place_groups
+from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
 from sfm_shapefit.solver.rigs import largest_tied
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 
-_COINCIDENT = 1e-9  # extent of the fixed centres, of their distance from the origin, that counts as none
+# Extent of the fixed centres, of their distance from the origin, that counts as none.
+_COINCIDENT = 1e-9
 
 
 class Rigid(NamedTuple):
@@ -36,11 +35,18 @@ class Rigid(NamedTuple):
     """(n,) images that stay exactly where the input has them."""
     groups: RigidGroups | None
     """The images in groups; None where each moves by itself."""
-    held: int | None
+    fixed_group: int | None
     """The group of the fixed images."""
 
+    def apply(self, measured: MeasuredGraph) -> MeasuredGraph:
+        """Return a measured graph of the images with these groups; each of its points is one more."""
+        if self.groups is None:
+            return measured
+        groups = self.groups.with_separate(measured.num_points)
+        return replace(measured, groups=groups, fixed_group=self.fixed_group)
 
-def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
+
+def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
     """Return what moves together and what not at all.
 
     Args:
@@ -52,7 +58,7 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
         InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
             asked for than rigs or fixed images have.
     """
-    fixed = _fixed_images(model, options.fix)
+    fixed = _read_fixed_images(model, options.fix)
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
@@ -71,10 +77,7 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
         raise InputError(
             f"the scale is that of the {source}; leave out other scales, known distances and priors"
         )
-    if not options.solves_shapefit or options.filter != "none":
-        raise InputError(
-            "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
-        )
+    refuse_options_of_groups(options)
     groups = model.groups if model.has_rigs else separate(model.num_images, 3)
     if count == 0:
         return Rigid(fixed, groups, None)
@@ -87,105 +90,49 @@ def rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) 
     return Rigid(fixed, groups.with_fixed(fixed, model.centers), 0)
 
 
-def rigs_statement(model: PosedModel, joint: JointGraph) -> str:
+def group_frames(model: PosedModel, measured: MeasuredGraph) -> MeasuredGraph:
+    """Return the measured graph of a model's images with the frames of its rigs, if it has any."""
+    groups = model.groups if model.has_rigs else None
+    return Rigid(np.zeros(model.num_images, dtype=np.bool_), groups, None).apply(measured)
+
+
+def rigs_statement(model: PosedModel, measured: MeasuredGraph) -> str:
     """Say how many frames a model has, and how many of them the pairs tie to one another."""
-    if not model.has_rigs:
+    groups, edges = measured.groups, measured.graph.edges
+    if groups is None:
         return "none: every image is a frame of its own"
-    groups = model.groups.with_separate(joint.num_points)
     frames = f"{model.groups.num_groups} frames of {model.num_images} images"
-    if not is_scaled(groups, joint.graph.edges):
+    if not is_scaled(groups, edges):
         return f"{frames}; no pair sees two cameras of a frame that stand apart, so their scale is open"
-    sizes = np.bincount(groups.group_of[: model.num_images], minlength=groups.num_groups)
-    tied = int(np.sum(sizes[largest_tied(joint.graph.edges, groups, sizes)] > 0))
+    sizes = measured.cameras_per_group
+    tied = int(np.sum(sizes[largest_tied(edges, groups, sizes)] > 0))
     return f"{frames}, of which the pairs tie {tied} in metric scale; the pieces below take images one by one"
 
 
-def placed(
-    joint: JointGraph,
-    rigid: Rigid,
-    evidence: Evidence,
-    options: LocateOptions,
-    clock: Clock,
-) -> Placement:
-    """Place the view graph, over groups where there are any.
+def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock) -> Placement:
+    """Place the measured graph; with rigid groups, 3D points take part only where they are needed.
 
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
-    if rigid.groups is None:
-        k = joint.num_cameras
-        return place(joint.graph, options, joint.covariance, evidence, k, clock.iteration)
+    settings = options
     first = None
-    if options.points != "always":
-        try:
-            first = _placed_groups(*_without_points(joint, evidence), rigid, options)
-        except UnsolvableError:
-            if joint.num_points == 0:
-                raise
-    if joint.num_points == 0 or (first is not None and not first.assessment.loose_groups):
-        assert first is not None or options.points == "always"
-        return first or _placed_groups(joint, evidence, rigid, options)
-    second = _placed_groups(joint, evidence, rigid, options)
-    return second if first is None or _num_held(second) > _num_held(first) else first
+    if measured.groups is not None and measured.num_points and options.points != "always":
+        with suppress(UnsolvableError):
+            first = place(measured.without_points(), settings, on_iteration=clock.iteration)
+        if first is not None and not first.assessment.loose_groups:
+            return first
+    second = place(measured, settings, on_iteration=clock.iteration)
+    return second if first is None or _count_held(second) > _count_held(first) else first
 
 
-def _placed_groups(joint: JointGraph, evidence: Evidence, rigid: Rigid, options: LocateOptions) -> Placement:
-    """Place groups, and points that each are one."""
-    assert rigid.groups is not None
-    return place_groups(
-        joint.graph,
-        rigid.groups.with_separate(joint.num_points),
-        options,
-        joint.covariance,
-        evidence,
-        joint.num_cameras,
-        rigid.held,
-    )
-
-
-def _without_points(joint: JointGraph, evidence: Evidence) -> tuple[JointGraph, Evidence]:
-    """Return the pairs of cameras alone; they stand before the rays."""
-    k = joint.num_cameras
-    rows = np.flatnonzero((joint.graph.edges < k).all(axis=1))
-    return without_points(joint), evidence.restricted_to(rows, np.arange(k), joint.graph.num_nodes)
-
-
-def _num_held(placement: Placement) -> int:
+def _count_held(placement: Placement) -> int:
     """Return how many cameras are placed and not loose."""
     loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
     return len(placement.cameras) - loose
 
 
-def rigid_gauge(
-    model: PosedModel, placement: Placement, rigid: Rigid, kept: BoolArray, otherwise: Callable[[], Gauge]
-) -> Gauge:
-    """Return scale and origin of the output where groups or a fixed camera decide them.
-
-    Args:
-        model: the input.
-        placement: its solution.
-        rigid: what of it is rigid.
-        kept: which of the placement's cameras are in the output.
-        otherwise: chooses where no group knows the scale; a single fixed camera then moves only the origin.
-
-    Raises:
-        UnsolvableError: if the only fixed image is not placed.
-    """
-    cameras = placement.cameras[kept]
-    locations, centers = placement.locations[kept], model.centers[cameras]
-    still = rigid.fixed[cameras]
-    if placement.unit is not None:
-        return metric_gauge(locations, placement.unit, centers, still, has_rigs=model.has_rigs)
-    gauge = otherwise()
-    if not rigid.fixed.any():
-        return gauge
-    name = model.names[int(np.argmax(rigid.fixed))]
-    if not still.any():
-        raise UnsolvableError(f"{name} is to stay where it is, but the matches do not tie it to the others")
-    return moved_gauge(gauge, locations[still][0], centers[still][0], name)
-
-
-def _fixed_images(model: PosedModel, fix: str) -> BoolArray:
+def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
     """Return which images are to stay where they are."""
     if not fix:
         return np.zeros(model.num_images, dtype=np.bool_)

@@ -1,6 +1,7 @@
 """Refine the given rotations before cameras are placed: opt-in, see `rotations`."""
 
 from contextlib import ExitStack
+from dataclasses import replace
 
 import numpy as np
 
@@ -8,7 +9,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel, with_turned_cameras
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource, open_source
-from sfm_shapefit.commands.stages.measure import joint_graph, measure_directions
+from sfm_shapefit.commands.stages.measure import build_graph, count_work, measure_directions
+from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import Inputs
@@ -16,12 +18,15 @@ from sfm_shapefit.rotations.acceptance import refine_rotations
 from sfm_shapefit.rotations.joint_refinement import RayMatches
 
 _REFINEMENT_ROUNDS = 2
-_REFINEMENT_RESIDUAL_DEG = 5.0  # of a direction; beyond it no error of rotations is to blame
-_REFINEMENT_MATCHES = 4_000_000  # in all; 200 MB
-_MATCHES_PER_PAIR = (50, 2000)  # at least and at most; more were no better on any real scene
+# Residual of a direction beyond which no error of rotations is to blame.
+_REFINEMENT_RESIDUAL_DEG = 5.0
+# Matches in all, which take 200 MB.
+_REFINEMENT_MATCHES = 4_000_000
+# Matches of a pair at least and at most; more were no better on any real scene.
+_MATCHES_PER_PAIR = (50, 2000)
 
 
-def refined_rotations(
+def refine_model_rotations(
     model: PosedModel, inputs: Inputs, options: LocateOptions, clock: Clock
 ) -> tuple[PosedModel, FloatArray]:
     """Return the model with refined rotations, and by how many degrees each camera turned, shape (n,).
@@ -34,10 +39,17 @@ def refined_rotations(
     turned, turned_deg = model, np.zeros(model.num_images)
     for repeat in range(_REFINEMENT_ROUNDS):
         with ExitStack() as resources:
-            given, current = (resources.enter_context(open_source(m, inputs)) for m in (model, turned))
+            given, current = (
+                resources.enter_context(open_source(m, inputs, options)) for m in (model, turned)
+            )
             directions = measure_directions(current, options, clock)
-            joint = joint_graph(current, directions, options)
-            placement = place(joint.graph, options, joint.covariance, num_cameras=joint.num_cameras)
+            _, measured, settings = keep_within_memory(
+                replace(count_work(current, directions), num_sampled=0),
+                build_graph(current, directions, options),
+                options,
+                current.economy,
+            )
+            placement = place(measured, settings)
             residuals = placement.assessment.residuals_deg[placement.pairs]
             near = placement.edges[placement.pairs[residuals <= _REFINEMENT_RESIDUAL_DEG]]
             rays = _rays_of_pairs(given, directions.usable()[near], placement.cameras)

@@ -2,19 +2,17 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted, bundle_adjust
 from sfm_shapefit.colmap.seed import build_seed, turned
 from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import MatchBatch
-from sfm_shapefit.directions.tracks import JointGraph
-from sfm_shapefit.judgement.trust import Evidence
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
@@ -23,91 +21,96 @@ from sfm_shapefit.results import FurtherPiece
 if TYPE_CHECKING:
     import pycolmap
 
-_FEWEST_KEPT = 3  # cameras; fewer trusted ones are no result
+# Fewer trusted cameras are no result.
+_FEWEST_KEPT = 3
 
 
-def trusted(placement: Placement, min_trust: float) -> BoolArray:
+class Located(NamedTuple):
+    """The cameras of a model that are in the output, and where."""
+
+    placement: Placement
+    kept: BoolArray
+    """(k,) which of the placement's cameras are in the output."""
+    gauge: Gauge
+    """The map from the placement's locations to the output's units and axes."""
+    fixed: BoolArray | None = None
+    """(n,) the images that keep their poses to the last bit; none if None."""
+
+    @property
+    def cameras(self) -> IntArray:
+        """The images that are in the output, ascending."""
+        return self.placement.cameras[self.kept]
+
+
+def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
     kept: BoolArray = placement.assessment.trust >= min_trust
     return kept if np.sum(kept) >= _FEWEST_KEPT else np.ones_like(kept)
 
 
-def seeded_model(
+def build_seeded_model(
     source: MatchSource,
-    placement: Placement,
-    kept: BoolArray,
-    gauge: Gauge,
+    located: Located,
     options: LocateOptions,
     clock: Clock,
-    fixed: BoolArray | None = None,
     executor: Executor | None = None,
 ) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
     """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
 
-    `kept` says which of the placement's cameras are in the model, `gauge` where those are in its units.
-    Images that are `fixed` keep their poses to the last bit; an executor shares out the model's own tracks.
+    An executor shares out the model's own tracks.
     """
-    adjusted = None
-    located = kept, gauge.similarity.apply(placement.locations[kept])
+    adjusted, fixed, axes = None, located.fixed, located.gauge.axes
     with clock("structure"):
-        seed, tracks = _seed_and_tracks(source, placement, located, clock.advance, fixed)
+        seed, tracks = _seed_and_tracks(source, located, clock.advance)
     if not options.bundle_adjust:  # which triangulates at the seed's poses itself
         with clock("triangulation"):
             settings = options
             seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
     if options.bundle_adjust:
         with clock("bundle adjustment"):
-            still = () if fixed is None else source.model.frame_ids[fixed].tolist()
-            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=still)
+            frames = () if fixed is None else source.model.frame_ids[fixed].tolist()
+            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
             seeded = colored(seeded, source.model.reconstruction, in_place=True)
-    return seeded if gauge.axes is None else turned(seeded, gauge.axes), adjusted
+    return seeded if axes is None else turned(seeded, axes), adjusted
 
 
-def further_pieces(
-    source: MatchSource,
-    placement: Placement,
-    joint: JointGraph,
-    evidence: Evidence,
-    options: LocateOptions,
+def place_further_pieces(
+    source: MatchSource, placement: Placement, options: LocateOptions
 ) -> tuple[FurtherPiece, ...]:
     """Return the further rigid pieces with their seeded models, each in the gauge "unit" of its own."""
-    found = []
-    for placed in place_further(placement, options, joint.covariance, evidence):
-        kept = trusted(placed, options.min_trust)
-        gauge = unit_gauge(placed.locations[kept])
-        seeded, _ = seeded_model(source, placed, kept, gauge, options, Clock())
-        found.append(
+    pieces = []
+    for further in place_further(placement, options):
+        kept = select_trusted(further, options.min_trust)
+        gauge = unit_gauge(further.locations[kept])
+        seeded, _ = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
+        pieces.append(
             FurtherPiece(
-                placement=placed,
+                placement=further,
                 kept=kept,
                 gauge=gauge,
                 reconstruction=seeded,
-                image_ids=source.model.image_ids[placed.cameras],
+                image_ids=source.model.image_ids[further.cameras],
             )
         )
-    return tuple(found)
+    return tuple(pieces)
 
 
 def _seed_and_tracks(
-    source: MatchSource,
-    placement: Placement,
-    located: tuple[BoolArray, FloatArray],
-    advance: Callable[[int, int], None],
-    fixed: BoolArray | None,
+    source: MatchSource, located: Located, advance: Callable[[int, int], None]
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
     """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
-    model, (kept, centers) = source.model, located
-    placed = np.zeros(model.num_images, dtype=np.bool_)
-    placed[placement.cameras[kept]] = True
-    all_centers = np.full((model.num_images, 3), np.nan)
-    all_centers[placement.cameras[kept]] = centers
+    model, placement, fixed = source.model, located.placement, located.fixed
+    is_placed = np.zeros(model.num_images, dtype=np.bool_)
+    is_placed[located.cameras] = True
+    centers = np.full((model.num_images, 3), np.nan)
+    centers[located.cameras] = located.gauge.similarity.apply(placement.locations[located.kept])
     if source.database is None:
-        return build_seed(model, placed, all_centers, fixed=fixed), model.reconstruction
-    seed = build_seed(model, placed, all_centers, source.database.keypoints, fixed)
+        return build_seed(model, is_placed, centers, fixed=fixed), model.reconstruction
+    seed = build_seed(model, is_placed, centers, source.database.keypoints, fixed)
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)

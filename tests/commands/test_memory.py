@@ -1,0 +1,172 @@
+"""Memory told beforehand: limits that are kept, refused with the number needed, and what is given up."""
+
+import re
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit import InputError, LocateOptions
+from sfm_shapefit.commands.stages.memory import (
+    ECONOMIES,
+    Workload,
+    choose_economy,
+    describe_work,
+    forecast,
+    keep_within_memory,
+)
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.solver.options import NO_FACTOR
+from sfm_shapefit.solver.rigs.groups import separate
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive, random_graph_problem
+from sfm_shapefit.synthetic.workspace import write_workspace
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.scenes import RING
+
+WORK = Workload(
+    num_images=1000,
+    num_keypoints=1_000_000,
+    num_pairs=100_000,
+    num_matches=2_000_000,
+    num_edges=120_000,
+    num_nodes=20_000,
+    num_sampled=120_000,
+    has_points=True,
+    factor_entries=5_000_000,
+)
+BARE = replace(WORK, num_edges=100_000, num_nodes=1000, has_points=False, factor_entries=2_000_000)
+
+
+def test_no_economy_needs_more_memory_than_a_cheaper_one():
+    peaks = [forecast(WORK, economy).peak_mb for economy in ECONOMIES]
+    assert peaks == sorted(peaks, reverse=True)
+    assert peaks[0] > 2.0 * peaks[-1]
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Workload) if field.name != "needs_factor"])
+def test_more_work_never_needs_less_memory(name):
+    more = {"has_points": True}.get(name, 2 * getattr(WORK, name))
+    for economy in ECONOMIES:
+        assert forecast(replace(WORK, **{name: more}), economy).peak_mb >= forecast(WORK, economy).peak_mb
+
+
+def test_the_cheapest_economy_that_fits_is_taken_and_what_is_given_up_already_stays_so():
+    for k, economy in enumerate(ECONOMIES):
+        limit = forecast(WORK if economy.points else BARE, economy).peak_mb
+        chosen = choose_economy(WORK, BARE, limit)
+        assert ECONOMIES.index(chosen) <= k
+        assert forecast(WORK if chosen.points else BARE, chosen).peak_mb <= limit
+    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]
+
+
+def test_a_limit_below_every_economy_is_refused_with_the_number_that_is_enough():
+    with pytest.raises(InputError, match="raise it to") as refused:
+        choose_economy(WORK, BARE, 100.0)
+    needed = float(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
+    assert choose_economy(WORK, BARE, needed) is ECONOMIES[-1]
+
+
+def loop_graph(num_nodes=400):
+    """Cameras on a loop, each with its next twenty: a factor of half a megabyte."""
+    edges = np.array([(i, (i + k) % num_nodes) for i in range(num_nodes) for k in range(1, 21)])
+    return ViewGraph(num_nodes, np.sort(edges, axis=1), np.tile([1.0, 0.0, 0.0], (len(edges), 1)))
+
+
+def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it():
+    graph = loop_graph()
+    plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
+    split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
+    with_priors = LocateOptions(solver="admm", refine_with_priors=True)
+    small = Workload(
+        num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
+    )
+    assert describe_work(small, plain, split).factor_entries > 0
+    assert not describe_work(small, plain, split).needs_factor
+    for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
+        work = describe_work(small, measured, options)
+        assert work.needs_factor
+        peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
+        assert peaks[0] == peaks[1]  # so that it is never chosen
+
+
+def test_where_the_factor_is_given_up_nothing_is_refined_as_is_stated():
+    measured = MeasuredGraph(loop_graph())
+    work = Workload(
+        num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
+    )
+    options = LocateOptions(solver="admm")
+    full = describe_work(work, measured, options)
+    least = forecast(full, ECONOMIES[-1]).peak_mb
+    assert forecast(full, ECONOMIES[-2]).peak_mb > least
+    limited = replace(options, max_memory_mb=int(np.ceil(least)))
+    economy, kept, changed = keep_within_memory(work, measured, limited, ECONOMIES[0])
+    assert economy is ECONOMIES[-1]
+    assert kept is measured
+    assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
+    assert "neither refined" in economy.statement
+
+
+def test_points_that_are_given_up_are_in_the_graph_no_more():
+    problem = random_graph_problem(60, 0.5, sigma=0.01, seed=1)
+    measured = MeasuredGraph(ViewGraph(60, problem.edges, problem.directions), num_points=20)
+    work = Workload(
+        num_images=40, num_keypoints=0, num_pairs=1, num_matches=10_000_000, num_edges=1, num_nodes=40
+    )
+    limit = forecast(describe_work(work, measured.without_points(), LocateOptions()), ECONOMIES[3]).peak_mb
+    options = LocateOptions(max_memory_mb=int(np.ceil(limit)))
+    economy, kept, _ = keep_within_memory(work, measured, options, ECONOMIES[0])
+    assert not economy.points
+    assert kept.num_points == 0
+    assert keep_within_memory(work, measured, LocateOptions(), ECONOMIES[0])[1] is measured
+
+
+# --- in locate -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def workspaces(tmp_path_factory):
+    """Models with a database: plain, and of rigs."""
+    folder = tmp_path_factory.mktemp("rigs") / "drive"
+    rigs = make_rig_drive(SceneOptions(num_images=36, num_points=1500, max_pairs_per_image=12, seed=0))
+    write_workspace(rigs.scene, folder, WorkspaceOptions(model="rotations"), rigs)
+    return {"plain": RING / "sparse" / "0", "rigs": folder / "sparse" / "0"}
+
+
+@pytest.mark.parametrize("kind", ["plain", "rigs"])
+def test_locate_refuses_a_limit_that_cannot_be_kept_and_keeps_the_one_that_it_names(workspaces, kind):
+    with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
+        sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=100))
+    needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
+    # The counts of the database alone do not know the graph, whose part is a few megabytes here.
+    found = sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=needed + 30))
+    usual = sfm_shapefit.locate(workspaces[kind])
+    assert len(found.placement.cameras) == len(usual.placement.cameras)
+    assert found.placement.refined.is_refined
+    assert np.isfinite(found.placement.assessment.sigmas).all()
+
+
+@pytest.mark.parametrize("kind", ["plain", "rigs"])
+def test_a_limit_that_is_none_changes_nothing(workspaces, kind):
+    usual, limited = (
+        sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=limit))
+        for limit in (0, 9000)
+    )
+    np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
+    assert limited.warnings == usual.warnings
+
+
+@pytest.mark.parametrize("kind", ["plain", "rigs"])
+def test_what_is_given_up_is_what_the_warning_says(workspaces, kind):
+    full = sfm_shapefit.inspect(workspaces[kind]).expected
+    for limit in range(int(full.peak_mb) - 1, 200, -5):
+        try:
+            found = sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=limit))
+        except InputError:
+            break
+        statement = next(text for text in found.warnings if text.startswith("to stay below max_memory_mb"))
+        evidence = found.placement.measured.evidence
+        assert ("count as independent" in statement) == (evidence.errors is None)
+        assert ("neither refined" in statement) == (not found.placement.refined.is_refined)
+    else:
+        pytest.fail("no limit was refused")

@@ -1,0 +1,212 @@
+"""Every option of a placement with plain graphs, rigs, fixed cameras and priors: obeyed or refused."""
+
+from dataclasses import fields
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.gauge import PositionPriors, prior_gauge
+from sfm_shapefit.placement.place import Placement, place
+from sfm_shapefit.placement.prior_refinement import pull_to_priors
+from sfm_shapefit.refinement import starts
+from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.solver.options import NO_FACTOR, Status
+from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.viewgraph import ViewGraph
+
+NUM_FRAMES, SENSORS = 12, 3
+N = NUM_FRAMES * SENSORS
+
+
+def directions_between(t, edges, rng):
+    """Directions of the baselines with errors of 0.003 rad."""
+    return normalized(normalized(differences(t, edges)) + 0.003 * rng.normal(size=(len(edges), 3)))
+
+
+def measure(kind, wrong=0.2, other=None):
+    """A measured graph of 36 cameras, a share of its pairs wrong: at random, or as other places have them."""
+    rng = np.random.default_rng(7)
+    frames = np.repeat(np.arange(NUM_FRAMES), SENSORS)
+    offsets = 0.7 * rng.normal(size=(N, 3))
+    t = 4.0 * rng.normal(size=(NUM_FRAMES, 3))[frames] + offsets
+    edges = np.stack(np.triu_indices(N, 1), axis=1)
+    edges = edges[rng.random(len(edges)) < 0.5]
+    v = directions_between(t, edges, rng)
+    bad = rng.random(len(edges)) < wrong
+    wrong_v = normalized(rng.normal(size=v.shape)) if other is None else directions_between(other, edges, rng)
+    v[bad] = wrong_v[bad]
+    graph, groups, fixed = ViewGraph(N, edges, v), None, None
+    if kind == "rigs":
+        groups = RigidGroups(group_of=frames, offsets=offsets)
+    if kind == "fixed":
+        groups, fixed = separate(N, 3).with_fixed(np.arange(N) < 8, t), 0
+    return MeasuredGraph(graph, groups=groups, fixed_group=fixed)
+
+
+# Another value of each option, and what must then be so of the placement, given that with the defaults.
+OPTIONS = {
+    "solver": ("admm", lambda found, _: found.solve.method == "admm"),
+    "tol": (1e-2, lambda found, usual: found.solve.iterations < usual.solve.iterations),
+    "max_iterations": (1, lambda found, _: found.solve.status is Status.MAX_ITERATIONS),
+    "uniqueness": (False, lambda found, usual: (found.solve.unique, usual.solve.unique) == (None, True)),
+    "factor_memory_mb": (
+        NO_FACTOR,
+        lambda found, _: not found.refined.is_refined and np.isnan(found.assessment.sigmas).all(),
+    ),
+    # The answer does not depend on it, by contract.
+    "threads": (2, lambda found, usual: np.array_equal(found.locations, usual.locations)),
+    "objective": (
+        "lud",
+        lambda found, _: found.refined.start == "LUD" and "as asked" in found.refined.reason,
+    ),
+    "filter": ("triangles", lambda found, _: len(found.dropped) > 0),
+    "refine": (False, lambda found, usual: usual.refined.is_refined and not found.refined.is_refined),
+}
+REFUSED_BY_GROUPS = {
+    "solver": "no solver admm",
+    "filter": "without a filter",
+    "factor_memory_mb": "factor over .* groups takes",
+}
+
+
+@pytest.fixture(scope="module", params=["plain", "rigs", "fixed"])
+def usual(request) -> tuple[str, MeasuredGraph, Placement]:
+    measured = measure(request.param)
+    return request.param, measured, place(measured)
+
+
+def test_the_table_has_every_option():
+    assert set(OPTIONS) == {field.name for field in fields(PlacementOptions)}
+
+
+@pytest.mark.parametrize("name", OPTIONS)
+def test_every_option_is_obeyed_or_refused_in_one_sentence(usual, name):
+    kind, measured, placement = usual
+    value, holds = OPTIONS[name]
+    options = PlacementOptions(**{name: value})
+    if kind != "plain" and name in REFUSED_BY_GROUPS:
+        with pytest.raises((InputError, UnsolvableError), match=REFUSED_BY_GROUPS[name]):
+            place(measured, options)
+        return
+    assert holds(place(measured, options), placement)
+
+
+def test_baselines_are_refused_with_groups_and_the_conic_solver_knows_them():
+    with pytest.raises(InputError, match="rigs and fixed cameras go with the objectives"):
+        place(measure("rigs"), PlacementOptions(objective="linf"))
+    assert place(measure("rigs"), PlacementOptions(solver="conic")).solve.method == "conic"
+
+
+@pytest.mark.parametrize("kind", ["rigs", "fixed"])
+def test_groups_are_placed_without_the_refinement_where_only_its_factor_would_be_too_large(kind, monkeypatch):
+    def refuse(*_given, **_more):
+        raise UnsolvableError("too large")
+
+    monkeypatch.setattr(starts, "ReducedFactor", refuse)
+    found = place(measure(kind))
+    assert not found.refined.is_refined
+    assert "the factor for that would be too large" in found.refined.reason
+
+
+def test_iterations_are_recorded_told_and_can_be_cancelled(usual):
+    _, measured, placement = usual
+    assert [info.iteration for info in placement.history] == list(range(1, placement.solve.iterations + 1))
+    assert placement.history[-1].objective == pytest.approx(placement.solve.objective, abs=1e-8)
+    told = []
+
+    def cancel(info):
+        told.append(info)
+        return len(told) < 2
+
+    cancelled = place(measured, on_iteration=cancel)
+    assert cancelled.solve.status is Status.CANCELLED
+    assert len(told) == len(cancelled.history) == 2
+    assert all(info.limit >= 2 for info in told)
+
+
+def test_rejected_pairs_that_agree_on_another_placement_are_warned_of(usual):
+    kind, _, placement = usual
+    other = 4.0 * np.random.default_rng(8).normal(size=(N, 3))
+    found = place(measure(kind, 0.3, other))
+    assert placement.second_configuration is None
+    assert found.second_configuration is not None
+    assert any("agree with one another" in sentence for sentence in quality_warnings(found))
+
+
+# --- priors --------------------------------------------------------------------------------------------
+
+
+def priors_for(rows, positions):
+    """Exact positions of some cameras, of a standard deviation of 0.01."""
+    return PositionPriors(
+        cameras=np.asarray(rows),
+        positions=positions[rows],
+        covariances=np.tile(1e-4 * np.eye(3), (len(rows), 1, 1)),
+        statement="made",
+    )
+
+
+@pytest.fixture(scope="module")
+def reset() -> tuple[Placement, np.ndarray]:
+    """A placement whose refinement threw cameras out, and the positions of all."""
+    problem = random_graph_problem(40, 0.5, sigma=0.01, seed=4)
+    t = problem.locations
+    order = np.argsort(t[:, 0])
+    # Each of two nearly parallel pairs sees camera 40 from a wrong side.
+    added = np.array([[order[5], 40], [order[-5], 40]])
+    v = normalized(np.array([[0.02, 0.0, -1.0], [-0.02, 0.0, -1.0]]))
+    v = np.concatenate([normalized(differences(t, problem.edges)), v])
+    v = normalized(v + 0.003 * np.random.default_rng(4).standard_normal(v.shape))
+    placement = place(ViewGraph(41, np.concatenate([problem.edges, added]), v))
+    assert placement.refined.reset_nodes.tolist() == [40]
+    return placement, np.concatenate([t, [[0.0, 0.0, 1.0]]])
+
+
+def pull(placement, priors, **options):
+    gauge = prior_gauge(placement.locations, priors)
+    return pull_to_priors(placement, gauge, priors, PlacementOptions(**options))
+
+
+def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):
+    placement, positions = reset
+    pulled, gauge = pull(placement, priors_for(np.arange(40), positions))
+    assert "the priors moved cameras by" in gauge.statement
+    assert np.isinf(pulled.assessment.sigmas[40]).all()
+    assert pulled.assessment.trust[40] == 0.0
+    assert pulled.assessment.reasons[40] == placement.assessment.reasons[40]
+    assert "leave its distance open" in pulled.assessment.reasons[40]
+    assert pulled.refined.reset_nodes.tolist() == [40]
+
+
+def test_a_camera_that_was_put_back_is_determined_where_its_prior_holds_it(reset):
+    placement, positions = reset
+    gauge = prior_gauge(placement.locations, priors_for(np.arange(40), positions))
+    positions = np.concatenate([positions[:40], gauge.apply(placement.locations)[40:]])
+    held, _ = pull(placement, priors_for(np.arange(41), positions))
+    assert held.refined.reset_nodes.tolist() == []
+    positions[40] += 100.0
+    lost, _ = pull(placement, priors_for(np.arange(41), positions))
+    assert lost.refined.reset_nodes.tolist() == [40]
+
+
+def test_what_the_rejected_pairs_agree_on_is_asked_anew_after_priors_pulled():
+    other = 4.0 * np.random.default_rng(8).normal(size=(N, 3))
+    placement = place(measure("plain", 0.3, other))
+    pulled, _ = pull(placement, priors_for(np.arange(N), placement.locations))
+    assert placement.second_configuration is not None
+    assert pulled.second_configuration is not None
+    assert pulled.second_configuration is not placement.second_configuration
+
+
+def test_priors_do_not_pull_with_a_larger_factor_than_is_allowed(reset):
+    placement, positions = reset
+    with pytest.raises(
+        InputError, match="factor_memory_mb allows 0; raise it, or leave out refine_with_priors"
+    ):
+        pull(placement, priors_for(np.arange(40), positions), factor_memory_mb=NO_FACTOR)
