@@ -15,7 +15,7 @@ from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import splu
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.laplacian.operators import LaplacianPattern, assemble, laplacian_pattern
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -46,7 +46,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
             lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
             weights = graph.weights / np.maximum(lengths, _SHORTEST * np.median(lengths)) ** 2
             weights = weights / weights.mean()
-    return unit_gauge(graph, t)
+    return normalize_locations(graph, t)
 
 
 def _smallest_eigenvector(pattern: LaplacianPattern, blocks: FloatArray) -> FloatArray:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -50,4 +50,4 @@ def locate_linf(graph: ViewGraph) -> FloatArray:
         raise UnsolvableError(f"the conic solver found no l_inf locations ({error})") from error
     if t.value is None:
         raise UnsolvableError(f"the conic solver stopped with status {program.status!r} and no answer")
-    return unit_gauge(graph, np.asarray(t.value))
+    return normalize_locations(graph, np.asarray(t.value))

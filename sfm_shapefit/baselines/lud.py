@@ -6,7 +6,7 @@ Source: Ozyesil and Singer, "Robust camera location estimation by convex program
 """
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -15,4 +15,4 @@ _STEPS = 5000  # to the optimum; as a start of a refinement 50 suffice
 
 def locate_lud(graph: ViewGraph) -> FloatArray:
     """Return LUD's locations (n, d), solved to its optimum."""
-    return unit_gauge(graph, solve_lud(graph, _STEPS, certified=False).locations)
+    return normalize_locations(graph, solve_lud(graph, _STEPS, certified=False).locations)

@@ -27,7 +27,7 @@ from sfm_shapefit.colmap.other_programs import reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.models import is_model_file, read_scene
+from sfm_shapefit.formats.models import is_model_file, read_model_file
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -170,7 +170,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         label, reconstruction = "the reconstruction", source
         is_checked = False
     elif is_model_file(source):
-        label, reconstruction = str(source), reconstruction_of(read_scene(source), source)
+        label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
         is_checked = False
     else:
         folder = Path(source)

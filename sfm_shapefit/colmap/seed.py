@@ -50,7 +50,7 @@ def build_seed(
         worst = int(np.flatnonzero(placed & ~np.isfinite(centers).all(axis=1))[0])
         raise ValueError(f"the centre of image {model.names[worst]} is not finite")
 
-    seed = without_points(model.reconstruction)
+    seed = copy_without_points(model.reconstruction)
     still = np.zeros(n, dtype=np.bool_) if fixed is None else fixed
     settled = set(model.frame_ids[still].tolist())
     for index, image_id in enumerate(model.image_ids.tolist()):
@@ -75,7 +75,7 @@ def build_seed(
     return seed
 
 
-def without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def copy_without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Return a copy that has no 3D points; its points2D stay and observe nothing."""
     copy = pycolmap.Reconstruction(reconstruction)
     for point_id in list(copy.point3D_ids()):

@@ -29,7 +29,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
-from sfm_shapefit.colmap.seed import without_points
+from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
@@ -107,7 +107,7 @@ def triangulate(
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = options or StructureOptions()
-    structure = seed if in_place else without_points(seed)
+    structure = seed if in_place else copy_without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
         _triangulate_matches(structure, tracks, options, advance or _unheard)
     else:

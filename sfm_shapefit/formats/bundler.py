@@ -24,8 +24,10 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.json_node import is_rotation
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile, is_rotation
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.geometry import FLIP_YZ
 
 _HEADER = "# Bundle file v0.3"
 _NUMBERS_PER_CAMERA = 15
@@ -43,7 +45,7 @@ def is_bundler(file: Path) -> bool:
         return False
 
 
-def read_bundler(file: Path) -> SceneFile:
+def read_bundler(file: Path) -> PosedModelFile:
     """Read the reconstructed cameras and the points.
 
     Raises:
@@ -74,9 +76,9 @@ def read_bundler(file: Path) -> SceneFile:
     sizes = _sizes(n, observed, offsets)
     halves = sizes / 2.0
     images = observed[:, 1]
-    return SceneFile(
+    return PosedModelFile(
         cameras=tuple(
-            SceneCamera(
+            Intrinsics(
                 model="RADIAL",
                 width=int(size[0]),
                 height=int(size[1]),

@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.geometry import FLIP_YZ
 
 _RADIAL_KEYS = {
     "SIMPLE_PINHOLE": "",
@@ -44,7 +45,7 @@ _ONE_FOCAL = {
 _DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV; nerfstudio has no such terms
 
 
-def nerf_text(scene: SceneFile) -> str:
+def nerf_text(scene: PosedModelFile) -> str:
     """Return the posed images as the text of a transforms.json.
 
     Raises:
@@ -64,7 +65,7 @@ def nerf_text(scene: SceneFile) -> str:
     return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _intrinsics(camera: SceneCamera) -> dict[str, Any]:
+def _intrinsics(camera: Intrinsics) -> dict[str, Any]:
     """Return a camera's keys."""
     is_fisheye = camera.model in _FISHEYE_KEYS
     if not is_fisheye and camera.model not in _RADIAL_KEYS:

@@ -14,7 +14,7 @@ photographed (`make_rendered_scene`), and bare graphs of directions (`random_gra
     problem = random_graph_problem(50, p=0.5, sigma=0.01, q=0.2)
     problem.view_graph, problem.locations, problem.corrupted
 
-`sfm_shapefit.synthetic.workspace` and `.photographs` write scenes as COLMAP workspaces, and
+`sfm_shapefit.synthetic.workspace` and `.rendered_workspace` write scenes as COLMAP workspaces, and
 `sfm_shapefit.synthetic.fixtures` is a pytest plugin with all of these as fixtures, and with comparisons.
 The same options give the same values on every run.
 

@@ -231,7 +231,7 @@ def workspace_of(tmp_path: Path) -> WorkspaceMaker:
 
     def workspace(scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path:
         from sfm_shapefit.synthetic import Scene
-        from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+        from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
         from sfm_shapefit.synthetic.workspace import write_workspace
 
         folder = tmp_path / f"workspace{len(list(tmp_path.glob('workspace*'))) + 1}"

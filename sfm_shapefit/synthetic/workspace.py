@@ -18,6 +18,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.atomic_folder import atomic_folder
+from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.synthetic import RigScene, Scene, WorkspaceOptions
 from sfm_shapefit.synthetic.rig_workspace import camera_id_of, new_frames, new_rigs, rig_model
 
@@ -53,18 +54,18 @@ def _write_contents(scene: Scene, workspace: Path, options: WorkspaceOptions, ri
         model = _rotations_only_model(scene, rigs)
     else:
         model = _full_model(scene, scene.stated_rotations, rigs) if perturbed else truth
-    write_model(model, workspace / "sparse" / "0")
-    if model is not truth:
-        write_model(truth, workspace / "truth")
+    write_models(model, truth, workspace)
 
 
 # --- models ----------------------------------------------------------------------------------------------
 
 
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary format."""
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
+def write_models(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction, workspace: Path) -> None:
+    """Write sparse/0, and the truth where it is another model."""
+    for written, folder in ((model, workspace / "sparse" / "0"), (truth, workspace / "truth")):
+        if folder.name != "truth" or truth is not model:
+            folder.mkdir(parents=True)
+            write_model(written, folder)
 
 
 def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Reconstruction:

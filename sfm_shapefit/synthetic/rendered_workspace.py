@@ -30,7 +30,7 @@ from sfm_shapefit.synthetic.rendering import (
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_model
+from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_models
 from sfm_shapefit.viewgraph import connected_components
 
 _CAMERA_ID = 1
@@ -180,9 +180,7 @@ def _write_models(scene: RenderedScene, workspace: Path, options: WorkspaceOptio
         model = truth
     else:
         model = _posed_model(scene, scene.stated_rotations, tracks)
-    write_model(model, workspace / "sparse" / "0")
-    if model is not truth:
-        write_model(truth, workspace / "truth")
+    write_models(model, truth, workspace)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -7,9 +7,9 @@ from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
 
-def unit_gauge(graph: ViewGraph, locations: FloatArray) -> FloatArray:
+def normalize_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:
     """Return the (n, d) locations centred, of unit norm, and with sum_e w_e <t_i - t_j, v_e> >= 0."""
-    centred = locations - locations.mean(axis=0)
-    centred = centred / np.linalg.norm(centred)
-    aligned: FloatArray = centred if projected_length(graph, centred) >= 0.0 else -centred
+    centered = locations - locations.mean(axis=0)
+    centered = centered / np.linalg.norm(centered)
+    aligned: FloatArray = centered if projected_length(graph, centered) >= 0.0 else -centered
     return aligned
