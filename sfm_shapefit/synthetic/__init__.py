@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic.graphs import (
         Corruption,
         GraphProblem,
+        Noise,
         box_graph_problem,
         community_graph_problem,
         corridor_graph_problem,
@@ -54,6 +55,7 @@ _HOMES = {
     "graphs": (
         "Corruption",
         "GraphProblem",
+        "Noise",
         "box_graph_problem",
         "community_graph_problem",
         "corridor_graph_problem",
@@ -81,6 +83,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "Corruption",
     "GraphProblem",
+    "Noise",
     "RenderOptions",
     "RenderedScene",
     "RigScene",
