@@ -145,7 +145,7 @@ def fit_similarity_l1(
     def cost(similarity: Similarity) -> float:
         return float(np.minimum(distances(similarity), cap).sum())
 
-    def reweighted(best: Similarity) -> Similarity:
+    def reweigh(best: Similarity) -> Similarity:
         best_cost = cost(best)
         for _ in range(iterations):
             apart = distances(best)
@@ -161,7 +161,7 @@ def fit_similarity_l1(
 
     plain = fit_similarity(source, target, rotate=rotate)
     sampled = sorted(_fits_of_few_points(source, target, rotate=rotate), key=cost)
-    return min((reweighted(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
+    return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
 
 
 def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:

@@ -59,7 +59,7 @@ class ViewGraph:
             InputError: naming the first edge that is out of range, a self-loop, not a unit vector, not
                 of positive weight, or whose duplicates cancel each other.
         """
-        edge_array, direction_array, weight_array = _checked_arrays(num_nodes, edges, directions, weights)
+        edge_array, direction_array, weight_array = _check_arrays(num_nodes, edges, directions, weights)
         if names is not None and len(names) != num_nodes:
             raise InputError(f"the graph has {num_nodes} cameras but {len(names)} names; give one name each")
         edge_array, direction_array, weight_array = _merge_duplicates(
@@ -132,7 +132,7 @@ def connected_components(num_nodes: int, edges: IntArray) -> IntArray:
     return np.asarray(csgraph.connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _checked_arrays(
+def _check_arrays(
     num_nodes: int, edges: npt.ArrayLike, directions: npt.ArrayLike, weights: npt.ArrayLike | None
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the inputs as arrays of the right type and shape, or raise InputError."""

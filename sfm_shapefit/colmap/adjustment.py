@@ -28,7 +28,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
-from sfm_shapefit.colmap.structure import TrackSource, filtered, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.errors import UnsolvableError
 
@@ -128,7 +128,7 @@ def bundle_adjust(
         steps, converged = _solve(current, stage.loss_scale_px, options, fixed_frames)
         _refuse_diverged(current)
         iterations += steps
-    answer = filtered(current, structure_options)
+    answer = filter_points(current, structure_options)
     return Adjusted(
         reconstruction=answer,
         initial_error_px=start.compute_mean_reprojection_error(),

@@ -73,7 +73,7 @@ def read_images(path: Path) -> UnposedImages:
     return UnposedImages(reconstruction=model, num_guessed_cameras=guessed, has_rigs=has_rigs)
 
 
-def posed_at_origin(
+def pose_at_origin(
     images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
 ) -> pycolmap.Reconstruction:
     """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centres 0."""

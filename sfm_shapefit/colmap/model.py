@@ -318,7 +318,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
 
     cameras = [reconstruction.camera(image.camera_id) for image in images]
     poses = [image.cam_from_world() for image in images]
-    rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
+    rotations = _check_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
@@ -358,7 +358,7 @@ def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction
     return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
 
 
-def _checked_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
+def _check_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
     """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
     quaternions = np.array(quaternions_xyzw, dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):

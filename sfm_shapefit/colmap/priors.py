@@ -84,7 +84,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         if first and len(cells) > 1 and not _is_number(cells[1]):
             system = _WGS84 if cells[1].lower() in _GEODETIC_NAMES else _CARTESIAN
         else:
-            position, covariance = _parsed(path, number, cells)
+            position, covariance = _parse(path, number, cells)
             if cells[0] in seen:
                 raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
             seen.add(cells[0])
@@ -138,7 +138,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _parsed(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
+def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
     """Return position and covariance of a line of a table."""
     if len(cells) not in _TABLE_COLUMNS or not all(map(_is_number, cells[1:])):
         raise InputError(

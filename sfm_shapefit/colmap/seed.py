@@ -83,7 +83,7 @@ def copy_without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Rec
     return copy
 
 
-def turned(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
+def turn_model(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
     """Return the model turned about the origin: cameras and points, x -> axes x."""
     copy = pycolmap.Reconstruction(reconstruction)
     copy.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(axes), np.zeros(3)))

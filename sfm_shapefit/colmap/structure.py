@@ -100,7 +100,7 @@ def triangulate(
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
-        model's ids and colours; points from matches are black (see `colored`).
+        model's ids and colours; points from matches are black (see `color_points`).
 
     Raises:
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
@@ -116,7 +116,7 @@ def triangulate(
     return structure
 
 
-def filtered(
+def filter_points(
     reconstruction: pycolmap.Reconstruction, options: StructureOptions | None = None
 ) -> pycolmap.Reconstruction:
     """Return a copy without the observations and points that violate `options`, its point errors updated.
@@ -130,7 +130,7 @@ def filtered(
     return result
 
 
-def colored(
+def color_points(
     reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction, *, in_place: bool = False
 ) -> pycolmap.Reconstruction:
     """Return a copy whose points take the mean colour of the source's points seen at the same points2D.
@@ -166,7 +166,7 @@ def _two_view_geometry(matches: IntArray) -> pycolmap.TwoViewGeometry:
 
 
 def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
-    """Do to our own `structure` what `filtered` does to a copy; the filter updates the errors of points."""
+    """Do to our own `structure` what `filter_points` does to a copy; update the errors of points."""
     manager = pycolmap.ObservationManager(structure)
     manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
     manager.filter_points3D_with_short_tracks(options.min_track_length)

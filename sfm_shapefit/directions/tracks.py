@@ -101,7 +101,7 @@ def build_tracks(
     for batch in batches:
         row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
         counts = np.diff(batch.offsets)
-        kept = np.repeat(row >= 0, counts) & _sampled(batch, counts, share)
+        kept = np.repeat(row >= 0, counts) & _draw_matches(batch, counts, share)
         pair = np.repeat(np.arange(len(row)), counts)[kept]
         d = directions.directions[row[pair]]
         angle = pixel_angles[batch.pairs[pair]].max(axis=1)
@@ -114,7 +114,7 @@ def build_tracks(
     return _components(np.concatenate(keys), rays)
 
 
-def _sampled(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
+def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
     """Return the matches one of whose keypoints belongs to a random share of all, always the same one."""
     if share >= 1.0:
         return np.ones(len(batch.keypoints), dtype=np.bool_)
@@ -158,11 +158,11 @@ def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
     return Tracks(
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         cameras=camera[kept].astype(np.int64),
-        rays=_gathered(rays, seen[kept]),
+        rays=_gather_rows(rays, seen[kept]),
     )
 
 
-def _gathered(parts: list[FloatArray], rows: IntArray) -> FloatArray:
+def _gather_rows(parts: list[FloatArray], rows: IntArray) -> FloatArray:
     """Return the given rows of arrays (., 3) that follow one another, without joining these."""
     found = np.empty((len(rows), 3))
     start = 0

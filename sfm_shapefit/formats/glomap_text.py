@@ -16,11 +16,11 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import (
     first_words,
+    is_repeated,
     node_indices,
     number_table,
     read_lines,
     refuse,
-    repeated,
 )
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
@@ -60,7 +60,7 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     refuse(
         file, numbers, ~(np.linalg.norm(translations, axis=1) > 0.0), "has no translation, so no direction"
     )
-    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
     return EpipolarGeometries(
         names=tuple(names),

@@ -112,7 +112,7 @@ def refuse(file: Path, numbers: list[int], bad: BoolArray, reason: str) -> None:
         raise InputError(f"{file}, line {numbers[int(np.argmax(bad))]}: {reason}")
 
 
-def repeated(rows: IntArray) -> BoolArray:
+def is_repeated(rows: IntArray) -> BoolArray:
     """Return which of (k, c) rows occurred before."""
     found = np.ones(len(rows), dtype=np.bool_)
     found[np.unique(rows, axis=0, return_index=True)[1]] = False

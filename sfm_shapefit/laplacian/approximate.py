@@ -127,7 +127,7 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
 
 
 @kernel(exact=True)
-def _grown(array: Any, size: int) -> Any:
+def _enlarge(array: Any, size: int) -> Any:
     """Return a copy of an array with room for `size` entries."""
     larger = np.empty((size, *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
@@ -175,7 +175,7 @@ def _add_entry(
 
 
 @kernel(exact=True)
-def _merged_star(
+def _merge_star(
     v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
     below: Any, step: Any, place: Any, star: Any, star_weight: Any,
 ) -> int:  # fmt: skip
@@ -263,7 +263,7 @@ def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, s
             lowest += 1
         v = bucket[lowest]
         _remove(bucket, above, below, degree, v)
-        size = _merged_star(
+        size = _merge_star(
             v, head, links, values, degree, pool, bucket, above, below, step, place, star, star_weight
         )
         _sort_star(size, star, star_weight, tail)
@@ -271,9 +271,9 @@ def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, s
         end = columns[k] + size
         columns[k + 1] = end
         if end > len(rows):
-            rows, fractions = _grown(rows, 2 * end), _grown(fractions, 2 * end)
+            rows, fractions = _enlarge(rows, 2 * end), _enlarge(fractions, 2 * end)
         if pool[1] + 2 * size > len(values):
-            links, values = _grown(links, 2 * len(values)), _grown(values, 2 * len(values))
+            links, values = _enlarge(links, 2 * len(values)), _enlarge(values, 2 * len(values))
         rows[end - size : end] = star[:size]  # nodes now, steps once all steps are known
         fractions[end - size : end] = star_weight[:size] / tail[0]
         _sample_clique(size, star, star_weight, tail, head, links, values, degree, pool, state)

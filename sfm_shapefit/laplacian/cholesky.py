@@ -33,7 +33,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
 from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
-from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, checked_edges
+from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
 
@@ -143,7 +143,7 @@ def analyse(
     Raises:
         InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    pairs = checked_edges(num_nodes, edges)
+    pairs = check_edges(num_nodes, edges)
     graph = adjacency(num_nodes, pairs)
     tree = best_order(graph, ordering) if isinstance(ordering, str) else elimination_tree(graph, ordering)
     return plan_factorisation(graph, pairs, tree)

@@ -42,7 +42,7 @@ class Adjacency:
         return len(self.pointers) - 1
 
 
-def checked_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
+def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array.
 
     Raises:
@@ -122,7 +122,7 @@ def laplacian_pattern(num_nodes: int, edges: npt.ArrayLike) -> LaplacianPattern:
     Raises:
         InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    pairs = checked_edges(num_nodes, edges)
+    pairs = check_edges(num_nodes, edges)
     m = len(pairs)
     nodes = np.arange(num_nodes)
     rows = np.concatenate([nodes, pairs[:, 0], pairs[:, 1]])

@@ -50,7 +50,7 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
     Raises:
         InputError: if an edge is a self-loop or out of range, or `dimension` is below 2.
     """
-    edges = _checked_edges(num_nodes, edges, dimension)
+    edges = _check_edges(num_nodes, edges, dimension)
     set_of = compact(triangle_sets(num_nodes, edges))
     set_of = grow_sets(num_nodes, edges, set_of)
     part = _FIRST_GAME_CAMERAS
@@ -59,7 +59,7 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
         united, is_settled = play(game, dimension)
         set_of = united[set_of]
         if is_settled and game.is_whole:
-            return _ranked(num_nodes, edges, set_of)
+            return _rank(num_nodes, edges, set_of)
         if set_of.max() + 1 < game.num_sets:
             set_of = grow_sets(num_nodes, edges, set_of)
         if is_settled:
@@ -71,7 +71,7 @@ def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
 
     A single camera without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
     """
-    checked = _checked_edges(num_nodes, edges, dimension)
+    checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
         graph = adjacency(num_nodes, checked)
         if _grows_from_first_pair(checked, graph.pointers, graph.neighbours):
@@ -156,7 +156,7 @@ def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray
     return is_kept
 
 
-def _checked_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
+def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
@@ -180,7 +180,7 @@ def _first_bad_edge(num_nodes: int, edges: IntArray) -> int:
     return len(edges)
 
 
-def _ranked(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
+def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
     """Renumber final pieces: more cameras, more edges, smaller first, smaller second camera first."""
     if len(set_of) == 0:
         return set_of

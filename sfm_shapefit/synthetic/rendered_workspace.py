@@ -26,7 +26,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import (
     RenderedScene,
-    encoded_image,
+    encode_image,
     project_distorted,
     surface_points,
 )
@@ -90,7 +90,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     with open_database(database, model) as opened:
         keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
         batches = list(opened.iter_matches(min_matches))
-    joined = _joined(batches)
+    joined = _join(batches)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)
@@ -106,7 +106,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     return JudgedMatches(matches=joined, is_right=is_right, pair_is_wrong=wrong)
 
 
-def _joined(batches: list[MatchBatch]) -> MatchBatch:
+def _join(batches: list[MatchBatch]) -> MatchBatch:
     """Return batches as one."""
     offsets, num_matches = [np.zeros(1, dtype=np.int64)], 0
     for batch in batches:
@@ -139,7 +139,7 @@ def _write_images(scene: RenderedScene, folder: Path) -> None:
     """Write the photographs as JPEG files."""
     folder.mkdir()
     for k in range(scene.num_images):
-        (folder / image_name(k)).write_bytes(encoded_image(scene, k))
+        (folder / image_name(k)).write_bytes(encode_image(scene, k))
 
 
 def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool) -> None:

@@ -25,7 +25,7 @@ from scipy.sparse import coo_array, csr_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turned_at_random
+from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turn_at_random
 from sfm_shapefit.synthetic.options import SceneOptions
 
 _NEAREST_DEPTH_M = 0.3  # nothing is photographed closer than this
@@ -131,8 +131,8 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
 
     false_lists = _false_lists(layout, keypoint_points, pairs, options, corruption_rng)
     lists = _match_lists(keypoints, keypoint_points, pairs, false_lists)
-    lists = [_thinned(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
-    scrambled = [_scrambled(rows, options.wrong_match_fraction, match_rng) for rows in lists]
+    lists = [_thin(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
+    scrambled = [_scramble(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
     relative_rotations, relative_translations = _relative_poses(
         layout, pairs, false_lists, ray_noise_rad, pose_rng
@@ -142,7 +142,7 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
         calibration=options.calibration,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turned_at_random(
+        stated_rotations=turn_at_random(
             layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng
         ),
         points=layout.points,
@@ -317,14 +317,14 @@ def _shared_keypoints(points_i: IntArray, points_j: IntArray) -> IntArray:
     return np.stack([in_i, in_j], axis=1).astype(np.int64)
 
 
-def _thinned(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
+def _thin(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
     """Return a random share of the matches, in their order; all, if they are few enough."""
     if most is None or len(matches) <= most:
         return matches
     return matches[np.sort(rng.choice(len(matches), most, replace=False))]
 
 
-def _scrambled(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
+def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
     """Return the matches with `fraction` of them joining random keypoints of the list, and which those are.
 
     The chosen rows pass their second keypoints on in a random cycle: each of them becomes wrong, and no
@@ -439,7 +439,7 @@ def _relative_poses(
     for e, false in false_lists.items():
         centers[e, false.displaced] = false.center
     rotation_i, rotation_j = layout.rotations[pairs].swapaxes(0, 1)
-    rotation = turned_at_random(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
+    rotation = turn_at_random(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
     translation = normalized(np.einsum("eab,eb->ea", rotation_j, centers[:, 0] - centers[:, 1]))
     noise = _RELATIVE_POSE_DIRECTION_FACTOR * ray_noise_rad * rng.standard_normal(translation.shape)
     return rotation, normalized(translation + noise)

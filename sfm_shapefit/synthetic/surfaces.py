@@ -181,7 +181,7 @@ def _ring(_num_images: int, repeated: float, rng: np.random.Generator) -> list[_
     size = (round(height * _TEXELS_PER_M_NEAR), round(radius * side_angle * _TEXELS_PER_M_NEAR))
     repeating = facade_texture(*size, 100, rng)
     parts = []
-    for k, repeats in enumerate(_chosen(_TOWER_SIDES, repeated, rng)):
+    for k, repeats in enumerate(_choose(_TOWER_SIDES, repeated, rng)):
         picture = repeating if repeats else facade_texture(*size, 100, rng)
         rows = side == k
         parts.append(
@@ -219,7 +219,7 @@ def _house_maker(
         return picture, low, extent
 
     repeating = drawn()
-    repeats = iter(_chosen(num_houses, repeated, rng))
+    repeats = iter(_choose(num_houses, repeated, rng))
 
     def house(place: _Place) -> list[_Part]:
         picture, low, extent = repeating if next(repeats) else drawn()
@@ -231,7 +231,7 @@ def _house_maker(
     return house
 
 
-def _chosen(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
+def _choose(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
     """Return which of so many things are among a random fraction of them."""
     chosen: list[bool] = (rng.permutation(count) < round(fraction * count)).tolist()
     return chosen
