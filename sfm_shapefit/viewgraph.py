@@ -24,7 +24,7 @@ class ViewGraph:
     """Cameras 0..n-1 and the measured directions between pairs of them. Arrays are read-only.
 
     A pair that is given more than once is merged into its first occurrence: weights add, and the
-    direction is that of the weighted sum. Directions are renormalised to unit length; those which have it
+    direction is that of the weighted sum. Directions are renormalized to unit length; those which have it
     to rounding are kept to the last bit, so that a graph of a graph's edges has the same directions.
     """
 

@@ -1,6 +1,6 @@
 """What the literature compares with: each a short module with its source, all on a `ViewGraph`.
 
-Locators return (n, d) locations, centred, of unit Frobenius norm, and pointing the way the directions do.
+Locators return (n, d) locations, centered, of unit Frobenius norm, and pointing the way the directions do.
 Filters return (m,) whether a pair is kept; what they leave is a graph for any locator, ShapeFit's too.
 """
 

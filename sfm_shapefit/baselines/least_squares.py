@@ -1,6 +1,6 @@
 """Least squares on the parts of the baselines that are orthogonal to their directions.
 
-    minimise  sum_e w_e ||P_e (t_i - t_j)||^2    subject to  sum_i t_i = 0,  sum_i ||t_i||^2 = 1
+    minimize  sum_e w_e ||P_e (t_i - t_j)||^2    subject to  sum_i t_i = 0,  sum_i ||t_i||^2 = 1
 
 is the smallest eigenvector, shifts aside, of the projected Laplacian D^T P D. Its residuals are lengths, so
 that long baselines count more; reweighting by 1 / ||t_i - t_j||^2 turns them into sines of angles.
@@ -35,7 +35,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
         reweightings: solves after the first, with weights of the last lengths (Govindu); 10 is plenty.
 
     Returns:
-        (n, d) locations, centred and of unit norm.
+        (n, d) locations, centered and of unit norm.
     """
     pattern = laplacian_pattern(graph.num_nodes, graph.edges)
     projections = np.eye(graph.dimension) - np.einsum("ea,eb->eab", graph.directions, graph.directions)

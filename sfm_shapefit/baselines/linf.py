@@ -1,6 +1,6 @@
 """l_inf: the locations whose worst pair is as good as can be. One wrong pair decides the answer.
 
-    minimise  gamma    subject to  || t_i - t_j - s_e v_e || <= gamma,  s_e >= 1
+    minimize  gamma    subject to  || t_i - t_j - s_e v_e || <= gamma,  s_e >= 1
 
 as a second-order cone program through cvxpy and Clarabel; for small graphs.
 

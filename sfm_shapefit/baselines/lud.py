@@ -1,6 +1,6 @@
 """LUD, least unsquared deviations, by the engine that ShapeFit's splitting uses.
 
-    minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
+    minimize  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
 
 Source: Ozyesil and Singer, "Robust camera location estimation by convex programming", CVPR 2015, eq. 7.
 """

@@ -8,7 +8,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 
 def normalize_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:
-    """Return the (n, d) locations centred, of unit norm, and with sum_e w_e <t_i - t_j, v_e> >= 0."""
+    """Return the (n, d) locations centered, of unit norm, and with sum_e w_e <t_i - t_j, v_e> >= 0."""
     centered = locations - locations.mean(axis=0)
     centered = centered / np.linalg.norm(centered)
     aligned: FloatArray = centered if projected_length(graph, centered) >= 0.0 else -centered

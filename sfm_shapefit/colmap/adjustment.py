@@ -6,8 +6,8 @@
 
 A seed that is a few pixels off loses its long tracks to a tight filter at once, so the first round is loose.
 Points made at the first poses carry their errors on, so every round triangulates anew instead of completing
-what is there. Mean error in metres against the laser truth of Strecha's castle scenes, from the incremental
-model's centres disturbed by 5 cm:
+what is there. Mean error in meters against the laser truth of Strecha's castle scenes, from the incremental
+model's centers disturbed by 5 cm:
 
                                                       castle-P19   castle-P30
     this recipe                                       0.0249       0.0217
@@ -103,7 +103,7 @@ def bundle_adjust(
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
 
     Returns:
-        The adjusted model, with ids and colours of points as from `triangulate`. The gauge is held by two
+        The adjusted model, with ids and colors of points as from `triangulate`. The gauge is held by two
         cameras, so scale and axes stay near the seed's; fewer than two fixed frames do not hold it. The poses
         of sensors in their rigs stay what they are.
 

@@ -24,7 +24,7 @@ class UnposedImages:
     """What a database says of its images."""
 
     reconstruction: pycolmap.Reconstruction
-    """All cameras and images; every rotation is the identity, every centre the origin."""
+    """All cameras and images; every rotation is the identity, every center the origin."""
     num_guessed_cameras: int
     """Cameras in use whose focal length is COLMAP's guess."""
     has_rigs: bool
@@ -76,7 +76,7 @@ def read_images(path: Path) -> UnposedImages:
 def pose_at_origin(
     images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
 ) -> pycolmap.Reconstruction:
-    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centres 0."""
+    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centers 0."""
     model = pycolmap.Reconstruction()
     for camera_id in sorted({images.image(i).camera_id for i in image_ids}):
         model.add_camera_with_trivial_rig(images.camera(camera_id))

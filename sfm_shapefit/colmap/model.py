@@ -1,7 +1,7 @@
 """Models with known rotations: what is read of a COLMAP reconstruction, and the rays of its pixels.
 
-COLMAP's convention is x_cam = R x_world + t with centre C = -R^T t. Only R and the intrinsics are
-trusted: the centres of the input are carried along for comparison and never place a camera.
+COLMAP's convention is x_cam = R x_world + t with center C = -R^T t. Only R and the intrinsics are
+trusted: the centers of the input are carried along for comparison and never place a camera.
 
 Poses live in frames (`rig_from_world`); for a model of an older COLMAP, pycolmap makes one frame per
 image. In a rig of several sensors cam_from_world = sensor_from_rig * rig_from_world, so that a camera stands
@@ -39,7 +39,7 @@ PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 _UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
 _LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
 _POINT3D_ID = attrgetter("point3D_id")
-# For this camera, pixel coordinates and normalised coordinates are the same numbers.
+# For this camera, pixel coordinates and normalized coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
 
 
@@ -60,7 +60,7 @@ class PosedModel:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     centers: FloatArray
-    """(n, 3) the input's camera centres; they never place a camera, and may all be 0."""
+    """(n, 3) the input's camera centers; they never place a camera, and may all be 0."""
     focal_lengths_px: FloatArray
     """(n,) mean focal length; for a camera without one (equirectangular) its pixels per radian."""
     frame_ids: IntArray
@@ -111,7 +111,7 @@ class PosedCameras:
 
 
 def posed_cameras(model: PosedModel) -> PosedCameras:
-    """Return the posed images without their points and centres."""
+    """Return the posed images without their points and centers."""
     reconstruction = model.reconstruction
     ids = [reconstruction.image(i).camera_id for i in model.image_ids.tolist()]
     different, camera_of = np.unique(ids, return_inverse=True)
@@ -126,7 +126,7 @@ def posed_cameras(model: PosedModel) -> PosedCameras:
 
 
 def from_posed_cameras(table: PosedCameras) -> PosedModel:
-    """Return a model of these images: the same rotations to the bit, centres at the origin, no points."""
+    """Return a model of these images: the same rotations to the bit, centers at the origin, no points."""
     reconstruction = pycolmap.Reconstruction()
     for k, camera in enumerate(table.cameras):
         made = pycolmap.Camera(
@@ -185,7 +185,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
 
 def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
-    """Return the model with cameras that turn about their centres; the input is not touched.
+    """Return the model with cameras that turn about their centers; the input is not touched.
 
     Args:
         model: the posed images.
@@ -213,7 +213,7 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     Args:
         model: the posed images.
         image: index into `model.image_ids`.
-        xy: (k, 2) pixels in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+        xy: (k, 2) pixels in COLMAP's convention: the center of the first pixel is (0.5, 0.5).
 
     Returns:
         (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.

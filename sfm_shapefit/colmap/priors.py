@@ -1,7 +1,7 @@
 """Position priors of cameras: the pose priors of a COLMAP database, or a table of names and positions.
 
-Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in metres) become metres east,
-north and up of their median. Their covariances are taken as metres squared in those axes.
+Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
+north and up of their median. Their covariances are taken as meters squared in those axes.
 
 Source: https://colmap.github.io/database.html; `colmap/geometry/pose_prior.h`: coordinate system -1 is
 undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP 3.12 a row names its image,
@@ -58,7 +58,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
     """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
 
     A first line that names the columns is optional; where it calls the second one lat or latitude, rows
-    are latitude, longitude (degrees) and altitude (metres). Lines that begin with # are comments.
+    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments.
 
     Args:
         path: the table.

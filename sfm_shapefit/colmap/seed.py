@@ -1,4 +1,4 @@
-"""A seeded model: the input's rotations and intrinsics, our camera centres, and no 3D points yet.
+"""A seeded model: the input's rotations and intrinsics, our camera centers, and no 3D points yet.
 
 COLMAP keeps poses in frames, x_rig = R x_world + t with t = -R C. Moving a frame replaces t and hands on
 the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in
@@ -33,15 +33,15 @@ def build_seed(
 
     Args:
         model: the input.
-        placed: (n,) which images have a centre; the others, and images that had no pose, are unregistered
+        placed: (n,) which images have a center; the others, and images that had no pose, are unregistered
             unless another image of their frame is placed.
-        centers: (n, 3) camera centres in world axes; rows of images that are not placed are ignored.
+        centers: (n, 3) camera centers in world axes; rows of images that are not placed are ignored.
         keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
             it has none (a missing key, or no rows), and all images if None, keep those of the model.
         fixed: (n,) images whose frame keeps its pose to the last bit; none if None.
 
     Raises:
-        ValueError: if the shapes do not fit the model, or the centre of a placed image is not finite.
+        ValueError: if the shapes do not fit the model, or the center of a placed image is not finite.
     """
     n = model.num_images
     if placed.shape != (n,) or centers.shape != (n, 3):

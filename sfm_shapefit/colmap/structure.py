@@ -1,4 +1,4 @@
-"""Structure: 3D points triangulated at given poses, filtered, and coloured like the input's.
+"""Structure: 3D points triangulated at given poses, filtered, and colored like the input's.
 
 Tracks come from one of two sources:
 
@@ -100,7 +100,7 @@ def triangulate(
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
-        model's ids and colours; points from matches are black (see `color_points`).
+        model's ids and colors; points from matches are black (see `color_points`).
 
     Raises:
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
@@ -133,11 +133,11 @@ def filter_points(
 def color_points(
     reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction, *, in_place: bool = False
 ) -> pycolmap.Reconstruction:
-    """Return a copy whose points take the mean colour of the source's points seen at the same points2D.
+    """Return a copy whose points take the mean color of the source's points seen at the same points2D.
 
     Images take part if their points2D are the same in both, in number and coordinates. Points without
-    any common observation keep their colour. A source without any colour costs no copy: the
-    `reconstruction` itself is returned. So it is `in_place`, coloured: a copy of a large one is large.
+    any common observation keep their color. A source without any color costs no copy: the
+    `reconstruction` itself is returned. So it is `in_place`, colored: a copy of a large one is large.
     """
     if not any(point.color.any() for point in source.points3D.values()):
         return reconstruction
@@ -318,7 +318,7 @@ class _Observations:
         return list(zip(firsts.tolist(), (firsts + lengths).tolist(), strict=True))
 
 
-# --- colours ---------------------------------------------------------------------------------------
+# --- colors ---------------------------------------------------------------------------------------
 
 
 def _common_observations(

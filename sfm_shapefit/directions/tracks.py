@@ -120,7 +120,7 @@ def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArra
         return np.ones(len(batch.keypoints), dtype=np.bool_)
     image = np.repeat(batch.pairs, counts, axis=0).astype(np.uint64)
     mixed = (image << np.uint64(32)) + batch.keypoints.astype(np.uint64)
-    for shift in (30, 27, 31):  # the finaliser of splitmix64
+    for shift in (30, 27, 31):  # the finalizer of splitmix64
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * _MIX
     drawn: BoolArray = (mixed >> np.uint64(11)).astype(np.float64) < share / 2.0 * 2.0**53
     return np.asarray(drawn.any(axis=1))

@@ -7,12 +7,12 @@
 
     P = R X + t,   p = -P / P_z,   pixel = f (1 + k1 |p|^2 + k2 |p|^4) p
 
-from the centre of the image, x to the right and y up: the camera looks along -z. S = diag(1, -1, -1) takes
+from the center of the image, x to the right and y up: the camera looks along -z. S = diag(1, -1, -1) takes
 its axes to COLMAP's, cam_from_world = S R; the distortion is that of COLMAP's RADIAL.
 
 Names stand in a list file beside it, one a line (`list.txt`, or the .out file's name with .list.txt
 appended, as COLMAP writes it); without one they are camera0000 and so on. Sizes of images stand nowhere:
-the smallest even size that holds all observations is taken, with the principal point at its centre, as
+the smallest even size that holds all observations is taken, with the principal point at its center, as
 Bundler has it.
 
 Source: Snavely, "Bundler v0.4 User's Manual", section VI.
@@ -154,7 +154,7 @@ def _is_finite(word: str) -> bool:
 def _points(
     words: _Words, num_points: int, num_cameras: int, index_of: dict[int, int]
 ) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
-    """Return points, colours, observations (point, image), and their offsets from the image's centre."""
+    """Return points, colors, observations (point, image), and their offsets from the image's center."""
     points, colors, observed, offsets = [], [], [], []
     for point in range(num_points):
         values = words.numbers(6)

@@ -1,6 +1,6 @@
 """g2o files, those of pose-graph tools (g2o, GTSAM): relative poses are read, placed nodes are written.
 
-    VERTEX_SE3:QUAT    id x y z qx qy qz qw        centre and rotation world_from_cam
+    VERTEX_SE3:QUAT    id x y z qx qy qz qw        center and rotation world_from_cam
     EDGE_SE3:QUAT      i j x y z qx qy qz qw [21]  cam_i_from_cam_j, whose x y z is camera j seen from i
     VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
     VERTEX_XY          id x y                      the same in the plane

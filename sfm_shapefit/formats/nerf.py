@@ -2,7 +2,7 @@
 
     transform_matrix  world_from_camera, 4 x 4, in OpenGL's camera axes: x right, y up, looking along -z
 
-so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's centre. World axes stay
+so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
 for instant-ngp and the original NeRF.

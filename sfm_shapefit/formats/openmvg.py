@@ -9,7 +9,7 @@
 
     x_cam = rotation (X - center)
 
-so rotation is cam_from_world, with z forward and y down as in COLMAP, and center the camera's centre.
+so rotation is cam_from_world, with z forward and y down as in COLMAP, and center the camera's center.
 Newer versions nest the base classes' members in objects `value0`; both forms are read. The camera model is
 known by the name of its distortion, for `polymorphic_name` stands only at the first of a kind. Pixels are
 taken as they are.

@@ -5,12 +5,12 @@
       "points":  {id: {coordinates: [3], color: [3]}}}, ...]
 
 `rotation` is the angle-axis vector of cam_from_world, `translation` its t: x_cam = R x + t, z forward and
-y down as in COLMAP. Lengths in the image are in units of its larger side, from its centre:
+y down as in COLMAP. Lengths in the image are in units of its larger side, from its center:
 
-    pixel = larger side * normalised + (width, height) / 2          (COLMAP's pixels: first centre at 0.5)
+    pixel = larger side * normalized + (width, height) / 2          (COLMAP's pixels: first center at 0.5)
 
 tracks.csv, versions 1 and 2: `image track feature x y [scale] r g b ...`, tab-separated, x and y
-normalised; tracks are the points. Of several reconstructions the one with most shots is read.
+normalized; tracks are the points. Of several reconstructions the one with most shots is read.
 
 Source: https://opensfm.org/docs/geometry.html and dataset.html.
 """
@@ -117,7 +117,7 @@ def _camera(node: JsonNode) -> Intrinsics:
 
 
 def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:
-    """Return the observations (point, image) of tracks.csv, and their normalised coordinates."""
+    """Return the observations (point, image) of tracks.csv, and their normalized coordinates."""
     tracks = file.with_name(_TRACKS_FILE)
     observed, coordinates = [], []
     if tracks.is_file():

@@ -1,6 +1,6 @@
 """A posed model in plain arrays: what the model formats of other programs are read into and written from.
 
-COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pixels with the centre of the
+COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pixels with the center of the
 first one at (0.5, 0.5), camera models and the order of their parameters by COLMAP's names.
 """
 
@@ -35,7 +35,7 @@ class PosedModelFile:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     centers: FloatArray
-    """(n, 3) camera centres in the world."""
+    """(n, 3) camera centers in the world."""
     points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
     """(p, 3)"""
     colors: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))

@@ -1,7 +1,7 @@
 """Poses as plain text: the TUM RGB-D trajectory format, and a CSV; both written.
 
-    TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the centre, and R^T as a quaternion
-    CSV   name,x,y,z,qw,qx,qy,qz              the centre, and cam_from_world as in COLMAP's images.txt
+    TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the center, and R^T as a quaternion
+    CSV   name,x,y,z,qw,qx,qy,qz              the center, and cam_from_world as in COLMAP's images.txt
 
 Camera axes are COLMAP's in both (z forward, y down), as in TUM's own data. The timestamp is the number
 that is an image's name without folder and suffix, as in TUM's data (1305031102.175304.png), if all names

@@ -1,6 +1,6 @@
 """Preconditioners without fill, and conjugate gradients: for graphs whose Cholesky factor would not fit.
 
-Eliminating a node v with neighbours of weights w_1 <= ... <= w_d, W = sum w, adds the clique of weights
+Eliminating a node v with neighbors of weights w_1 <= ... <= w_d, W = sum w, adds the clique of weights
 w_i w_j / W. Approximate Cholesky replaces the clique by d - 1 sampled edges of the right mean: each i < d is
 joined to one later j, drawn with probability w_j / (w_{i+1} + ... + w_d), with weight
 w_i (w_{i+1} + ... + w_d) / W. So the number of edges never grows.
@@ -58,7 +58,7 @@ class ApproximateCholesky:
     rows: Int32Array
     """Elimination steps of the entries below the diagonal."""
     fractions: npt.NDArray[np.float32]
-    """Minus these entries: the share of each neighbour in the weighted degree of the eliminated node."""
+    """Minus these entries: the share of each neighbor in the weighted degree of the eliminated node."""
     pivots: FloatArray
     """(n,) weighted degree at elimination; 0 for the last node of each component."""
 
@@ -81,7 +81,7 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     """Return a sampled Cholesky factor of the graph Laplacian.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         weights: (m,) non-negative edge weights; edges of weight 0 do not count.
         seed: of the draws; any integer.
     """
@@ -179,9 +179,9 @@ def _merge_star(
     v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
     below: Any, step: Any, place: Any, star: Any, star_weight: Any,
 ) -> int:  # fmt: skip
-    """Collect the neighbours of v that are left, parallel edges summed, and free v's list.
+    """Collect the neighbors of v that are left, parallel edges summed, and free v's list.
 
-    Returns their number. Each neighbour leaves its bucket; its degree falls by the number of its edges to v.
+    Returns their number. Each neighbor leaves its bucket; its degree falls by the number of its edges to v.
     """
     size, entry, last = 0, head[v], -1
     while entry >= 0:
@@ -206,7 +206,7 @@ def _merge_star(
 
 @kernel(exact=True)
 def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
-    """Sort the neighbours by weight, ascending, equal ones by node; sum the weights from each to the last.
+    """Sort the neighbors by weight, ascending, equal ones by node; sum the weights from each to the last.
 
     Shell's method with Ciura's gaps: no allocation, and insertion sort where a star is small.
     """
@@ -228,7 +228,7 @@ def _sample_clique(
     size: int, star: Any, star_weight: Any, tail: Any, head: Any, links: Any, values: Any, degree: Any,
     pool: Any, state: Any,
 ) -> None:  # fmt: skip
-    """Join each neighbour to one of larger weight, drawn in proportion to the weights."""
+    """Join each neighbor to one of larger weight, drawn in proportion to the weights."""
     for a in range(size - 1):
         target = tail[a + 1] * (1.0 - _uniform(state))  # in (0, tail[a + 1]]
         low, high = a + 1, size - 1

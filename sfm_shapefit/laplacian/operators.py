@@ -27,7 +27,7 @@ Int32Array = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjacency:
-    """The neighbours of each node, in compressed rows; within a row in the order of the edges."""
+    """The neighbors of each node, in compressed rows; within a row in the order of the edges."""
 
     pointers: IntArray
     """(n + 1,) row i is `neighbours[pointers[i]:pointers[i + 1]]`."""
@@ -57,7 +57,7 @@ def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
 
 
 def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
-    """Return the neighbours of each node; a repeated edge stands repeatedly.
+    """Return the neighbors of each node; a repeated edge stands repeatedly.
 
     Args:
         num_nodes: n.

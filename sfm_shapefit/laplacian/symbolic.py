@@ -1,6 +1,6 @@
-"""What a sparse Cholesky factorisation will do, from the graph alone: fill, work, and where all goes.
+"""What a sparse Cholesky factorization will do, from the graph alone: fill, work, and where all goes.
 
-Eliminating node k joins its later neighbours. The first of them is its parent in the elimination tree,
+Eliminating node k joins its later neighbors. The first of them is its parent in the elimination tree,
 and column k of the factor L is filled within the column of the parent (Liu 1990, "The role of elimination
 trees in sparse factorization"). From that:
 
@@ -54,13 +54,13 @@ class EliminationTree:
 
     @property
     def flops(self) -> float:
-        """Multiplications and additions of the factorisation: the sum of squared column counts."""
+        """Multiplications and additions of the factorization: the sum of squared column counts."""
         return float(np.sum(self.counts.astype(np.float64) ** 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SymbolicFactor:
-    """The plan of a multifrontal Cholesky factorisation; serves every block size and precision.
+    """The plan of a multifrontal Cholesky factorization; serves every block size and precision.
 
     Supernode s owns elimination steps `first[s]:first[s + 1]`. Its panel has those steps as columns, and
     as rows the same steps followed by `rows[row_pointers[s]:row_pointers[s + 1]]`, column-major.
@@ -111,7 +111,7 @@ class SymbolicFactor:
     num_nonzeros: int
     """Entries of the scalar factor L without any explicit zero."""
     flops: float
-    """Multiplications and additions of the scalar factorisation, without explicit zeros."""
+    """Multiplications and additions of the scalar factorization, without explicit zeros."""
 
     @property
     def num_nodes(self) -> int:
@@ -138,7 +138,7 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
     """Return the elimination tree and the column counts of L for a fill-reducing order.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         order: (n,) a permutation of the nodes, the first eliminated first.
 
     Returns:
@@ -161,7 +161,7 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         edges: (m, 2) int64, the edges of `graph`.
         tree: from `elimination_tree` on the same graph.
     """
@@ -216,7 +216,7 @@ def _inverse(permutation: IntArray) -> IntArray:
 
 @kernel()
 def _parents(pointers: Any, neighbours: Any, permutation: Any, inverse: Any) -> Any:
-    """Return the elimination tree: join the earlier neighbours' trees below each step (with compression)."""
+    """Return the elimination tree: join the earlier neighbors' trees below each step (with compression)."""
     n = len(permutation)
     parent = np.full(n, -1, np.int64)
     ancestor = np.full(n, -1, np.int64)
@@ -262,7 +262,7 @@ def _postorder(parent: Any) -> Any:
 def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
     """Count the entries of each column of L.
 
-    Row i of L is the subtree that joins i's earlier neighbours to i. Entry (i, j) is charged +1 at each
+    Row i of L is the subtree that joins i's earlier neighbors to i. Entry (i, j) is charged +1 at each
     leaf j and -1 where two branches meet, so that sums over subtrees count every row that passes.
     """
     n = len(permutation)
@@ -281,7 +281,7 @@ def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: An
         for p in range(pointers[node], pointers[node + 1]):
             i = inverse[neighbours[p]]
             if i <= j or lowest[j] <= previous[i]:
-                continue  # an earlier neighbour of i lies below j: j is no leaf of row i
+                continue  # an earlier neighbor of i lies below j: j is no leaf of row i
             delta[j] += 1
             if previous[i] >= 0:
                 meet = previous[i]

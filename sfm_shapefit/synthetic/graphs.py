@@ -118,8 +118,8 @@ def box_graph_problem(
 ) -> GraphProblem:
     """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
 
-    The model of an area mapped from a drone. About degree / 1.25 neighbours are taken, because the union of
-    the neighbourhoods is larger than each of them.
+    The model of an area mapped from a drone. About degree / 1.25 neighbors are taken, because the union of
+    the neighborhoods is larger than each of them.
     """
     rng = _rng(noise)
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
@@ -263,7 +263,7 @@ def community_graph_problem(
 ) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
-    Locations are N(0, I) around centres N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
     cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
     (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
     that the mean degree stays somewhat below `degree`.

@@ -1,6 +1,6 @@
 """Where the cameras of a synthetic scene stand, and which surface points lie before them, for each shape.
 
-World axes: z is up; one unit is a metre. Every surface is convex towards its cameras, so that which way a
+World axes: z is up; one unit is a meter. Every surface is convex towards its cameras, so that which way a
 point faces also decides whether it is hidden.
 """
 
@@ -25,7 +25,7 @@ class Layout:
     """Surfaces and cameras, before any photograph."""
 
     centers: FloatArray
-    """(n, 3) camera centres."""
+    """(n, 3) camera centers."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     points: FloatArray
@@ -194,7 +194,7 @@ def _draw_board(
     dark: tuple[int, int, int],
     rng: np.random.Generator,
 ) -> ByteArray:
-    """Return colours (p, 3) of a board with unit fields at texture coordinates u, v, with some grain."""
+    """Return colors (p, 3) of a board with unit fields at texture coordinates u, v, with some grain."""
     odd = (np.floor(u) + np.floor(v)) % 2.0 == 1.0
     grain = rng.integers(-8, 9, size=(len(u), 1))
     return np.asarray(np.clip(np.where(odd[:, None], dark, light) + grain, 0, 255), dtype=np.uint8)

@@ -221,7 +221,7 @@ def _true_tracks(scene: RenderedScene, database: Path) -> _Tracks:
 def _posed_model(
     scene: RenderedScene, rotations: FloatArray, tracks: _Tracks | None = None, *, at_origin: bool = False
 ) -> pycolmap.Reconstruction:
-    """Return a model with the given rotations at the true centres, or all at the origin, and its tracks."""
+    """Return a model with the given rotations at the true centers, or all at the origin, and its tracks."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(_camera(scene))
     for k, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):

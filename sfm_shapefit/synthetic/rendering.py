@@ -16,7 +16,7 @@ is right. Source of the projection: Olano and Greer, Triangle scan conversion us
 coordinates (1997).
 
 Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner,
-so that the first pixel's centre is (0.5, 0.5).
+so that the first pixel's center is (0.5, 0.5).
 """
 
 from dataclasses import dataclass
@@ -57,7 +57,7 @@ class RenderedScene:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world, true."""
     centers: FloatArray
-    """(n, 3) camera centres, true."""
+    """(n, 3) camera centers, true."""
     stated_rotations: FloatArray
     """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     surfaces: Surfaces
@@ -260,11 +260,11 @@ def _nearest_triangles(
     return nearest, inverse_depth
 
 
-# --- colours -----------------------------------------------------------------------------------------------
+# --- colors -----------------------------------------------------------------------------------------------
 
 
 def _shade(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np.float32]:
-    """Return the colours (rows, columns, 3) of the samples of an image, 0 to 255."""
+    """Return the colors (rows, columns, 3) of the samples of an image, 0 to 255."""
     inverse, kept = _inverse_corners(scene, image)
     nearest, _ = _nearest_triangles(rays, inverse, _bounds(scene, image, kept, rays))
     pyramid, levels = _mipmaps(scene.surfaces.textures)
@@ -323,7 +323,7 @@ def _paint(
     pyramid: ByteArray,
     levels: IntArray,
 ) -> None:
-    """Write the colour of each sample that shows a triangle."""
+    """Write the color of each sample that shows a triangle."""
     rows, columns = nearest.shape
     for r in range(rows):
         for c in range(columns):
@@ -358,7 +358,7 @@ def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float,
 
 @kernel(exact=True)
 def _bilinear(pyramid: ByteArray, levels: IntArray, level: int, u: float, v: float, channel: int) -> float:
-    """Return one colour of a picture that repeats for ever, at a position in pixels of its first level."""
+    """Return one color of a picture that repeats for ever, at a position in pixels of its first level."""
     offset, height, width = levels[level, 0], levels[level, 1], levels[level, 2]
     x = u * width / levels[0, 2] - 0.5
     y = v * height / levels[0, 1] - 0.5

@@ -46,7 +46,7 @@ class RigScene:
     sensor_rotations: FloatArray
     """(rigs, sensors, 3, 3) sensor_from_rig."""
     sensor_centers: FloatArray
-    """(rigs, sensors, 3) of each sensor in its rig, in metres; 0 for the reference."""
+    """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
 
 
 def make_rig_drive(options: SceneOptions) -> RigScene:
@@ -93,7 +93,7 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
 def _frames(
     num_frames: int, rig_of_frame: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rig_from_world rotations (f, 3, 3) and centres (f, 3) of the frames along the street."""
+    """Return rig_from_world rotations (f, 3, 3) and centers (f, 3) of the frames along the street."""
     at = _STEP_M / NUM_RIGS * np.arange(num_frames)
     road, ahead, left = street(at)
     centers = road + (_LANES_M[rig_of_frame] + 0.1 * rng.standard_normal(num_frames))[:, None] * left

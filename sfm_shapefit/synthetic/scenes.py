@@ -12,7 +12,7 @@ constraint of the true relative rotation and of a baseline that does not exist, 
 gives it away. Its second image gets keypoints of its own for that, which belong to no point.
 
 Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner.
-World axes: z is up; one unit is a metre. OpenCV is imported when a scene is projected and
+World axes: z is up; one unit is a meter. OpenCV is imported when a scene is projected and
 not before.
 """
 
@@ -46,7 +46,7 @@ class Scene:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world, true."""
     centers: FloatArray
-    """(n, 3) camera centres, true."""
+    """(n, 3) camera centers, true."""
     stated_rotations: FloatArray
     """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     points: FloatArray
@@ -167,7 +167,7 @@ def project_points(
     Args:
         points: (k, 3) in world axes.
         cam_from_world: (3, 3) rotation.
-        center: (3,) camera centre in world axes.
+        center: (3,) camera center in world axes.
         calibration: (3, 3) K.
 
     Raises:
@@ -238,7 +238,7 @@ def _in_view_from(
     cam_from_world: FloatArray,
     options: SceneOptions,
 ) -> BoolArray:
-    """Return (c, k): which of the points a camera at each of the centres would show, whatever they face."""
+    """Return (c, k): which of the points a camera at each of the centers would show, whatever they face."""
     img_from_world = options.calibration @ cam_from_world
     homogeneous = (points @ img_from_world.T)[None, :, :] - (centers @ img_from_world.T)[:, None, :]
     depth = homogeneous[:, :, 2]
@@ -378,9 +378,9 @@ def _false_list(
     options: SceneOptions,
     rng: np.random.Generator,
 ) -> _FalseList | None:
-    """Return what one camera would show of the other image's points from a false centre, if any fits.
+    """Return what one camera would show of the other image's points from a false center, if any fits.
 
-    Its rotation is kept. Centres are tried in the order of `_false_centers`; the first that is wrong by
+    Its rotation is kept. Centers are tried in the order of `_false_centers`; the first that is wrong by
     enough and keeps enough points in view is taken. The list is as long as the true one, at most.
     """
     side = int(rng.integers(2))
@@ -407,10 +407,10 @@ def _false_list(
 
 
 def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return candidate centres (c, 3), c <= 40, of a camera that never was, beside the one at `center`.
+    """Return candidate centers (c, 3), c <= 40, of a camera that never was, beside the one at `center`.
 
     First 16 at the true distance in uniformly random directions, the corruption of the paper; then 24
-    around the true centre, ever nearer to it, for pairs whose view axes leave less freedom. None is so
+    around the true center, ever nearer to it, for pairs whose view axes leave less freedom. None is so
     near to the other camera that its direction would be ill determined.
     """
     baseline = float(np.linalg.norm(center - true_center))

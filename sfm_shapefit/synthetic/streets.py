@@ -1,7 +1,7 @@
 """A straight street whose truth is known: parallel baselines between cameras, and points at the roadside.
 
 Cameras drive along a line, so that the directions between them say nothing of their distances; rays to points
-3 to 10 m aside do. Cameras are a metre apart on average, the speed varies smoothly by a factor of 3. Each
+3 to 10 m aside do. Cameras are a meter apart on average, the speed varies smoothly by a factor of 3. Each
 camera starts tracks, seen by it and the next 3 to 7, of a point beside the middle of them. Noise is a random
 vector of 0.01 rad between cameras and of 1e-3 rad, a pixel at a focal length of 1000, towards points.
 """
@@ -25,7 +25,7 @@ class StreetProblem:
     """Cameras and points of a street, with the directions between them."""
 
     locations: FloatArray
-    """(n, 3) the truth in metres: cameras 0..num_cameras-1, then points."""
+    """(n, 3) the truth in meters: cameras 0..num_cameras-1, then points."""
     num_cameras: int
     edges: IntArray
     """(m, 2) pairs of cameras, then (camera, point)."""
@@ -45,7 +45,7 @@ def street_problem(
     Args:
         num_cameras: at least 8, the longest track.
         tracks_per_camera: tracks that start at each camera.
-        jitter: standard deviation of the cameras' distance from the line, per axis, in metres.
+        jitter: standard deviation of the cameras' distance from the line, per axis, in meters.
         seed: an integer, or a Generator to draw from.
     """
     rng = np.random.default_rng(seed)

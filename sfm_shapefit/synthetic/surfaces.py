@@ -5,7 +5,7 @@ thing that it belongs to: along its front, into it, and up. Where houses repeat,
 picture, same balconies. Boxes and ground never repeat.
 
 The surfaces stand where the layout of the same shape has its points, and its cameras look at them. World
-axes: z is up; one unit is a metre.
+axes: z is up; one unit is a meter.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,7 +43,7 @@ class Surfaces:
     texture: IntArray
     """(t,) the picture of each triangle."""
     brightness: FloatArray
-    """(t,) factor to the picture's colours."""
+    """(t,) factor to the picture's colors."""
     textures: tuple[ByteArray, ...]
     """The pictures, (height, width, 3): red, green, blue."""
 
@@ -253,7 +253,7 @@ def _boxes(
     floor_m: float = 0.0,
     texels_per_m: float = _TEXELS_PER_M,
 ) -> list[_Part]:
-    """Return boxes of about a size, turned at random, with their centres at (k, 2) on the floor."""
+    """Return boxes of about a size, turned at random, with their centers at (k, 2) on the floor."""
     parts = []
     for x, y in at.tolist():
         angle = rng.uniform(0.0, 2.0 * np.pi)

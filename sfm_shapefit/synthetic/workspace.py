@@ -69,7 +69,7 @@ def write_models(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction,
 
 
 def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Reconstruction:
-    """Return cameras and images with rotations, all centres (of frames) at the origin, and nothing else."""
+    """Return cameras and images with rotations, all centers (of frames) at the origin, and nothing else."""
     if rigs is not None:
         images = [_image(k, camera_id=camera_id_of(rigs, k)) for k in range(scene.num_images)]
         return rig_model(rigs, _camera(scene), images, np.zeros((len(rigs.rig_of_frame), 3)))
@@ -81,7 +81,7 @@ def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Recon
 
 
 def _full_model(scene: Scene, rotations: FloatArray, rigs: RigScene | None) -> pycolmap.Reconstruction:
-    """Return the model at the true centres and points, with the given rotations.
+    """Return the model at the true centers and points, with the given rotations.
 
     Points that fewer than two images show are left out. Point p of the scene has id p + 1.
     """
