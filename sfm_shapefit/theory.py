@@ -44,7 +44,8 @@ _ANY_DIMENSION = 3 * 256 * 64 * 32
 _THREE_DIMENSIONS = 32 * 3 * 64 * 1024
 _EXCEPTIONS = 192
 _FEASIBLE = 8.0
-_COLLINEAR = 1e-12  # sine of an angle; rounding of locations of order one gives 1e-16
+# Three locations are on a line if the sine of their angle is no larger; rounding alone gives 1e-16.
+_COLLINEAR = 1e-12
 _LOCAL_STEPS = 100
 
 

@@ -15,8 +15,10 @@ from scipy.sparse import coo_array, csgraph
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
 
-_UNIT_NORM_TOLERANCE = 1e-6  # a direction printed with 7 digits still passes; a wrong one does not
-_ROUNDING = 8.0 * np.finfo(np.float64).eps  # of a norm; dividing by it again would only change last bits
+# A direction printed with 7 digits still passes; a wrong one does not.
+_UNIT_NORM_TOLERANCE = 1e-6
+# A norm that is off by no more is 1: dividing by it again would only change last bits.
+_ROUNDING = 8.0 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)

@@ -21,10 +21,14 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DENSE_UNKNOWNS = 600
-_SHIFT = 1e-10  # of the mean diagonal, so that the singular matrix has a factor
+# This share of the mean diagonal is added to it, so that the singular matrix has a factor.
+_SHIFT = 1e-10
 _INVERSE_STEPS = 200
-_ALIGNED = 1e-15  # cosine of the angle between two steps, from one
-_SHORTEST = 1e-3  # of the median length; a baseline that shrinks to nothing must not take all weight
+# Inverse iteration ends when the cosine between two steps is so near to one.
+_ALIGNED = 1e-15
+# Lengths count as at least this share of the median: a baseline that shrinks to nothing must not take all
+# weight.
+_SHORTEST = 1e-3
 
 
 def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:

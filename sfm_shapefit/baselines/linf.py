@@ -18,7 +18,8 @@ from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.viewgraph import ViewGraph
 
-_MOST_PAIRS = 20_000  # minutes
+# More pairs would take many minutes.
+_MOST_PAIRS = 20_000
 
 
 def locate_linf(graph: ViewGraph) -> FloatArray:

@@ -10,7 +10,8 @@ from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
-_STEPS = 5000  # to the optimum; as a start of a refinement 50 suffice
+# So many steps reach the optimum; as a start of a refinement 50 suffice.
+_STEPS = 5000
 
 
 def locate_lud(graph: ViewGraph) -> FloatArray:

@@ -15,8 +15,10 @@ from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.errors import InputError
 
-_NO_ID = 2**32 - 1  # COLMAP's ids are 32-bit, and this one is none
-_LARGEST_SIDE = 2**31  # of an image, in px
+# COLMAP's ids are 32-bit, and this one is none.
+_NO_ID = 2**32 - 1
+# No image has a side of so many pixels.
+_LARGEST_SIDE = 2**31
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

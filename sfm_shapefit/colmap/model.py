@@ -36,8 +36,10 @@ UInt64Array = npt.NDArray[np.uint64]
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
-_UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
-_LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
+# This is the tolerance of `check.py`.
+_UNIT_QUATERNION_TOLERANCE = 1e-3
+# Sums of squares of larger coordinates overflow; these count as not finite.
+_LARGEST_COORDINATE = 1e100
 _POINT3D_ID = attrgetter("point3D_id")
 # For this camera, pixel coordinates and normalized coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])

@@ -23,9 +23,11 @@ from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
 _SENSOR_IS_CAMERA = 0
-_TABLE_COLUMNS = (4, 5, 7)  # name and position, and one standard deviation or three
+# A row has name and position, and no standard deviation, one or three.
+_TABLE_COLUMNS = (4, 5, 7)
 _GEODETIC_NAMES = {"lat", "latitude"}
-_LARGEST = 1e30  # coordinate or standard deviation: sums of squares of squares must not overflow
+# Sums of squares of squares of coordinates and standard deviations must not overflow.
+_LARGEST = 1e30
 
 
 def database_priors(path: Path, model: PosedModel) -> PositionPriors:

@@ -22,7 +22,8 @@ _LOSSES = {
     "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,
     "half-norm": pycolmap.RotationWeightType.HALF_NORM,
 }
-_MAX_ERROR_DEG = 10.0  # pycolmap's own default
+# This is pycolmap's own default.
+_MAX_ERROR_DEG = 10.0
 _CAMERA_ID = 1
 
 

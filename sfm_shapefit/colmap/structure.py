@@ -41,10 +41,13 @@ TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 Advance = Callable[[int, int], None]
 """Called with the work done so far and the work in all."""
 
-_TRACKS_A_TASK = 1000  # about half a second of work
-_RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
+# So many tracks are about half a second of work.
+_TRACKS_A_TASK = 1000
+# It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
+_RANDOM_SEED = 0
 _IMAGES_OF_A_CHECKED_TRACK = 3
-_CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
+# The triangulator only asks that there is a configuration of the two-view geometry.
+_CALIBRATED = 2
 
 
 def correspondence_graph(

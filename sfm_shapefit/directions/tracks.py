@@ -21,12 +21,17 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
-_PER_CAMERA = 20  # about 3 tracks started per camera, of 6 views each: what determines a straight road
-_IN_ALL, _PER_CAMERA_OF_FEW = 800, 60  # observations that a small scene can afford
+# These are about 3 tracks started per camera, of 6 views each: what determines a straight road.
+_PER_CAMERA = 20
+# A small scene can afford so many observations, in all and per camera.
+_IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
 _MIN_VIEWS = 3
-_MAX_MATCHES = 10_000_000  # held at a time: 0.6 GB
-_WIDEST_RAD = 0.5  # rays farther apart than this gain nothing more, and are often wrong
-_KEYPOINTS = 1 << 32  # more than an image may have
+# So many matches are held at a time, in 0.6 GB.
+_MAX_MATCHES = 10_000_000
+# Rays farther apart than this gain nothing more, and are often wrong.
+_WIDEST_RAD = 0.5
+# No image has so many keypoints.
+_KEYPOINTS = 1 << 32
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 

@@ -27,7 +27,8 @@ from sfm_shapefit.geometry import normalized
 
 _POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 _POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
-_INFORMATION = 21  # the upper triangle of an edge's information matrix
+# An edge ends with so many numbers, the upper triangle of its information matrix.
+_INFORMATION = 21
 _PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
 _FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3

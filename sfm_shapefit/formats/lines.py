@@ -9,7 +9,8 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 
-_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words: Python refuses to convert very long ones
+# Longer numbers are words: Python refuses to convert very long ones.
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
 
 
 def refuse_irregular_file(path: Path) -> None:

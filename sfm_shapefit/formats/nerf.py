@@ -42,7 +42,8 @@ _ONE_FOCAL = {
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
 }
-_DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV; nerfstudio has no such terms
+# nerfstudio has no such terms of FULL_OPENCV.
+_DENOMINATOR = ("k4", "k5", "k6")
 
 
 def nerf_text(scene: PosedModelFile) -> str:

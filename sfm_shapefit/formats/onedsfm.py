@@ -37,7 +37,8 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
 _PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
-_ROTATION_TOLERANCE = 1e-3  # of R R^T and of |t|; the published files have six digits
+# R R^T and |t| may be off by so much, for the published files have six digits.
+_ROTATION_TOLERANCE = 1e-3
 """From Bundler's camera axes to COLMAP's, and back."""
 
 

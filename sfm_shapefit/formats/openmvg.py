@@ -26,7 +26,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.formats.json_node import JsonNode
 from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
-_NO_POSE = 2**32 - 1  # openMVG's UndefinedIndexT
+# This is openMVG's UndefinedIndexT.
+_NO_POSE = 2**32 - 1
 
 
 def is_openmvg(content: object) -> bool:

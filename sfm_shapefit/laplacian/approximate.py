@@ -22,7 +22,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.jit import kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
-_DIVERGED = 1e6  # times the least residual so far: rounding leads, and no longer the system
+# A residual so many times the least so far shows that rounding leads, and no longer the system.
+_DIVERGED = 1e6
 
 Operator = Callable[[FloatArray], FloatArray]
 

@@ -27,11 +27,16 @@ from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
-_MERGE_ALWAYS = 0.03  # a child joins its parent if the merged panel has at most this share of zeros,
-_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # or this share while it has at most so many columns
-_LARGEST_TASK = 1 / 6  # of all entries: subtrees with more are divided
-_SMALLEST_TASK = 1 / 40  # of all entries: it is left to the part above, with what cannot be divided
-_WORTH_TASKS = 500_000  # entries of the panels; below, handing out work costs more than the work
+# A child joins its parent if the merged panel has at most this share of zeros, or the share that the limits
+# give while it has at most so many columns.
+_MERGE_ALWAYS = 0.03
+_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))
+# Subtrees with more than the first share of all entries are divided; with less than the second they are left
+# to the part above, with what cannot be divided.
+_LARGEST_TASK = 1 / 6
+_SMALLEST_TASK = 1 / 40
+# With fewer entries in the panels, handing out work costs more than the work.
+_WORTH_TASKS = 500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)

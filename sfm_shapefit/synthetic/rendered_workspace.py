@@ -34,7 +34,8 @@ from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid
 from sfm_shapefit.viewgraph import connected_components
 
 _CAMERA_ID = 1
-_LARGEST_ERROR_PX = 4.0  # of a right match: COLMAP's own limit for inliers
+# A right match is off by no more: this is COLMAP's own limit for inliers.
+_LARGEST_ERROR_PX = 4.0
 _POINT_COLOR = np.array([160, 160, 160], dtype=np.uint8)
 
 

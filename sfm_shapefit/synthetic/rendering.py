@@ -32,10 +32,14 @@ from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, turn_at_random
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
-_SAMPLES = 2  # along either side of a pixel
-_RAY_SLACK = 1e-6  # far below the spacing of rays, far above rounding
-_NEAREST_DEPTH_M = 0.05  # a triangle that comes nearer than this is drawn without bounds
-_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))  # at the horizon and above: too smooth for features
+# A pixel has so many samples along either side.
+_SAMPLES = 2
+# This is far below the spacing of rays, and far above rounding.
+_RAY_SLACK = 1e-6
+# A triangle that comes nearer than this is drawn without bounds.
+_NEAREST_DEPTH_M = 0.05
+# These are the colors at the horizon and above: too smooth for features.
+_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))
 _OF_POINTS_ONLY = (
     "num_points",
     "pixel_noise_px",

@@ -20,8 +20,10 @@ from sfm_shapefit.synthetic.scenes import Scene, scene_of
 
 NUM_RIGS, NUM_SENSORS = 2, 3
 
-_STEP_M = 1.5  # between two frames of a vehicle
-_YAW_DEG = np.array([0.0, 40.0, -40.0])  # to the left of ahead
+# Two frames of a vehicle are so far apart.
+_STEP_M = 1.5
+# Angles count to the left of ahead.
+_YAW_DEG = np.array([0.0, 40.0, -40.0])
 _OFFSETS_M = np.array(
     [
         [[0.0, 0.0, 0.0], [-0.8, 0.1, -0.3], [0.8, 0.1, -0.3]],

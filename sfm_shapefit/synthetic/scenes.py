@@ -28,11 +28,16 @@ from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turn_at_random
 from sfm_shapefit.synthetic.options import SceneOptions
 
-_NEAREST_DEPTH_M = 0.3  # nothing is photographed closer than this
-_LARGEST_VIEW_ANGLE_DEG = 80.0  # between a surface's normal and the line of sight; also the occlusion rule
-_SMALLEST_FALSE_ANGLE_DEG = 10.0  # a corrupted pair's direction is off by at least this
-_MOST_FALSE_MATCHES = 200  # of a corrupted pair: keeps the number of extra keypoints low
-_RELATIVE_POSE_DIRECTION_FACTOR = 3.0  # direction error over rotation error of a two-view estimate, roughly
+# Nothing is photographed closer than this.
+_NEAREST_DEPTH_M = 0.3
+# This angle between a surface's normal and the line of sight is also the occlusion rule.
+_LARGEST_VIEW_ANGLE_DEG = 80.0
+# A corrupted pair's direction is off by at least this.
+_SMALLEST_FALSE_ANGLE_DEG = 10.0
+# A corrupted pair has at most so many matches, which keeps the number of extra keypoints low.
+_MOST_FALSE_MATCHES = 200
+# This is roughly the direction error over the rotation error of a two-view estimate.
+_RELATIVE_POSE_DIRECTION_FACTOR = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -14,10 +14,12 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.synthetic.graphs import Seed
 
-_BAND = 10  # cameras ahead that a camera is paired with
+# A camera is paired with so many cameras ahead.
+_BAND = 10
 _PAIR_NOISE_RAD, _PAIR_SHARE_WRONG = 0.01, 0.1
 _RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15
-_SPEED_RATIO, _WAVE = 3.0, 50.0  # largest over smallest speed, and cameras per wave of it
+# These are the largest over the smallest speed, and the cameras per wave of it.
+_SPEED_RATIO, _WAVE = 3.0, 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

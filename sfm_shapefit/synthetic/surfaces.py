@@ -23,13 +23,17 @@ from sfm_shapefit.synthetic.textures import facade_texture, ground_texture
 
 _HOUSE_DEPTH_M = 4.0
 _HOUSE_WIDTH_M = 8.0
-_TOWER_SIDES = 8  # with a picture each
+# Each side has a picture of its own.
+_TOWER_SIDES = 8
 _STOREY_M = 2.6
-_MOST_TEXELS = 2048  # along either side of the ground's picture
+# The ground's picture has at most so many texels along either side.
+_MOST_TEXELS = 2048
 _TEXELS_PER_M = 64.0
-_TEXELS_PER_M_NEAR = 160.0  # of the tower, which is photographed from nearby
+# The tower has more texels, for it is photographed from nearby.
+_TEXELS_PER_M_NEAR = 160.0
 _LIGHT = normalized(np.array([0.3, -0.5, 0.8]))
-_SHADE = 0.7  # brightness of a surface that the light does not reach
+# This is the brightness of a surface that the light does not reach.
+_SHADE = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -9,7 +9,8 @@ import numpy as np
 
 from sfm_shapefit.synthetic.layouts import ByteArray
 
-_STONE_AREA_PX = 700  # of picture per stone
+# There is a stone to so many pixels of the picture.
+_STONE_AREA_PX = 700
 
 
 def ground_texture(height_px: int, width_px: int, rng: np.random.Generator) -> ByteArray:

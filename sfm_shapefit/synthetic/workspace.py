@@ -23,7 +23,8 @@ from sfm_shapefit.synthetic import RigScene, Scene, WorkspaceOptions
 from sfm_shapefit.synthetic.rig_workspace import camera_id_of, new_frames, new_rigs, rig_model
 
 _CAMERA_ID = 1
-_CALIBRATED = 2  # COLMAP's TwoViewGeometry::ConfigurationType
+# This is a value of COLMAP's TwoViewGeometry::ConfigurationType.
+_CALIBRATED = 2
 
 
 def write_workspace(
