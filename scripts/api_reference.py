@@ -16,7 +16,7 @@ MODULES = (
     "sfm_shapefit",
     "sfm_shapefit.baselines",
     "sfm_shapefit.colmap.model",
-    "sfm_shapefit.synthetic.photographs",
+    "sfm_shapefit.synthetic.rendered_workspace",
     "sfm_shapefit.colmap.quiet",
     "sfm_shapefit.synthetic.workspace",
     "sfm_shapefit.placement.diagnosis",

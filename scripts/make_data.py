@@ -19,7 +19,7 @@ from sfm_shapefit.synthetic import (
     make_scene,
     random_graph_problem,
 )
-from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
 

@@ -1,6 +1,6 @@
 """Errors of camera poses against a reference, after a robust alignment of positions and one of rotations.
 
-A reconstruction is known up to a similarity. The centres are aligned by the similarity with the least sum of
+A reconstruction is known up to a similarity. The centers are aligned by the similarity with the least sum of
 min(distance, cap), cap = half of the reference's median spread: an L1 fit for which a camera that has flown
 away is lost and pulls no more, so that half of the cameras may be anywhere (`geometry.fit_similarity_l1`).
 The rotations are compared independently of that: with ref_from_model = Q, a perfect camera has
@@ -35,12 +35,12 @@ _ON_A_LINE = (
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Position errors at which recall is always given, as fractions of the reference's extent."""
 
-# Fewer centres never determine a similarity.
+# Fewer centers never determine a similarity.
 _MIN_COMMON = 3
 # Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
 # failed on some sets of 7 and 11 cameras.
 _CAP_OF_SPREAD = 0.5
-# Centres count as a line if the ratio of their second to their first singular value is smaller.
+# Centers count as a line if the ratio of their second to their first singular value is smaller.
 _COLLINEAR_RATIO = 1e-3
 # Published references printed with 6 digits are off by 2e-6 in R R^T - I.
 _ORTHOGONALITY_TOLERANCE = 1e-4
@@ -79,17 +79,17 @@ class Evaluation(Displayed):
     extra: tuple[str, ...]
     """Cameras of the model that the reference does not have."""
     position_errors: FloatArray
-    """(k,) distances between aligned and reference centres, in the reference's units."""
+    """(k,) distances between aligned and reference centers, in the reference's units."""
     rotation_errors_deg: FloatArray
     """(k,) angles that remain after the best global rotation."""
     aligned_centers: FloatArray
-    """(k, 3) the model's centres in the reference's frame."""
+    """(k, 3) the model's centers in the reference's frame."""
     ref_from_model: Similarity
-    """The alignment of the centres."""
+    """The alignment of the centers."""
     rotation_ref_from_model: FloatArray
-    """(3, 3) the alignment of the rotations, found without the centres."""
+    """(3, 3) the alignment of the rotations, found without the centers."""
     extent: float
-    """Diagonal of the bounding box of all reference centres, in the reference's units."""
+    """Diagonal of the bounding box of all reference centers, in the reference's units."""
     recalls: tuple[Recall, ...]
     """Recall at the relative thresholds, then at the absolute ones that were asked for."""
     warnings: tuple[str, ...]
@@ -97,7 +97,7 @@ class Evaluation(Displayed):
 
     @property
     def degenerate(self) -> bool:
-        """Whether the centres lie on a line: the rotation of `ref_from_model` about it is arbitrary."""
+        """Whether the centers lie on a line: the rotation of `ref_from_model` about it is arbitrary."""
         return _ON_A_LINE in self.warnings
 
     @property
@@ -142,7 +142,7 @@ class Evaluation(Displayed):
         return f"{len(self.names)} cameras in common, position error {median:.3g} (median), {worst:.3g} (max)"
 
     def rows(self) -> list[dict[str, str | float]]:
-        """Return one row per common camera, for a table: errors and the aligned centre."""
+        """Return one row per common camera, for a table: errors and the aligned center."""
         columns = zip(
             self.names,
             self.position_errors.tolist(),
@@ -171,13 +171,13 @@ def evaluate_poses(
     Args:
         names, ref_names: n and m names, each distinct.
         rotations, ref_rotations: (n, 3, 3) and (m, 3, 3) cam_from_world.
-        centers, ref_centers: (n, 3) and (m, 3) camera centres in world axes.
+        centers, ref_centers: (n, 3) and (m, 3) camera centers in world axes.
         thresholds: position errors in the reference's units at which recall is given too.
 
     Raises:
         InputError: if an array has a wrong shape, is not finite or holds a matrix that is no rotation, a name
             stands twice, a threshold is not positive, fewer than 3 cameras are common, or all common
-            centres of either side coincide.
+            centers of either side coincide.
     """
     _check_poses("the model", names, rotations, centers)
     _check_poses("the reference", ref_names, ref_rotations, ref_centers)
@@ -213,7 +213,7 @@ def evaluate_poses(
 
 
 def _check_poses(owner: str, names: Sequence[str], rotations: FloatArray, centers: FloatArray) -> None:
-    """Raise InputError unless names, rotations and centres are distinct, matching, finite and orthogonal."""
+    """Raise InputError unless names, rotations and centers are distinct, matching, finite and orthogonal."""
     count = len(names)
     if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
         raise InputError(
@@ -275,7 +275,7 @@ def _too_few_common(names: Sequence[str], ref_names: Sequence[str], count: int) 
 
 
 def _refuse_coincident(owner: str, centers: FloatArray) -> None:
-    """Raise InputError if all centres are the same to rounding."""
+    """Raise InputError if all centers are the same to rounding."""
     rounding = 1e-12 * float(np.abs(centers).max())
     if float(np.ptp(centers, axis=0).max()) <= rounding:
         raise InputError(
@@ -291,7 +291,7 @@ def _compare_rotations(rotations: FloatArray, ref_rotations: FloatArray) -> tupl
 
 
 def _on_a_line(centers: FloatArray, close: BoolArray) -> bool:
-    """Whether the centres that the alignment rests on lie on a line; of all, if too few are close."""
+    """Whether the centers that the alignment rests on lie on a line; of all, if too few are close."""
     used = centers[close] if close.sum() >= _MIN_COMMON else centers
     spreads = np.linalg.svd(used - used.mean(axis=0), compute_uv=False)
     return bool(spreads[1] <= _COLLINEAR_RATIO * spreads[0])

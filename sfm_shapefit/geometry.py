@@ -120,7 +120,7 @@ def median_spread(points: FloatArray) -> float:
 def fit_similarity_l1(
     source: FloatArray, target: FloatArray, *, rotate: bool = True, cap: float = np.inf, iterations: int = 200
 ) -> Similarity:
-    """Return the similarity that minimises the sum of unsquared distances min(distance, cap).
+    """Return the similarity that minimizes the sum of unsquared distances min(distance, cap).
 
     Without a cap, a few bad targets hardly matter, but one source point that is far enough away shrinks
     the scale towards 0: it costs its distance at the true scale, and nearly nothing at scale 0. A finite
@@ -145,7 +145,7 @@ def fit_similarity_l1(
     def cost(similarity: Similarity) -> float:
         return float(np.minimum(distances(similarity), cap).sum())
 
-    def reweighted(best: Similarity) -> Similarity:
+    def reweigh(best: Similarity) -> Similarity:
         best_cost = cost(best)
         for _ in range(iterations):
             apart = distances(best)
@@ -161,7 +161,7 @@ def fit_similarity_l1(
 
     plain = fit_similarity(source, target, rotate=rotate)
     sampled = sorted(_fits_of_few_points(source, target, rotate=rotate), key=cost)
-    return min((reweighted(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
+    return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
 
 
 def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
@@ -205,8 +205,8 @@ def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray
 
     count = len(rotations)
     candidates = np.random.default_rng(0).permutation(count)[:100]
-    centre = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
-    nearest = np.argsort(distances(centre), kind="stable")[: count // 2 + 1]
+    center = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
+    nearest = np.argsort(distances(center), kind="stable")[: count // 2 + 1]
     best = nearest_rotations(rotations[nearest].sum(axis=0))
     for _ in range(iterations):
         weights = floor / np.maximum(distances(best), floor)

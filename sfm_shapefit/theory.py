@@ -44,7 +44,8 @@ _ANY_DIMENSION = 3 * 256 * 64 * 32
 _THREE_DIMENSIONS = 32 * 3 * 64 * 1024
 _EXCEPTIONS = 192
 _FEASIBLE = 8.0
-_COLLINEAR = 1e-12  # sine of an angle; rounding of locations of order one gives 1e-16
+# Three locations are on a line if the sine of their angle is no larger; rounding alone gives 1e-16.
+_COLLINEAR = 1e-12
 _LOCAL_STEPS = 100
 
 
@@ -59,7 +60,7 @@ class Typicality:
     degrees: tuple[int, int]
     """Least and greatest number of pairs of a camera."""
     codegrees: tuple[int, int]
-    """Least and greatest number of common neighbours of two cameras, joined or not."""
+    """Least and greatest number of common neighbors of two cameras, joined or not."""
     p_low: float
     """The graph is p-typical for p in [p_low, p_high], and for none if p_low > p_high."""
     p_high: float
@@ -191,7 +192,7 @@ def graph_typicality(num_cameras: int, edges: IntArray) -> Typicality:
 
 
 def well_distributed(locations: FloatArray, adjacency: BoolArray, *, threads: int = 1) -> tuple[float, float]:
-    """Bracket c_1: the smallest well-distributedness of the common neighbours of two cameras.
+    """Bracket c_1: the smallest well-distributedness of the common neighbors of two cameras.
 
     Args:
         locations: (n, d), distinct.
@@ -200,7 +201,7 @@ def well_distributed(locations: FloatArray, adjacency: BoolArray, *, threads: in
 
     Returns:
         Lower and upper bound, equal in three dimensions. In the plane every triangle spans all of it, so
-        that both are 0 unless cameras are collinear. Pairs without common neighbours ask for nothing.
+        that both are 0 unless cameras are collinear. Pairs without common neighbors ask for nothing.
     """
     n, d = locations.shape
     if d == 3:
@@ -342,7 +343,7 @@ def _spread_bracket(t: FloatArray, i: int, j: int, common: IntArray) -> tuple[fl
 def _local_minimum(units: FloatArray, h: FloatArray) -> float:
     """Return a local minimum of sum_k sqrt(1 - <b_k, h>^2) over unit vectors h in the span of the b_k.
 
-    The root is concave, so its tangent at h is above it: each step maximises sum_k w_k <b_k, h>^2 with
+    The root is concave, so its tangent at h is above it: each step maximizes sum_k w_k <b_k, h>^2 with
     w_k = 1 / sqrt(1 - <b_k, h>^2), and the sum falls.
     """
     best = np.inf

@@ -15,8 +15,10 @@ from scipy.sparse import coo_array, csgraph
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
 
-_UNIT_NORM_TOLERANCE = 1e-6  # a direction printed with 7 digits still passes; a wrong one does not
-_ROUNDING = 8.0 * np.finfo(np.float64).eps  # of a norm; dividing by it again would only change last bits
+# A direction printed with 7 digits still passes; a wrong one does not.
+_UNIT_NORM_TOLERANCE = 1e-6
+# A norm that is off by no more is 1: dividing by it again would only change last bits.
+_ROUNDING = 8.0 * np.finfo(np.float64).eps
 
 
 @dataclass(frozen=True, slots=True, init=False, eq=False)
@@ -24,7 +26,7 @@ class ViewGraph:
     """Cameras 0..n-1 and the measured directions between pairs of them. Arrays are read-only.
 
     A pair that is given more than once is merged into its first occurrence: weights add, and the
-    direction is that of the weighted sum. Directions are renormalised to unit length; those which have it
+    direction is that of the weighted sum. Directions are renormalized to unit length; those which have it
     to rounding are kept to the last bit, so that a graph of a graph's edges has the same directions.
     """
 
@@ -59,7 +61,7 @@ class ViewGraph:
             InputError: naming the first edge that is out of range, a self-loop, not a unit vector, not
                 of positive weight, or whose duplicates cancel each other.
         """
-        edge_array, direction_array, weight_array = _checked_arrays(num_nodes, edges, directions, weights)
+        edge_array, direction_array, weight_array = _check_arrays(num_nodes, edges, directions, weights)
         if names is not None and len(names) != num_nodes:
             raise InputError(f"the graph has {num_nodes} cameras but {len(names)} names; give one name each")
         edge_array, direction_array, weight_array = _merge_duplicates(
@@ -132,7 +134,7 @@ def connected_components(num_nodes: int, edges: IntArray) -> IntArray:
     return np.asarray(csgraph.connected_components(links, directed=False)[1], dtype=np.int64)
 
 
-def _checked_arrays(
+def _check_arrays(
     num_nodes: int, edges: npt.ArrayLike, directions: npt.ArrayLike, weights: npt.ArrayLike | None
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Return the inputs as arrays of the right type and shape, or raise InputError."""

@@ -52,7 +52,7 @@ DOORS = {
         "colmap",
         "synthetic/workspace.py",
         "synthetic/rig_workspace.py",
-        "synthetic/photographs.py",
+        "synthetic/rendered_workspace.py",
     },
     "sqlite3": {"colmap", "synthetic/workspace.py"},
     "plotly": {"report/page.py"},

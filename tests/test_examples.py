@@ -17,7 +17,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.synthetic import make_rendered_scene
 from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
-from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from tests.scenes import ROOT
 
 FOCAL_LENGTH_PX = 350.0

@@ -189,7 +189,7 @@ def _madrid(spec: GraphSpec, seed: int, data: Path) -> "GraphProblem":
     rng = np.random.default_rng(seed)
     locations = rng.standard_normal((n, 3)) * [1.0, 1.0, 0.2]
     pairs = np.unique(np.sort(edges, axis=1), axis=0)
-    return measured_problem(locations, pairs, spec.sigma, spec.q, rng, "concentrated")
+    return measured_problem(locations, pairs, sigma=spec.sigma, q=spec.q, seed=rng, corruption="concentrated")
 
 
 def measure_seeds(name: str, problem: Problem, seeds: int, data: Path) -> Trials:

@@ -1,6 +1,6 @@
 """Least squares on the parts of the baselines that are orthogonal to their directions.
 
-    minimise  sum_e w_e ||P_e (t_i - t_j)||^2    subject to  sum_i t_i = 0,  sum_i ||t_i||^2 = 1
+    minimize  sum_e w_e ||P_e (t_i - t_j)||^2    subject to  sum_i t_i = 0,  sum_i ||t_i||^2 = 1
 
 is the smallest eigenvector, shifts aside, of the projected Laplacian D^T P D. Its residuals are lengths, so
 that long baselines count more; reweighting by 1 / ||t_i - t_j||^2 turns them into sines of angles.
@@ -15,16 +15,20 @@ from scipy.sparse import csc_array, eye_array
 from scipy.sparse.linalg import splu
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.laplacian.operators import LaplacianPattern, assemble, laplacian_pattern
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 
 _DENSE_UNKNOWNS = 600
-_SHIFT = 1e-10  # of the mean diagonal, so that the singular matrix has a factor
+# This share of the mean diagonal is added to it, so that the singular matrix has a factor.
+_SHIFT = 1e-10
 _INVERSE_STEPS = 200
-_ALIGNED = 1e-15  # cosine of the angle between two steps, from one
-_SHORTEST = 1e-3  # of the median length; a baseline that shrinks to nothing must not take all weight
+# Inverse iteration ends when the cosine between two steps is so near to one.
+_ALIGNED = 1e-15
+# Lengths count as at least this share of the median: a baseline that shrinks to nothing must not take all
+# weight.
+_SHORTEST = 1e-3
 
 
 def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
@@ -35,7 +39,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
         reweightings: solves after the first, with weights of the last lengths (Govindu); 10 is plenty.
 
     Returns:
-        (n, d) locations, centred and of unit norm.
+        (n, d) locations, centered and of unit norm.
     """
     pattern = laplacian_pattern(graph.num_nodes, graph.edges)
     projections = np.eye(graph.dimension) - np.einsum("ea,eb->eab", graph.directions, graph.directions)
@@ -46,7 +50,7 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
             lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
             weights = graph.weights / np.maximum(lengths, _SHORTEST * np.median(lengths)) ** 2
             weights = weights / weights.mean()
-    return unit_gauge(graph, t)
+    return normalize_locations(graph, t)
 
 
 def _smallest_eigenvector(pattern: LaplacianPattern, blocks: FloatArray) -> FloatArray:

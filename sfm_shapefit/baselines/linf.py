@@ -1,6 +1,6 @@
 """l_inf: the locations whose worst pair is as good as can be. One wrong pair decides the answer.
 
-    minimise  gamma    subject to  || t_i - t_j - s_e v_e || <= gamma,  s_e >= 1
+    minimize  gamma    subject to  || t_i - t_j - s_e v_e || <= gamma,  s_e >= 1
 
 as a second-order cone program through cvxpy and Clarabel; for small graphs.
 
@@ -14,11 +14,12 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.viewgraph import ViewGraph
 
-_MOST_PAIRS = 20_000  # minutes
+# More pairs would take many minutes.
+_MOST_PAIRS = 20_000
 
 
 def locate_linf(graph: ViewGraph) -> FloatArray:
@@ -50,4 +51,4 @@ def locate_linf(graph: ViewGraph) -> FloatArray:
         raise UnsolvableError(f"the conic solver found no l_inf locations ({error})") from error
     if t.value is None:
         raise UnsolvableError(f"the conic solver stopped with status {program.status!r} and no answer")
-    return unit_gauge(graph, np.asarray(t.value))
+    return normalize_locations(graph, np.asarray(t.value))

@@ -1,6 +1,13 @@
-"""The baselines by the names that command lines use."""
+"""The baselines by the names that command lines use, and their answers in the form of a solver's result.
 
+The certificate of such an answer is the trivial one: y = 0 is dual feasible and proves that no objective is
+below 0.
+"""
+
+import time
 from collections.abc import Callable
+
+import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.baselines.least_squares import locate_least_squares
@@ -8,6 +15,10 @@ from sfm_shapefit.baselines.linf import locate_linf
 from sfm_shapefit.baselines.lud import locate_lud
 from sfm_shapefit.baselines.onedsfm import filter_1dsfm
 from sfm_shapefit.directions.triangles import filter_triangles
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.solver.options import SolverResult, Status
+from sfm_shapefit.solver.program import projected_length
+from sfm_shapefit.solver.solve import uncertified
 from sfm_shapefit.viewgraph import ViewGraph
 
 LOCATORS: dict[str, Callable[[ViewGraph], FloatArray]] = {
@@ -22,3 +33,23 @@ FILTERS: dict[str, Callable[[ViewGraph], BoolArray]] = {
     "triangles": filter_triangles,
 }
 """What says which pairs (m,) to keep."""
+
+
+def solve_baseline(graph: ViewGraph, name: str) -> SolverResult:
+    """Return the locations of a baseline in ShapeFit's scale, with status NOT_SOLVED.
+
+    Args:
+        graph: connected and parallel rigid.
+        name: a key of `LOCATORS`.
+
+    Raises:
+        UnsolvableError: if the baseline finds no locations that point the way the directions do.
+    """
+    start = time.perf_counter()
+    located = LOCATORS[name](graph)
+    if not (np.isfinite(located).all() and projected_length(graph, located) > 0.0):
+        raise UnsolvableError(
+            f"{name} found no finite locations; check the directions, or choose --objective auto"
+        )
+    reason = "as asked; ShapeFit was not solved, so nothing certifies these locations"
+    return uncertified(graph, located, Status.NOT_SOLVED, name, reason, start)

@@ -1,18 +1,19 @@
 """LUD, least unsquared deviations, by the engine that ShapeFit's splitting uses.
 
-    minimise  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
+    minimize  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
 
 Source: Ozyesil and Singer, "Robust camera location estimation by convex programming", CVPR 2015, eq. 7.
 """
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.baselines.gauge import unit_gauge
+from sfm_shapefit.baselines.normalize import normalize_locations
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
-_STEPS = 5000  # to the optimum; as a start of a refinement 50 suffice
+# So many steps reach the optimum; as a start of a refinement 50 suffice.
+_STEPS = 5000
 
 
 def locate_lud(graph: ViewGraph) -> FloatArray:
     """Return LUD's locations (n, d), solved to its optimum."""
-    return unit_gauge(graph, solve_lud(graph, _STEPS, certified=False).locations)
+    return normalize_locations(graph, solve_lud(graph, _STEPS, certified=False).locations)

@@ -18,8 +18,10 @@ from sfm_shapefit.laplacian.operators import Int32Array, adjacency
 from sfm_shapefit.viewgraph import ViewGraph
 
 _AXES = 48
-_THRESHOLD = 0.1  # the paper's
-_JITTER = 0.3  # axes are drawn near the directions themselves: others separate no cameras
+# This is the paper's threshold.
+_THRESHOLD = 0.1
+# Axes are drawn near the directions themselves, since others separate no cameras.
+_JITTER = 0.3
 
 
 def filter_1dsfm(

@@ -53,7 +53,7 @@ def _write_drawn(
 ) -> list[tuple[str, str]]:
     """Write a workspace with images; return what to print of it."""
     from sfm_shapefit.synthetic import make_rendered_scene
-    from sfm_shapefit.synthetic.photographs import judge_matches, write_rendered_workspace
+    from sfm_shapefit.synthetic.rendered_workspace import judge_matches, write_rendered_workspace
 
     scene = make_rendered_scene(options, render)
     write_rendered_workspace(scene, target, workspace)

@@ -6,8 +6,8 @@
 
 A seed that is a few pixels off loses its long tracks to a tight filter at once, so the first round is loose.
 Points made at the first poses carry their errors on, so every round triangulates anew instead of completing
-what is there. Mean error in metres against the laser truth of Strecha's castle scenes, from the incremental
-model's centres disturbed by 5 cm:
+what is there. Mean error in meters against the laser truth of Strecha's castle scenes, from the incremental
+model's centers disturbed by 5 cm:
 
                                                       castle-P19   castle-P30
     this recipe                                       0.0249       0.0217
@@ -28,7 +28,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
-from sfm_shapefit.colmap.structure import TrackSource, filtered, triangulate
+from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.errors import UnsolvableError
 
@@ -103,7 +103,7 @@ def bundle_adjust(
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
 
     Returns:
-        The adjusted model, with ids and colours of points as from `triangulate`. The gauge is held by two
+        The adjusted model, with ids and colors of points as from `triangulate`. The gauge is held by two
         cameras, so scale and axes stay near the seed's; fewer than two fixed frames do not hold it. The poses
         of sensors in their rigs stay what they are.
 
@@ -128,7 +128,7 @@ def bundle_adjust(
         steps, converged = _solve(current, stage.loss_scale_px, options, fixed_frames)
         _refuse_diverged(current)
         iterations += steps
-    answer = filtered(current, structure_options)
+    answer = filter_points(current, structure_options)
     return Adjusted(
         reconstruction=answer,
         initial_error_px=start.compute_mean_reprojection_error(),

@@ -36,7 +36,8 @@ from sfm_shapefit.jit import kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
 
-_UNIT_QUATERNION_TOLERANCE = 1e-3  # a quaternion printed with 4 digits still passes; a wrong one does not
+# A quaternion printed with 4 digits still passes; a wrong one does not.
+_UNIT_QUATERNION_TOLERANCE = 1e-3
 _NO_POINT = np.uint64(2**64 - 1)
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 

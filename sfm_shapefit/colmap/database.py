@@ -44,14 +44,18 @@ MAX_NUM_IMAGES = 2147483647
 
 # COLMAP's TwoViewGeometryConfiguration: 0 undefined, 1 degenerate, 2 calibrated, 3 uncalibrated, 4 planar,
 # 5 panoramic, 6 planar or panoramic, 7 watermark, 8 multiple, 9 calibrated rig.
-_CONFIGS_WITHOUT_MATCHES = (0, 1, 7)  # what they list is not verified, or a watermark
-_CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)  # 5: pure rotation; 8: several motions, none of them stored
+# What pairs of these configurations list is not verified, or a watermark.
+_CONFIGS_WITHOUT_MATCHES = (0, 1, 7)
+# Of these configurations, 5 is a pure rotation, and 8 several motions, none of them stored.
+_CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
 
 _SIDECARS = ("-wal", "-journal")
-_WAL_VERSION = 2  # bytes 18 and 19 of the header
+# Bytes 18 and 19 of the header say so.
+_WAL_VERSION = 2
 _LOCK_TIMEOUT_S = 2.0
 _COPY_ATTEMPTS = 3
-_MIN_TRANSLATION = 1e-12  # stored translations are 1, or of the scene's size; shorter ones mean "none"
+# Stored translations are 1, or of the scene's size; shorter ones mean "none".
+_MIN_TRANSLATION = 1e-12
 
 # A database may come from anywhere: what no query of this module needs is not allowed.
 _LIMITS = {

@@ -15,8 +15,10 @@ from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
 from sfm_shapefit.errors import InputError
 
-_NO_ID = 2**32 - 1  # COLMAP's ids are 32-bit, and this one is none
-_LARGEST_SIDE = 2**31  # of an image, in px
+# COLMAP's ids are 32-bit, and this one is none.
+_NO_ID = 2**32 - 1
+# No image has a side of so many pixels.
+_LARGEST_SIDE = 2**31
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,7 +26,7 @@ class UnposedImages:
     """What a database says of its images."""
 
     reconstruction: pycolmap.Reconstruction
-    """All cameras and images; every rotation is the identity, every centre the origin."""
+    """All cameras and images; every rotation is the identity, every center the origin."""
     num_guessed_cameras: int
     """Cameras in use whose focal length is COLMAP's guess."""
     has_rigs: bool
@@ -73,10 +75,10 @@ def read_images(path: Path) -> UnposedImages:
     return UnposedImages(reconstruction=model, num_guessed_cameras=guessed, has_rigs=has_rigs)
 
 
-def posed_at_origin(
+def pose_at_origin(
     images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
 ) -> pycolmap.Reconstruction:
-    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centres 0."""
+    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centers 0."""
     model = pycolmap.Reconstruction()
     for camera_id in sorted({images.image(i).camera_id for i in image_ids}):
         model.add_camera_with_trivial_rig(images.camera(camera_id))

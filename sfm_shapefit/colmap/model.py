@@ -1,7 +1,7 @@
 """Models with known rotations: what is read of a COLMAP reconstruction, and the rays of its pixels.
 
-COLMAP's convention is x_cam = R x_world + t with centre C = -R^T t. Only R and the intrinsics are
-trusted: the centres of the input are carried along for comparison and never place a camera.
+COLMAP's convention is x_cam = R x_world + t with center C = -R^T t. Only R and the intrinsics are
+trusted: the centers of the input are carried along for comparison and never place a camera.
 
 Poses live in frames (`rig_from_world`); for a model of an older COLMAP, pycolmap makes one frame per
 image. In a rig of several sensors cam_from_world = sensor_from_rig * rig_from_world, so that a camera stands
@@ -27,7 +27,7 @@ from sfm_shapefit.colmap.other_programs import reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.models import is_model_file, read_scene
+from sfm_shapefit.formats.models import is_model_file, read_model_file
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -36,10 +36,12 @@ UInt64Array = npt.NDArray[np.uint64]
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
-_UNIT_QUATERNION_TOLERANCE = 1e-3  # as in files, see check.py
-_LARGEST_COORDINATE = 1e100  # sums of squares of larger ones overflow; they count as not finite
+# This is the tolerance of `check.py`.
+_UNIT_QUATERNION_TOLERANCE = 1e-3
+# Sums of squares of larger coordinates overflow; these count as not finite.
+_LARGEST_COORDINATE = 1e100
 _POINT3D_ID = attrgetter("point3D_id")
-# For this camera, pixel coordinates and normalised coordinates are the same numbers.
+# For this camera, pixel coordinates and normalized coordinates are the same numbers.
 _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1.0, 1.0, 0.0, 0.0])
 
 
@@ -60,7 +62,7 @@ class PosedModel:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     centers: FloatArray
-    """(n, 3) the input's camera centres; they never place a camera, and may all be 0."""
+    """(n, 3) the input's camera centers; they never place a camera, and may all be 0."""
     focal_lengths_px: FloatArray
     """(n,) mean focal length; for a camera without one (equirectangular) its pixels per radian."""
     frame_ids: IntArray
@@ -111,7 +113,7 @@ class PosedCameras:
 
 
 def posed_cameras(model: PosedModel) -> PosedCameras:
-    """Return the posed images without their points and centres."""
+    """Return the posed images without their points and centers."""
     reconstruction = model.reconstruction
     ids = [reconstruction.image(i).camera_id for i in model.image_ids.tolist()]
     different, camera_of = np.unique(ids, return_inverse=True)
@@ -126,7 +128,7 @@ def posed_cameras(model: PosedModel) -> PosedCameras:
 
 
 def from_posed_cameras(table: PosedCameras) -> PosedModel:
-    """Return a model of these images: the same rotations to the bit, centres at the origin, no points."""
+    """Return a model of these images: the same rotations to the bit, centers at the origin, no points."""
     reconstruction = pycolmap.Reconstruction()
     for k, camera in enumerate(table.cameras):
         made = pycolmap.Camera(
@@ -170,7 +172,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         label, reconstruction = "the reconstruction", source
         is_checked = False
     elif is_model_file(source):
-        label, reconstruction = str(source), reconstruction_of(read_scene(source), source)
+        label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
         is_checked = False
     else:
         folder = Path(source)
@@ -185,7 +187,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
 
 def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
-    """Return the model with cameras that turn about their centres; the input is not touched.
+    """Return the model with cameras that turn about their centers; the input is not touched.
 
     Args:
         model: the posed images.
@@ -213,7 +215,7 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     Args:
         model: the posed images.
         image: index into `model.image_ids`.
-        xy: (k, 2) pixels in COLMAP's convention: the centre of the first pixel is (0.5, 0.5).
+        xy: (k, 2) pixels in COLMAP's convention: the center of the first pixel is (0.5, 0.5).
 
     Returns:
         (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
@@ -318,7 +320,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
 
     cameras = [reconstruction.camera(image.camera_id) for image in images]
     poses = [image.cam_from_world() for image in images]
-    rotations = _checked_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
+    rotations = _check_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
@@ -358,7 +360,7 @@ def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction
     return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
 
 
-def _checked_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
+def _check_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
     """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
     quaternions = np.array(quaternions_xyzw, dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):

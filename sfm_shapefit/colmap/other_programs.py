@@ -8,10 +8,10 @@ import pycolmap
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import EpipolarGeometries
-from sfm_shapefit.formats.scene import SceneCamera, SceneFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
 
-def reconstruction_of(scene: SceneFile, label: Path | str) -> pycolmap.Reconstruction:
+def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reconstruction:
     """Return a scene as a new reconstruction: cameras and images from id 1 on, a frame for each image.
 
     Points seen by fewer than two images are left out. Of several observations of a point in one image the
@@ -44,14 +44,14 @@ def reconstruction_of(scene: SceneFile, label: Path | str) -> pycolmap.Reconstru
     return model
 
 
-def scene_of(model: pycolmap.Reconstruction) -> SceneFile:
+def posed_model_of(model: pycolmap.Reconstruction) -> PosedModelFile:
     """Return the posed images of a reconstruction, by id, without points."""
     images = [model.image(i) for i in sorted(i for i, image in model.images.items() if image.has_pose)]
     camera_ids = sorted({image.camera_id for image in images})
     cameras = [model.camera(camera_id) for camera_id in camera_ids]
-    return SceneFile(
+    return PosedModelFile(
         cameras=tuple(
-            SceneCamera(
+            Intrinsics(
                 model=camera.model.name,
                 width=int(camera.width),
                 height=int(camera.height),
@@ -92,7 +92,7 @@ def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
     )
 
 
-def _camera(camera: SceneCamera, camera_id: int, label: Path | str) -> pycolmap.Camera:
+def _camera(camera: Intrinsics, camera_id: int, label: Path | str) -> pycolmap.Camera:
     """Return a camera of pycolmap's."""
     made = pycolmap.Camera(
         camera_id=camera_id,
@@ -107,7 +107,7 @@ def _camera(camera: SceneCamera, camera_id: int, label: Path | str) -> pycolmap.
     return made
 
 
-def _unambiguous(scene: SceneFile) -> tuple[IntArray, FloatArray]:
+def _unambiguous(scene: PosedModelFile) -> tuple[IntArray, FloatArray]:
     """Return the first observation of each point in each image, of points that two images or more see."""
     if not len(scene.observed):
         return scene.observed, scene.pixels
@@ -118,7 +118,7 @@ def _unambiguous(scene: SceneFile) -> tuple[IntArray, FloatArray]:
 
 
 def _add_points(
-    model: pycolmap.Reconstruction, scene: SceneFile, observed: IntArray, bounds: IntArray
+    model: pycolmap.Reconstruction, scene: PosedModelFile, observed: IntArray, bounds: IntArray
 ) -> None:
     """Add the points, with ids from 1 in their order; `observed` is sorted by image."""
     keypoints = np.arange(len(observed)) - bounds[observed[:, 1]]

@@ -1,7 +1,7 @@
 """Position priors of cameras: the pose priors of a COLMAP database, or a table of names and positions.
 
-Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in metres) become metres east,
-north and up of their median. Their covariances are taken as metres squared in those axes.
+Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
+north and up of their median. Their covariances are taken as meters squared in those axes.
 
 Source: https://colmap.github.io/database.html; `colmap/geometry/pose_prior.h`: coordinate system -1 is
 undefined, 0 WGS84, 1 Cartesian; covariances are stored by columns. Until COLMAP 3.12 a row names its image,
@@ -23,9 +23,11 @@ from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
 _SENSOR_IS_CAMERA = 0
-_TABLE_COLUMNS = (4, 5, 7)  # name and position, and one standard deviation or three
+# A row has name and position, and no standard deviation, one or three.
+_TABLE_COLUMNS = (4, 5, 7)
 _GEODETIC_NAMES = {"lat", "latitude"}
-_LARGEST = 1e30  # coordinate or standard deviation: sums of squares of squares must not overflow
+# Sums of squares of squares of coordinates and standard deviations must not overflow.
+_LARGEST = 1e30
 
 
 def database_priors(path: Path, model: PosedModel) -> PositionPriors:
@@ -58,7 +60,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
     """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
 
     A first line that names the columns is optional; where it calls the second one lat or latitude, rows
-    are latitude, longitude (degrees) and altitude (metres). Lines that begin with # are comments.
+    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments.
 
     Args:
         path: the table.
@@ -84,7 +86,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         if first and len(cells) > 1 and not _is_number(cells[1]):
             system = _WGS84 if cells[1].lower() in _GEODETIC_NAMES else _CARTESIAN
         else:
-            position, covariance = _parsed(path, number, cells)
+            position, covariance = _parse(path, number, cells)
             if cells[0] in seen:
                 raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
             seen.add(cells[0])
@@ -138,7 +140,7 @@ def _is_number(cell: str) -> bool:
     return True
 
 
-def _parsed(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
+def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
     """Return position and covariance of a line of a table."""
     if len(cells) not in _TABLE_COLUMNS or not all(map(_is_number, cells[1:])):
         raise InputError(

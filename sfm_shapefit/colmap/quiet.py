@@ -20,7 +20,8 @@ from contextvars import ContextVar
 
 import pycolmap
 
-_QUIET = 3  # glog's FATAL
+# This is glog's level FATAL.
+_QUIET = 3
 _heard = ContextVar("pycolmap_is_heard", default=False)
 
 

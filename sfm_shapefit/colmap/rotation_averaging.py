@@ -1,6 +1,6 @@
 """Rotations of cameras from relative rotations of pairs: pycolmap's rotation averaging, on plain arrays.
 
-    minimise  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
+    minimize  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
 
 from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs beyond
 `max_error_deg` of the result are left out and what stays connected is averaged once more, as pycolmap's
@@ -22,7 +22,8 @@ _LOSSES = {
     "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,
     "half-norm": pycolmap.RotationWeightType.HALF_NORM,
 }
-_MAX_ERROR_DEG = 10.0  # pycolmap's own default
+# This is pycolmap's own default.
+_MAX_ERROR_DEG = 10.0
 _CAMERA_ID = 1
 
 

@@ -1,4 +1,4 @@
-"""A seeded model: the input's rotations and intrinsics, our camera centres, and no 3D points yet.
+"""A seeded model: the input's rotations and intrinsics, our camera centers, and no 3D points yet.
 
 COLMAP keeps poses in frames, x_rig = R x_world + t with t = -R C. Moving a frame replaces t and hands on
 the very same quaternion, so that rotations and intrinsics come out bit-identical. The poses of sensors in
@@ -33,15 +33,15 @@ def build_seed(
 
     Args:
         model: the input.
-        placed: (n,) which images have a centre; the others, and images that had no pose, are unregistered
+        placed: (n,) which images have a center; the others, and images that had no pose, are unregistered
             unless another image of their frame is placed.
-        centers: (n, 3) camera centres in world axes; rows of images that are not placed are ignored.
+        centers: (n, 3) camera centers in world axes; rows of images that are not placed are ignored.
         keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
             it has none (a missing key, or no rows), and all images if None, keep those of the model.
         fixed: (n,) images whose frame keeps its pose to the last bit; none if None.
 
     Raises:
-        ValueError: if the shapes do not fit the model, or the centre of a placed image is not finite.
+        ValueError: if the shapes do not fit the model, or the center of a placed image is not finite.
     """
     n = model.num_images
     if placed.shape != (n,) or centers.shape != (n, 3):
@@ -50,7 +50,7 @@ def build_seed(
         worst = int(np.flatnonzero(placed & ~np.isfinite(centers).all(axis=1))[0])
         raise ValueError(f"the centre of image {model.names[worst]} is not finite")
 
-    seed = without_points(model.reconstruction)
+    seed = copy_without_points(model.reconstruction)
     still = np.zeros(n, dtype=np.bool_) if fixed is None else fixed
     settled = set(model.frame_ids[still].tolist())
     for index, image_id in enumerate(model.image_ids.tolist()):
@@ -75,7 +75,7 @@ def build_seed(
     return seed
 
 
-def without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def copy_without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Return a copy that has no 3D points; its points2D stay and observe nothing."""
     copy = pycolmap.Reconstruction(reconstruction)
     for point_id in list(copy.point3D_ids()):
@@ -83,7 +83,7 @@ def without_points(reconstruction: pycolmap.Reconstruction) -> pycolmap.Reconstr
     return copy
 
 
-def turned(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
+def turn_model(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pycolmap.Reconstruction:
     """Return the model turned about the origin: cameras and points, x -> axes x."""
     copy = pycolmap.Reconstruction(reconstruction)
     copy.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(axes), np.zeros(3)))

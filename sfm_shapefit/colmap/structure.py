@@ -1,4 +1,4 @@
-"""Structure: 3D points triangulated at given poses, filtered, and coloured like the input's.
+"""Structure: 3D points triangulated at given poses, filtered, and colored like the input's.
 
 Tracks come from one of two sources:
 
@@ -29,7 +29,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
-from sfm_shapefit.colmap.seed import without_points
+from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
@@ -41,10 +41,13 @@ TrackSource = pycolmap.CorrespondenceGraph | pycolmap.Reconstruction
 Advance = Callable[[int, int], None]
 """Called with the work done so far and the work in all."""
 
-_TRACKS_A_TASK = 1000  # about half a second of work
-_RANDOM_SEED = 0  # without effect today: pycolmap 4.2 tries pairs of observations in a fixed order
+# So many tracks are about half a second of work.
+_TRACKS_A_TASK = 1000
+# It is without effect in pycolmap 4.2, which tries pairs of observations in a fixed order.
+_RANDOM_SEED = 0
 _IMAGES_OF_A_CHECKED_TRACK = 3
-_CALIBRATED = 2  # TwoViewGeometry configuration; the triangulator only asks that there is one
+# The triangulator only asks that there is a configuration of the two-view geometry.
+_CALIBRATED = 2
 
 
 def correspondence_graph(
@@ -100,14 +103,14 @@ def triangulate(
 
     Returns:
         A new reconstruction with errors of points updated. Points from another model's tracks have that
-        model's ids and colours; points from matches are black (see `colored`).
+        model's ids and colors; points from matches are black (see `color_points`).
 
     Raises:
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
         WorkerError: if a worker died and the executor does not replace it.
     """
     options = options or StructureOptions()
-    structure = seed if in_place else without_points(seed)
+    structure = seed if in_place else copy_without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
         _triangulate_matches(structure, tracks, options, advance or _unheard)
     else:
@@ -116,7 +119,7 @@ def triangulate(
     return structure
 
 
-def filtered(
+def filter_points(
     reconstruction: pycolmap.Reconstruction, options: StructureOptions | None = None
 ) -> pycolmap.Reconstruction:
     """Return a copy without the observations and points that violate `options`, its point errors updated.
@@ -130,14 +133,14 @@ def filtered(
     return result
 
 
-def colored(
+def color_points(
     reconstruction: pycolmap.Reconstruction, source: pycolmap.Reconstruction, *, in_place: bool = False
 ) -> pycolmap.Reconstruction:
-    """Return a copy whose points take the mean colour of the source's points seen at the same points2D.
+    """Return a copy whose points take the mean color of the source's points seen at the same points2D.
 
     Images take part if their points2D are the same in both, in number and coordinates. Points without
-    any common observation keep their colour. A source without any colour costs no copy: the
-    `reconstruction` itself is returned. So it is `in_place`, coloured: a copy of a large one is large.
+    any common observation keep their color. A source without any color costs no copy: the
+    `reconstruction` itself is returned. So it is `in_place`, colored: a copy of a large one is large.
     """
     if not any(point.color.any() for point in source.points3D.values()):
         return reconstruction
@@ -166,7 +169,7 @@ def _two_view_geometry(matches: IntArray) -> pycolmap.TwoViewGeometry:
 
 
 def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
-    """Do to our own `structure` what `filtered` does to a copy; the filter updates the errors of points."""
+    """Do to our own `structure` what `filter_points` does to a copy; update the errors of points."""
     manager = pycolmap.ObservationManager(structure)
     manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
     manager.filter_points3D_with_short_tracks(options.min_track_length)
@@ -318,7 +321,7 @@ class _Observations:
         return list(zip(firsts.tolist(), (firsts + lengths).tolist(), strict=True))
 
 
-# --- colours ---------------------------------------------------------------------------------------
+# --- colors ---------------------------------------------------------------------------------------
 
 
 def _common_observations(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.other_programs import scene_of
+from sfm_shapefit.colmap.other_programs import posed_model_of
 from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.nerf import nerf_text
@@ -65,7 +65,7 @@ def convert(
         target_format = _BY_SUFFIX[path.suffix.lower()]
     model = read_model(source).reconstruction
     if target_format in _TEXTS:
-        _write_text(_TEXTS[target_format](scene_of(model)), path, overwrite=overwrite)
+        _write_text(_TEXTS[target_format](posed_model_of(model)), path, overwrite=overwrite)
         return target_format
     protect = [source] if isinstance(source, Path | str) else []
     with atomic_folder(path, protect=protect) as folder:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
-from sfm_shapefit.colmap.database_images import UnposedImages, posed_at_origin, read_images, rotations_of
+from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images, rotations_of
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
 from sfm_shapefit.commands.locate import locate
@@ -165,7 +165,7 @@ class _Run:
                 rotations = self._drafted(path, images, image_ids, rotations, settings)
             settings["refine_rotations"] = False
         with self.clock("locate"):
-            model = posed_at_origin(images.reconstruction, image_ids, rotations)
+            model = pose_at_origin(images.reconstruction, image_ids, rotations)
             return locate(model, path, options=LocateOptions(**settings), progress=self.clock.progress)
 
     def _drafted(
@@ -184,7 +184,7 @@ class _Run:
             "min_trust": 0.0,
             "max_reprojection_error_px": limit,
         }
-        model = posed_at_origin(images.reconstruction, image_ids, rotations)
+        model = pose_at_origin(images.reconstruction, image_ids, rotations)
         draft = locate(model, path, options=LocateOptions(**draft_settings))  # type: ignore[arg-type]
         try:
             adjusted = bundle_adjust(

@@ -6,7 +6,7 @@ d = C_i - C_j lies in their plane: <a x b, d> = 0. The residual of a match is it
     r = <a x b, d> / (omega sqrt(|a x d|^2 + |b x d|^2)),    omega = angle of one pixel,
 
 the distance in pixels, to first order, that both image points must move for the rays to meet. The
-direction minimises sum v rho(r) with the Geman-McClure kernel rho: two matches give a hypothesis
+direction minimizes sum v rho(r) with the Geman-McClure kernel rho: two matches give a hypothesis
 (a1 x b1) x (a2 x b2), and the best of many by truncated squares starts Gauss-Newton steps on the sphere.
 The kernel is 4 standard deviations of the noise wide, which is measured by the median of the residuals
 near the direction, so that it does not matter how many matches are elsewhere. v = 1 but for

@@ -48,10 +48,10 @@ def estimate_directions(
     else:
         with ThreadPoolExecutor(len(shares)) as pool:
             list(pool.map(run, shares))
-    return _judged(pairs, np.diff(offsets), directions, measures, moments, options)
+    return _judge(pairs, np.diff(offsets), directions, measures, moments, options)
 
 
-def _judged(
+def _judge(
     pairs: IntArray,
     num_matches: IntArray,
     directions: FloatArray,

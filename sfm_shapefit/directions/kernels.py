@@ -10,21 +10,29 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.jit import kernel
 
-MIN_MATCHES = 5  # two fix a direction; below this a robust fit means nothing
+# Two matches fix a direction; below this number a robust fit means nothing.
+MIN_MATCHES = 5
 MEASURES = ("inliers", "front", "behind", "voters", "rivals", "loyal", "residual_px", "parallax_rad")
 """What is counted and measured of a pair, in this order."""
 
-_MIN_NOISE_PX = 1e-3  # exact matches still get a finite information
-_WIDTH = 4.0  # of the kernel, in standard deviations of the noise: 95 % efficient, as simulated
-_MIN_WIDTH_PX = 0.5  # the width stays in this range: matches are never better, inliers never worse
+# With this least noise, exact matches still get a finite information.
+_MIN_NOISE_PX = 1e-3
+# Width of the kernel in standard deviations of the noise: 95 % efficient, as simulated.
+_WIDTH = 4.0
+# The width stays in this range: matches are never better, inliers never worse.
+_MIN_WIDTH_PX = 0.5
 _MAX_WIDTH_PX = 8.0
-_RESCALINGS = 8  # steps that measure the noise anew; it is kept from then on, so that the steps converge
+# The first steps measure the noise anew; it is kept from then on, so that the steps converge.
+_RESCALINGS = 8
 _STEPS = 30
 _LONGEST_STEP_RAD = 0.3
 _LEVERAGE_QUANTILE = 0.9
-_LEVERAGE = 2.0  # a match has full weight up to this many times that quantile of the inliers with parallax
-_MIN_VOTE_PX = 2.0  # a match votes on the sign only if its parallax is larger, and beyond the noise:
-_VOTE_SIGMAS = 6.0  # without any parallax the rays differ by more than 6 standard deviations once in 8000
+# A match has full weight up to this many times that quantile of the inliers with parallax.
+_LEVERAGE = 2.0
+# A match votes on the sign only if its parallax is larger than this, and than so many standard deviations of
+# the noise, which rays without any parallax exceed once in 8000.
+_MIN_VOTE_PX = 2.0
+_VOTE_SIGMAS = 6.0
 
 
 @kernel(exact=True)

@@ -28,8 +28,10 @@ CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MIS
 """The reasons that speak against the given rotations."""
 
 
-_FLOOR_DEG = 0.05  # what good rotations leave in any direction; matches that promise more are no better
-_MIN_WEIGHT = 0.02  # keeps the program well conditioned; a camera may have nothing better
+# Good rotations leave so much in any direction; matches that promise more are no better.
+_FLOOR_DEG = 0.05
+# This least weight keeps the program well conditioned; a camera may have nothing better.
+_MIN_WEIGHT = 0.02
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

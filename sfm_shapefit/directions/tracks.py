@@ -22,12 +22,17 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
-_PER_CAMERA = 20  # about 3 tracks started per camera, of 6 views each: what determines a straight road
-_IN_ALL, _PER_CAMERA_OF_FEW = 800, 60  # observations that a small scene can afford
+# These are about 3 tracks started per camera, of 6 views each: what determines a straight road.
+_PER_CAMERA = 20
+# A small scene can afford so many observations, in all and per camera.
+_IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
 _MIN_VIEWS = 3
-_MAX_MATCHES = 10_000_000  # held at a time: 0.6 GB
-_WIDEST_RAD = 0.5  # rays farther apart than this gain nothing more, and are often wrong
-_KEYPOINTS = 1 << 32  # more than an image may have
+# So many matches are held at a time, in 0.6 GB.
+_MAX_MATCHES = 10_000_000
+# Rays farther apart than this gain nothing more, and are often wrong.
+_WIDEST_RAD = 0.5
+# No image has so many keypoints.
+_KEYPOINTS = 1 << 32
 _MIX = np.uint64(0x9E3779B97F4A7C15)
 
 
@@ -86,7 +91,7 @@ def build_tracks(
     for batch in batches:
         row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
         counts = np.diff(batch.offsets)
-        kept = np.repeat(row >= 0, counts) & _sampled(batch, counts, share)
+        kept = np.repeat(row >= 0, counts) & _draw_matches(batch, counts, share)
         pair = np.repeat(np.arange(len(row)), counts)[kept]
         d = directions.directions[row[pair]]
         angle = pixel_angles[batch.pairs[pair]].max(axis=1)
@@ -99,13 +104,13 @@ def build_tracks(
     return _components(np.concatenate(keys), rays)
 
 
-def _sampled(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
+def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArray:
     """Return the matches one of whose keypoints belongs to a random share of all, always the same one."""
     if share >= 1.0:
         return np.ones(len(batch.keypoints), dtype=np.bool_)
     image = np.repeat(batch.pairs, counts, axis=0).astype(np.uint64)
     mixed = (image << np.uint64(32)) + batch.keypoints.astype(np.uint64)
-    for shift in (30, 27, 31):  # the finaliser of splitmix64
+    for shift in (30, 27, 31):  # the finalizer of splitmix64
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * _MIX
     drawn: BoolArray = (mixed >> np.uint64(11)).astype(np.float64) < share / 2.0 * 2.0**53
     return np.asarray(drawn.any(axis=1))
@@ -143,11 +148,11 @@ def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
     return Tracks(
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         cameras=camera[kept].astype(np.int64),
-        rays=_gathered(rays, seen[kept]),
+        rays=_gather_rows(rays, seen[kept]),
     )
 
 
-def _gathered(parts: list[FloatArray], rows: IntArray) -> FloatArray:
+def _gather_rows(parts: list[FloatArray], rows: IntArray) -> FloatArray:
     """Return the given rows of arrays (., 3) that follow one another, without joining these."""
     found = np.empty((len(rows), 3))
     start = 0

@@ -19,11 +19,13 @@ from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.viewgraph import ViewGraph
 
 _ITERATIONS = 10
-_SHARPEST = 20.0  # per radian: how fast a triangle's weight falls with the scores of its sides, at the end
+# A triangle's weight falls so fast, per radian, with the scores of its sides, at the end.
+_SHARPEST = 20.0
 _OPPOSITE_RAD = (
     0.2  # between one side and the other turned round; a noise of 0.05 then bends the plane by 0.3
 )
-_KEPT = 0.2  # radians; between the scores of wrong pairs, around one, and those of noisy ones
+# This score, in radians, lies between those of wrong pairs, around one, and those of noisy ones.
+_KEPT = 0.2
 
 
 def filter_triangles(

@@ -7,12 +7,12 @@
 
     P = R X + t,   p = -P / P_z,   pixel = f (1 + k1 |p|^2 + k2 |p|^4) p
 
-from the centre of the image, x to the right and y up: the camera looks along -z. S = diag(1, -1, -1) takes
+from the center of the image, x to the right and y up: the camera looks along -z. S = diag(1, -1, -1) takes
 its axes to COLMAP's, cam_from_world = S R; the distortion is that of COLMAP's RADIAL.
 
 Names stand in a list file beside it, one a line (`list.txt`, or the .out file's name with .list.txt
 appended, as COLMAP writes it); without one they are camera0000 and so on. Sizes of images stand nowhere:
-the smallest even size that holds all observations is taken, with the principal point at its centre, as
+the smallest even size that holds all observations is taken, with the principal point at its center, as
 Bundler has it.
 
 Source: Snavely, "Bundler v0.4 User's Manual", section VI.
@@ -24,8 +24,10 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.json_node import is_rotation
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile, is_rotation
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.geometry import FLIP_YZ
 
 _HEADER = "# Bundle file v0.3"
 _NUMBERS_PER_CAMERA = 15
@@ -43,7 +45,7 @@ def is_bundler(file: Path) -> bool:
         return False
 
 
-def read_bundler(file: Path) -> SceneFile:
+def read_bundler(file: Path) -> PosedModelFile:
     """Read the reconstructed cameras and the points.
 
     Raises:
@@ -74,9 +76,9 @@ def read_bundler(file: Path) -> SceneFile:
     sizes = _sizes(n, observed, offsets)
     halves = sizes / 2.0
     images = observed[:, 1]
-    return SceneFile(
+    return PosedModelFile(
         cameras=tuple(
-            SceneCamera(
+            Intrinsics(
                 model="RADIAL",
                 width=int(size[0]),
                 height=int(size[1]),
@@ -152,7 +154,7 @@ def _is_finite(word: str) -> bool:
 def _points(
     words: _Words, num_points: int, num_cameras: int, index_of: dict[int, int]
 ) -> tuple[FloatArray, IntArray, IntArray, FloatArray]:
-    """Return points, colours, observations (point, image), and their offsets from the image's centre."""
+    """Return points, colors, observations (point, image), and their offsets from the image's center."""
     points, colors, observed, offsets = [], [], [], []
     for point in range(num_points):
         values = words.numbers(6)

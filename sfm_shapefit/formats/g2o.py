@@ -1,6 +1,6 @@
 """g2o files, those of pose-graph tools (g2o, GTSAM): relative poses are read, placed nodes are written.
 
-    VERTEX_SE3:QUAT    id x y z qx qy qz qw        centre and rotation world_from_cam
+    VERTEX_SE3:QUAT    id x y z qx qy qz qw        center and rotation world_from_cam
     EDGE_SE3:QUAT      i j x y z qx qy qz qw [21]  cam_i_from_cam_j, whose x y z is camera j seen from i
     VERTEX_TRACKXYZ    id x y z                    a point, where there is no rotation
     VERTEX_XY          id x y                      the same in the plane
@@ -21,13 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse, repeated
+from sfm_shapefit.formats.lines import is_repeated, node_indices, number_table, read_lines, refuse
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
 
 _POSE, _RELATIVE_POSE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 _POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
-_INFORMATION = 21  # the upper triangle of an edge's information matrix
+# An edge ends with so many numbers, the upper triangle of its information matrix.
+_INFORMATION = 21
 _PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
 _FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
 _UNIT_TOLERANCE = 1e-3
@@ -53,7 +54,7 @@ def read_g2o(path: Path | str) -> EpipolarGeometries:
         InputError: if the file is malformed or holds edges of another kind, naming the first bad line.
     """
     file = Path(path)
-    numbers, rows = _tagged(file, _RELATIVE_POSE)
+    numbers, rows = _select_tag(file, _RELATIVE_POSE)
     rows = [row[:-_INFORMATION] if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION else row for row in rows]
     values = number_table(file, numbers, rows, first=3, width=_RELATIVE_POSE_COLUMNS)
     names, nodes = node_indices([word for row in rows for word in row[1:3]])
@@ -61,7 +62,7 @@ def read_g2o(path: Path | str) -> EpipolarGeometries:
     refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
     largest = np.abs(values[:, :3]).max(axis=1)
     refuse(file, numbers, ~(largest > 0.0), "has no translation, so no direction")
-    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     return EpipolarGeometries(
         names=tuple(names),
         pairs=pairs,
@@ -77,10 +78,10 @@ def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatA
         InputError: if the file is malformed, naming the first bad line, or has none of the cameras.
     """
     file = Path(path)
-    numbers, rows = _tagged(file, _POSE)
+    numbers, rows = _select_tag(file, _POSE)
     values = number_table(file, numbers, rows, first=2, width=_POSE_COLUMNS)
     ids = [row[1] for row in rows]
-    refuse(file, numbers, repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
+    refuse(file, numbers, is_repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
     rotations = _rotations(file, numbers, values[:, 3:]).swapaxes(1, 2)
     index = {name: k for k, name in enumerate(names)}
     inside = [k for k, name in enumerate(ids) if name in index]
@@ -126,7 +127,7 @@ def _one_line(name: str) -> str:
     return "".join(c if c.isprintable() else "?" for c in name)
 
 
-def _tagged(file: Path, tag: str) -> tuple[list[int], list[list[str]]]:
+def _select_tag(file: Path, tag: str) -> tuple[list[int], list[list[str]]]:
     """Return numbers and words of the lines of one tag; edges that are not understood are refused."""
     numbers, rows = read_lines(file, _FORM)
     known = {_POSE, _RELATIVE_POSE}

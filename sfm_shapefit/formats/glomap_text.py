@@ -11,18 +11,18 @@ Source: GLOMAP's relative pose files, `glomap/io/pose_io.cc` (ReadRelPose).
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import (
     first_words,
+    is_repeated,
     node_indices,
     number_table,
     read_lines,
     refuse,
-    repeated,
 )
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
-from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.geometry import normalized
 
 _COLUMNS = 9
@@ -60,8 +60,8 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     refuse(
         file, numbers, ~(np.linalg.norm(translations, axis=1) > 0.0), "has no translation, so no direction"
     )
-    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
-    rotations = np.array([rotation_from_quaternion(q) for q in quaternions])
+    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
     return EpipolarGeometries(
         names=tuple(names),
         pairs=pairs,
@@ -80,9 +80,10 @@ def relative_poses_text(poses: EpipolarGeometries) -> str:
         if len(name.split()) != 1 or "#" in name:
             raise InputError(f"the name {name!r} cannot stand in a file of relative poses; rename the image")
     lines = []
-    for (i, j), rotation, to_second in zip(
-        poses.pairs.tolist(), poses.rotations, poses.to_second, strict=True
+    quaternions = Rotation.from_matrix(poses.rotations).as_quat(canonical=True)  # x, y, z, w
+    for (i, j), (x, y, z, w), rotation, to_second in zip(
+        poses.pairs.tolist(), quaternions.tolist(), poses.rotations, poses.to_second, strict=True
     ):
-        numbers = [*quaternion_from_rotation(rotation).tolist(), *(-rotation @ to_second).tolist()]
+        numbers = [w, x, y, z, *(-rotation @ to_second).tolist()]
         lines.append(" ".join([poses.names[i], poses.names[j], *(repr(number + 0.0) for number in numbers)]))
     return "".join(f"{line}\n" for line in lines)

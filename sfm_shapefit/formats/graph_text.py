@@ -18,17 +18,20 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
 from sfm_shapefit.viewgraph import ViewGraph
 
-_UNIT_TOLERANCE = 1e-4  # directions printed with 5 digits
+# Directions printed with 5 digits pass.
+_UNIT_TOLERANCE = 1e-4
 _ROUNDED = 1e-7
-_LARGEST_WEIGHT = 1e30  # sums of squares of products of weights must not overflow
+# Sums of squares of products of weights must not overflow.
+_LARGEST_WEIGHT = 1e30
 _FORM = "i j vx vy vz [weight]"
-_MIN_COLUMNS = 4  # two ids and a direction in the plane
+# A row has at least two ids and a direction in the plane.
+_MIN_COLUMNS = 4
 
 
 def read_graph(path: Path | str) -> ViewGraph:
     """Read a bare view graph; the ids become its names, numbers in numerical order, else alphabetically.
 
-    Directions are normalised; a pair that stands twice is merged (see `ViewGraph`).
+    Directions are normalized; a pair that stands twice is merged (see `ViewGraph`).
 
     Raises:
         InputError: if the file cannot be read, naming the first malformed line by its number.

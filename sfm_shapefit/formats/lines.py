@@ -9,7 +9,8 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 
-_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")  # longer ones are words: Python refuses to convert very long ones
+# Longer numbers are words: Python refuses to convert very long ones.
+_IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
 
 
 def refuse_irregular_file(path: Path) -> None:
@@ -112,7 +113,7 @@ def refuse(file: Path, numbers: list[int], bad: BoolArray, reason: str) -> None:
         raise InputError(f"{file}, line {numbers[int(np.argmax(bad))]}: {reason}")
 
 
-def repeated(rows: IntArray) -> BoolArray:
+def is_repeated(rows: IntArray) -> BoolArray:
     """Return which of (k, c) rows occurred before."""
     found = np.ones(len(rows), dtype=np.bool_)
     found[np.unique(rows, axis=0, return_index=True)[1]] = False

@@ -4,9 +4,10 @@ from pathlib import Path
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.bundler import is_bundler, read_bundler
+from sfm_shapefit.formats.json_node import read_json
 from sfm_shapefit.formats.openmvg import is_openmvg, read_openmvg
 from sfm_shapefit.formats.opensfm import is_opensfm, read_opensfm
-from sfm_shapefit.formats.scene import SceneFile, read_json
+from sfm_shapefit.formats.posed_model import PosedModelFile
 
 _SUFFIXES = (".json", ".out")
 
@@ -17,7 +18,7 @@ def is_model_file(path: Path | str) -> bool:
     return file.is_file() and (file.suffix.lower() in _SUFFIXES or is_bundler(file))
 
 
-def read_scene(path: Path | str) -> SceneFile:
+def read_model_file(path: Path | str) -> PosedModelFile:
     """Read a model file of Bundler, openMVG or OpenSfM.
 
     Raises:

@@ -2,7 +2,7 @@
 
     transform_matrix  world_from_camera, 4 x 4, in OpenGL's camera axes: x right, y up, looking along -z
 
-so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's centre. World axes stay
+so its columns are those of R^T S with S = diag(1, -1, -1), and the camera's center. World axes stay
 COLMAP's. Intrinsics stand at the top if all images share them, else in each frame; the names of images are
 taken to lie in images/, as in COLMAP's usual workspace. Beside nerfstudio's keys stands camera_angle_x,
 for instant-ngp and the original NeRF.
@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.scene import FLIP_YZ, SceneCamera, SceneFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.geometry import FLIP_YZ
 
 _RADIAL_KEYS = {
     "SIMPLE_PINHOLE": "",
@@ -41,10 +42,11 @@ _ONE_FOCAL = {
     "SIMPLE_RADIAL_FISHEYE",
     "RADIAL_FISHEYE",
 }
-_DENOMINATOR = ("k4", "k5", "k6")  # of FULL_OPENCV; nerfstudio has no such terms
+# nerfstudio has no such terms of FULL_OPENCV.
+_DENOMINATOR = ("k4", "k5", "k6")
 
 
-def nerf_text(scene: SceneFile) -> str:
+def nerf_text(scene: PosedModelFile) -> str:
     """Return the posed images as the text of a transforms.json.
 
     Raises:
@@ -64,7 +66,7 @@ def nerf_text(scene: SceneFile) -> str:
     return json.dumps({**shared, "frames": frames}, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-def _intrinsics(camera: SceneCamera) -> dict[str, Any]:
+def _intrinsics(camera: Intrinsics) -> dict[str, Any]:
     """Return a camera's keys."""
     is_fisheye = camera.model in _FISHEYE_KEYS
     if not is_fisheye and camera.model not in _RADIAL_KEYS:

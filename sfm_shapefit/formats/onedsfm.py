@@ -26,18 +26,19 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import (
     first_words,
+    is_repeated,
     node_indices,
     number_table,
     read_lines,
     refuse,
-    repeated,
 )
 from sfm_shapefit.geometry import FLIP_YZ, nearest_rotations, normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
 _PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
-_ROTATION_TOLERANCE = 1e-3  # of R R^T and of |t|; the published files have six digits
+# R R^T and |t| may be off by so much, for the published files have six digits.
+_ROTATION_TOLERANCE = 1e-3
 """From Bundler's camera axes to COLMAP's, and back."""
 
 
@@ -118,7 +119,7 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
     lengths = np.linalg.norm(translations, axis=1)
     refuse(file, numbers, np.abs(lengths - 1.0) > _ROTATION_TOLERANCE, "has no unit direction at its end")
     refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
-    refuse(file, numbers, repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
+    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
     found = EpipolarGeometries(
         names=tuple(names),
         pairs=pairs,
@@ -126,7 +127,7 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
         to_second=normalized(translations) @ FLIP_YZ,
     )
     component = path / _COMPONENT_FILE
-    return _restricted(found, component) if path.is_dir() and component.is_file() else found
+    return _restrict(found, component) if path.is_dir() and component.is_file() else found
 
 
 def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray, BoolArray]:
@@ -144,7 +145,7 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
     index = {name: k for k, name in enumerate(names)}
     ids = [row[0] for row in rows]
     _, as_node = node_indices(ids)
-    refuse(file, numbers, repeated(as_node[:, None]), "gives an earlier camera a second rotation")
+    refuse(file, numbers, is_repeated(as_node[:, None]), "gives an earlier camera a second rotation")
     inside = [k for k, name in enumerate(ids) if name in index]
     if not inside:
         raise InputError(f"{file} has a rotation of none of the {len(names)} cameras; check its ids")
@@ -183,7 +184,7 @@ def _text(ids: list[str], values: FloatArray) -> str:
     return "".join(lines)
 
 
-def _restricted(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:
+def _restrict(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:
     """Return the cameras of a cc.txt and the pairs between them."""
     numbers, rows = read_lines(component, "i")
     refuse(component, numbers, np.array([len(row) != 1 for row in rows]), "is not one camera's id")

@@ -9,7 +9,7 @@
 
     x_cam = rotation (X - center)
 
-so rotation is cam_from_world, with z forward and y down as in COLMAP, and center the camera's centre.
+so rotation is cam_from_world, with z forward and y down as in COLMAP, and center the camera's center.
 Newer versions nest the base classes' members in objects `value0`; both forms are read. The camera model is
 known by the name of its distortion, for `polymorphic_name` stands only at the first of a kind. Pixels are
 taken as they are.
@@ -23,9 +23,11 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.formats.scene import JsonNode, SceneCamera, SceneFile
+from sfm_shapefit.formats.json_node import JsonNode
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
-_NO_POSE = 2**32 - 1  # openMVG's UndefinedIndexT
+# This is openMVG's UndefinedIndexT.
+_NO_POSE = 2**32 - 1
 
 
 def is_openmvg(content: object) -> bool:
@@ -33,7 +35,7 @@ def is_openmvg(content: object) -> bool:
     return isinstance(content, dict) and "sfm_data_version" in content
 
 
-def read_openmvg(file: Path, content: object) -> SceneFile:
+def read_openmvg(file: Path, content: object) -> PosedModelFile:
     """Read the posed views and the structure of a file whose JSON is `content`.
 
     Raises:
@@ -64,7 +66,7 @@ def read_openmvg(file: Path, content: object) -> SceneFile:
         rotations.append(poses[pose][0])
         centers.append(poses[pose][1])
     points, observed, pixels = _structure(root, index_of)
-    return SceneFile(
+    return PosedModelFile(
         cameras=tuple(cameras.values()),
         names=tuple(names),
         camera_of=np.array(camera_of, dtype=np.int64),
@@ -95,7 +97,7 @@ def _found(node: JsonNode, key: str) -> JsonNode | None:
     return _found(node.get("value0"), key) if node.has("value0") else None
 
 
-def _camera(node: JsonNode) -> SceneCamera:
+def _camera(node: JsonNode) -> Intrinsics:
     """Return a camera in COLMAP's terms."""
     members = {}
     for key in ("width", "height", "focal_length", "principal_point"):
@@ -108,7 +110,7 @@ def _camera(node: JsonNode) -> SceneCamera:
     if f <= 0.0 or width < 1 or height < 1:
         raise node.error("has a focal length or a size that is not positive")
     model, params = _model(node, f, center)
-    return SceneCamera(model=model, width=width, height=height, params=params)
+    return Intrinsics(model=model, width=width, height=height, params=params)
 
 
 def _model(node: JsonNode, f: float, center: list[float]) -> tuple[str, tuple[float, ...]]:

@@ -5,12 +5,12 @@
       "points":  {id: {coordinates: [3], color: [3]}}}, ...]
 
 `rotation` is the angle-axis vector of cam_from_world, `translation` its t: x_cam = R x + t, z forward and
-y down as in COLMAP. Lengths in the image are in units of its larger side, from its centre:
+y down as in COLMAP. Lengths in the image are in units of its larger side, from its center:
 
-    pixel = larger side * normalised + (width, height) / 2          (COLMAP's pixels: first centre at 0.5)
+    pixel = larger side * normalized + (width, height) / 2          (COLMAP's pixels: first center at 0.5)
 
 tracks.csv, versions 1 and 2: `image track feature x y [scale] r g b ...`, tab-separated, x and y
-normalised; tracks are the points. Of several reconstructions the one with most shots is read.
+normalized; tracks are the points. Of several reconstructions the one with most shots is read.
 
 Source: https://opensfm.org/docs/geometry.html and dataset.html.
 """
@@ -18,11 +18,13 @@ Source: https://opensfm.org/docs/geometry.html and dataset.html.
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.json_node import JsonNode
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.scene import JsonNode, SceneCamera, SceneFile, rotation_from_quaternion
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
 _TRACKS_FILE = "tracks.csv"
 _MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
@@ -35,7 +37,7 @@ def is_opensfm(content: object) -> bool:
     )
 
 
-def read_opensfm(file: Path, content: object) -> SceneFile:
+def read_opensfm(file: Path, content: object) -> PosedModelFile:
     """Read the largest reconstruction of a file whose JSON is `content`.
 
     Raises:
@@ -52,7 +54,7 @@ def read_opensfm(file: Path, content: object) -> SceneFile:
         key = shot.get("camera").text()
         if key not in camera_ids:
             raise shot.error(f"has the camera {key!r}, which is not among the cameras")
-        rotation = rotation_from_vector(np.array(shot.get("rotation").numbers(3)))
+        rotation = Rotation.from_rotvec(shot.get("rotation").numbers(3)).as_matrix()
         names.append(name)
         camera_of.append(camera_ids.index(key))
         rotations.append(rotation)
@@ -67,7 +69,7 @@ def read_opensfm(file: Path, content: object) -> SceneFile:
         -1, 2
     )
     of_image = sizes[observed[:, 1]]
-    return SceneFile(
+    return PosedModelFile(
         cameras=tuple(cameras),
         names=tuple(names),
         camera_of=np.array(camera_of, dtype=np.int64),
@@ -80,13 +82,7 @@ def read_opensfm(file: Path, content: object) -> SceneFile:
     )
 
 
-def rotation_from_vector(vector: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation about `vector` by its length in radians."""
-    half = np.linalg.norm(vector) / 2.0
-    return rotation_from_quaternion(np.array([np.cos(half), *(np.sinc(half / np.pi) / 2.0 * vector)]))
-
-
-def _camera(node: JsonNode) -> SceneCamera:
+def _camera(node: JsonNode) -> Intrinsics:
     """Return a camera in COLMAP's terms; missing coefficients are 0."""
     kind = node.get("projection_type").text()
     if kind not in _MODELS:
@@ -117,11 +113,11 @@ def _camera(node: JsonNode) -> SceneCamera:
         model, params = "FULL_OPENCV", (fx, fy, *center, k1, k2, *extra)
     else:
         model, params = "OPENCV", (fx, fy, *center, k1, k2, 0.0, 0.0)
-    return SceneCamera(model=model, width=width, height=height, params=params)
+    return Intrinsics(model=model, width=width, height=height, params=params)
 
 
 def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:
-    """Return the observations (point, image) of tracks.csv, and their normalised coordinates."""
+    """Return the observations (point, image) of tracks.csv, and their normalized coordinates."""
     tracks = file.with_name(_TRACKS_FILE)
     observed, coordinates = [], []
     if tracks.is_file():

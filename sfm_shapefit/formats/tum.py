@@ -1,7 +1,7 @@
 """Poses as plain text: the TUM RGB-D trajectory format, and a CSV; both written.
 
-    TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the centre, and R^T as a quaternion
-    CSV   name,x,y,z,qw,qx,qy,qz              the centre, and cam_from_world as in COLMAP's images.txt
+    TUM   timestamp tx ty tz qx qy qz qw      world_from_camera: the center, and R^T as a quaternion
+    CSV   name,x,y,z,qw,qx,qy,qz              the center, and cam_from_world as in COLMAP's images.txt
 
 Camera axes are COLMAP's in both (z forward, y down), as in TUM's own data. The timestamp is the number
 that is an image's name without folder and suffix, as in TUM's data (1305031102.175304.png), if all names
@@ -16,27 +16,31 @@ import io
 import math
 from pathlib import PurePosixPath
 
-from sfm_shapefit.formats.scene import SceneFile, quaternion_from_rotation
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.formats.posed_model import PosedModelFile
 
 
-def tum_text(scene: SceneFile) -> str:
+def tum_text(model: PosedModelFile) -> str:
     """Return the posed images as a trajectory; numbers round-trip."""
     lines = []
-    for stamp, k in sorted(zip(_timestamps(scene.names), range(len(scene.names)), strict=True), key=_by_time):
-        w, x, y, z = quaternion_from_rotation(scene.rotations[k].T).tolist()
-        numbers = [*scene.centers[k].tolist(), x, y, z, w]
+    quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
+    for stamp, k in sorted(zip(_timestamps(model.names), range(len(model.names)), strict=True), key=_by_time):
+        numbers = [*model.centers[k].tolist(), *quaternions[k].tolist()]
         lines.append(" ".join([stamp, *(repr(number + 0.0) for number in numbers)]))
     return "# timestamp tx ty tz qx qy qz qw\n" + "".join(f"{line}\n" for line in lines)
 
 
-def poses_csv(scene: SceneFile) -> str:
+def poses_csv(model: PosedModelFile) -> str:
     """Return the posed images as a CSV; numbers round-trip."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(["name", "x", "y", "z", "qw", "qx", "qy", "qz"])
-    for name, rotation, center in zip(scene.names, scene.rotations, scene.centers, strict=True):
-        quaternion = quaternion_from_rotation(rotation).tolist()
-        writer.writerow([name, *(repr(number + 0.0) for number in [*center.tolist(), *quaternion])])
+    quaternions = np.roll(Rotation.from_matrix(model.rotations).as_quat(canonical=True), 1, axis=1)
+    numbers = np.concatenate([model.centers, quaternions], axis=1) + 0.0
+    for name, row in zip(model.names, numbers.tolist(), strict=True):
+        writer.writerow([name, *map(repr, row)])
     return stream.getvalue()
 
 

@@ -1,6 +1,6 @@
 """Preconditioners without fill, and conjugate gradients: for graphs whose Cholesky factor would not fit.
 
-Eliminating a node v with neighbours of weights w_1 <= ... <= w_d, W = sum w, adds the clique of weights
+Eliminating a node v with neighbors of weights w_1 <= ... <= w_d, W = sum w, adds the clique of weights
 w_i w_j / W. Approximate Cholesky replaces the clique by d - 1 sampled edges of the right mean: each i < d is
 joined to one later j, drawn with probability w_j / (w_{i+1} + ... + w_d), with weight
 w_i (w_{i+1} + ... + w_d) / W. So the number of edges never grows.
@@ -22,7 +22,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.jit import kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
-_DIVERGED = 1e6  # times the least residual so far: rounding leads, and no longer the system
+# A residual so many times the least so far shows that rounding leads, and no longer the system.
+_DIVERGED = 1e6
 
 Operator = Callable[[FloatArray], FloatArray]
 
@@ -58,7 +59,7 @@ class ApproximateCholesky:
     rows: Int32Array
     """Elimination steps of the entries below the diagonal."""
     fractions: npt.NDArray[np.float32]
-    """Minus these entries: the share of each neighbour in the weighted degree of the eliminated node."""
+    """Minus these entries: the share of each neighbor in the weighted degree of the eliminated node."""
     pivots: FloatArray
     """(n,) weighted degree at elimination; 0 for the last node of each component."""
 
@@ -81,7 +82,7 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     """Return a sampled Cholesky factor of the graph Laplacian.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         weights: (m,) non-negative edge weights; edges of weight 0 do not count.
         seed: of the draws; any integer.
     """
@@ -127,7 +128,7 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
 
 
 @kernel(exact=True)
-def _grown(array: Any, size: int) -> Any:
+def _enlarge(array: Any, size: int) -> Any:
     """Return a copy of an array with room for `size` entries."""
     larger = np.empty((size, *array.shape[1:]), array.dtype)
     larger[: len(array)] = array
@@ -175,13 +176,13 @@ def _add_entry(
 
 
 @kernel(exact=True)
-def _merged_star(
+def _merge_star(
     v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
     below: Any, step: Any, place: Any, star: Any, star_weight: Any,
 ) -> int:  # fmt: skip
-    """Collect the neighbours of v that are left, parallel edges summed, and free v's list.
+    """Collect the neighbors of v that are left, parallel edges summed, and free v's list.
 
-    Returns their number. Each neighbour leaves its bucket; its degree falls by the number of its edges to v.
+    Returns their number. Each neighbor leaves its bucket; its degree falls by the number of its edges to v.
     """
     size, entry, last = 0, head[v], -1
     while entry >= 0:
@@ -206,7 +207,7 @@ def _merged_star(
 
 @kernel(exact=True)
 def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
-    """Sort the neighbours by weight, ascending, equal ones by node; sum the weights from each to the last.
+    """Sort the neighbors by weight, ascending, equal ones by node; sum the weights from each to the last.
 
     Shell's method with Ciura's gaps: no allocation, and insertion sort where a star is small.
     """
@@ -228,7 +229,7 @@ def _sample_clique(
     size: int, star: Any, star_weight: Any, tail: Any, head: Any, links: Any, values: Any, degree: Any,
     pool: Any, state: Any,
 ) -> None:  # fmt: skip
-    """Join each neighbour to one of larger weight, drawn in proportion to the weights."""
+    """Join each neighbor to one of larger weight, drawn in proportion to the weights."""
     for a in range(size - 1):
         target = tail[a + 1] * (1.0 - _uniform(state))  # in (0, tail[a + 1]]
         low, high = a + 1, size - 1
@@ -263,7 +264,7 @@ def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, s
             lowest += 1
         v = bucket[lowest]
         _remove(bucket, above, below, degree, v)
-        size = _merged_star(
+        size = _merge_star(
             v, head, links, values, degree, pool, bucket, above, below, step, place, star, star_weight
         )
         _sort_star(size, star, star_weight, tail)
@@ -271,9 +272,9 @@ def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, s
         end = columns[k] + size
         columns[k + 1] = end
         if end > len(rows):
-            rows, fractions = _grown(rows, 2 * end), _grown(fractions, 2 * end)
+            rows, fractions = _enlarge(rows, 2 * end), _enlarge(fractions, 2 * end)
         if pool[1] + 2 * size > len(values):
-            links, values = _grown(links, 2 * len(values)), _grown(values, 2 * len(values))
+            links, values = _enlarge(links, 2 * len(values)), _enlarge(values, 2 * len(values))
         rows[end - size : end] = star[:size]  # nodes now, steps once all steps are known
         fractions[end - size : end] = star_weight[:size] / tail[0]
         _sample_clique(size, star, star_weight, tail, head, links, values, degree, pool, state)

@@ -1,6 +1,6 @@
-"""Sparse Cholesky factorisation of graph Laplacians, scalar (n x n) and in b x b blocks (nb x nb).
+"""Sparse Cholesky factorization of graph Laplacians, scalar (n x n) and in b x b blocks (nb x nb).
 
-The factorisation is multifrontal (Duff, Reid 1983; Liu 1992, "The multifrontal method for sparse matrix
+The factorization is multifrontal (Duff, Reid 1983; Liu 1992, "The multifrontal method for sparse matrix
 solution"). For each supernode, children first:
 
     assemble   its panel from the edges' slots and from the children's update matrices
@@ -8,7 +8,7 @@ solution"). For each supernode, children first:
     update     U = -L_RJ L_RJ^T + what the children leave for later fronts, kept on a stack
 
 What depends on the graph alone is planned once (`analyse`); `refactor` takes new edge weights and does not
-sort. Disjoint subtrees are tasks for several threads, in the factorisation and in both substitutions; the
+sort. Disjoint subtrees are tasks for several threads, in the factorization and in both substitutions; the
 large fronts above them are factored by strips of columns. Tasks and strips are the same for any number of
 threads, and so is every bit of the answer.
 
@@ -33,7 +33,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
 from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
-from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, checked_edges
+from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
 
@@ -129,7 +129,7 @@ def analyse(
     edges: npt.ArrayLike,
     ordering: Ordering | IntArray = "auto",
 ) -> SymbolicFactor:
-    """Plan the factorisation of the Laplacians of a graph, whatever their weights, block size and precision.
+    """Plan the factorization of the Laplacians of a graph, whatever their weights, block size and precision.
 
     Args:
         num_nodes: n >= 1.
@@ -137,13 +137,13 @@ def analyse(
         ordering: a method of `ordering.best_order`, or an order of elimination (n,) itself.
 
     Returns:
-        The plan. `num_nonzeros`, `flops` and `num_bytes` tell what a factorisation would cost. To know that
+        The plan. `num_nonzeros`, `flops` and `num_bytes` tell what a factorization would cost. To know that
         still earlier, and cheaper, ask `best_order` for the elimination tree alone.
 
     Raises:
         InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    pairs = checked_edges(num_nodes, edges)
+    pairs = check_edges(num_nodes, edges)
     graph = adjacency(num_nodes, pairs)
     tree = best_order(graph, ordering) if isinstance(ordering, str) else elimination_tree(graph, ordering)
     return plan_factorisation(graph, pairs, tree)

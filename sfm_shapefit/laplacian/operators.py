@@ -27,7 +27,7 @@ Int32Array = npt.NDArray[np.int32]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjacency:
-    """The neighbours of each node, in compressed rows; within a row in the order of the edges."""
+    """The neighbors of each node, in compressed rows; within a row in the order of the edges."""
 
     pointers: IntArray
     """(n + 1,) row i is `neighbours[pointers[i]:pointers[i + 1]]`."""
@@ -42,7 +42,7 @@ class Adjacency:
         return len(self.pointers) - 1
 
 
-def checked_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
+def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array.
 
     Raises:
@@ -57,7 +57,7 @@ def checked_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
 
 
 def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
-    """Return the neighbours of each node; a repeated edge stands repeatedly.
+    """Return the neighbors of each node; a repeated edge stands repeatedly.
 
     Args:
         num_nodes: n.
@@ -122,7 +122,7 @@ def laplacian_pattern(num_nodes: int, edges: npt.ArrayLike) -> LaplacianPattern:
     Raises:
         InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    pairs = checked_edges(num_nodes, edges)
+    pairs = check_edges(num_nodes, edges)
     m = len(pairs)
     nodes = np.arange(num_nodes)
     rows = np.concatenate([nodes, pairs[:, 0], pairs[:, 1]])

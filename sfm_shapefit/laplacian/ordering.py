@@ -37,9 +37,9 @@ def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
     """Return the elimination tree of the order with the least work.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         method: one method, or "auto": METIS, and minimum degree as well on graphs of up to 400,000 edges
-            where it can be better; the one whose factorisation takes fewer operations is kept.
+            where it can be better; the one whose factorization takes fewer operations is kept.
     """
     trees = [] if method == "minimum-degree" else [elimination_tree(graph, metis_order(graph))]
     edges = len(graph.neighbours) // 2
@@ -64,7 +64,7 @@ def metis_order(graph: Adjacency) -> IntArray:
 def minimum_degree_order(graph: Adjacency) -> IntArray:
     """Return SuperLU's multiple minimum degree order, (n,): node eliminated k-th.
 
-    SuperLU orders before it factors. An incomplete factorisation that drops everything costs no more than
+    SuperLU orders before it factors. An incomplete factorization that drops everything costs no more than
     that order, which it then reports.
     """
     n = graph.num_nodes
@@ -91,7 +91,7 @@ def widest_level(graph: Adjacency) -> int:
 
 
 def without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
-    """Return row pointers and neighbours with each neighbour once, as METIS demands."""
+    """Return row pointers and neighbors with each neighbor once, as METIS demands."""
     n = graph.num_nodes
     entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
     matrix = csc_array(entries, shape=(n, n), copy=True)

@@ -8,8 +8,8 @@ Z of A obeys, from the last supernode to the first,
 and Z_RR is part of what is known of the parent, because R lies in the rows of the parent's panel (Takahashi,
 Fagan, Chin 1973, "Formation of a sparse bus impedance matrix"; Erisman and Tinney 1975; in fronts: Amestoy et
 al. 2012, "On computing inverse entries of a sparse matrix in an out-of-core environment"). It costs about
-twice the factorisation. The block Z_RR of a supernode waits where its update matrix lay during the
-factorisation: it lives from the parent to the supernode, the same interval run backwards.
+twice the factorization. The block Z_RR of a supernode waits where its update matrix lay during the
+factorization: it lives from the parent to the supernode, the same interval run backwards.
 """
 
 from dataclasses import dataclass

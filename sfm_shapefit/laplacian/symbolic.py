@@ -1,6 +1,6 @@
-"""What a sparse Cholesky factorisation will do, from the graph alone: fill, work, and where all goes.
+"""What a sparse Cholesky factorization will do, from the graph alone: fill, work, and where all goes.
 
-Eliminating node k joins its later neighbours. The first of them is its parent in the elimination tree,
+Eliminating node k joins its later neighbors. The first of them is its parent in the elimination tree,
 and column k of the factor L is filled within the column of the parent (Liu 1990, "The role of elimination
 trees in sparse factorization"). From that:
 
@@ -27,11 +27,16 @@ from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
-_MERGE_ALWAYS = 0.03  # a child joins its parent if the merged panel has at most this share of zeros,
-_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))  # or this share while it has at most so many columns
-_LARGEST_TASK = 1 / 6  # of all entries: subtrees with more are divided
-_SMALLEST_TASK = 1 / 40  # of all entries: it is left to the part above, with what cannot be divided
-_WORTH_TASKS = 500_000  # entries of the panels; below, handing out work costs more than the work
+# A child joins its parent if the merged panel has at most this share of zeros, or the share that the limits
+# give while it has at most so many columns.
+_MERGE_ALWAYS = 0.03
+_MERGE_LIMITS = ((64, 0.10), (24, 0.20), (8, 0.80))
+# Subtrees with more than the first share of all entries are divided; with less than the second they are left
+# to the part above, with what cannot be divided.
+_LARGEST_TASK = 1 / 6
+_SMALLEST_TASK = 1 / 40
+# With fewer entries in the panels, handing out work costs more than the work.
+_WORTH_TASKS = 500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,13 +59,13 @@ class EliminationTree:
 
     @property
     def flops(self) -> float:
-        """Multiplications and additions of the factorisation: the sum of squared column counts."""
+        """Multiplications and additions of the factorization: the sum of squared column counts."""
         return float(np.sum(self.counts.astype(np.float64) ** 2))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SymbolicFactor:
-    """The plan of a multifrontal Cholesky factorisation; serves every block size and precision.
+    """The plan of a multifrontal Cholesky factorization; serves every block size and precision.
 
     Supernode s owns elimination steps `first[s]:first[s + 1]`. Its panel has those steps as columns, and
     as rows the same steps followed by `rows[row_pointers[s]:row_pointers[s + 1]]`, column-major.
@@ -111,7 +116,7 @@ class SymbolicFactor:
     num_nonzeros: int
     """Entries of the scalar factor L without any explicit zero."""
     flops: float
-    """Multiplications and additions of the scalar factorisation, without explicit zeros."""
+    """Multiplications and additions of the scalar factorization, without explicit zeros."""
 
     @property
     def num_nodes(self) -> int:
@@ -138,7 +143,7 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
     """Return the elimination tree and the column counts of L for a fill-reducing order.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         order: (n,) a permutation of the nodes, the first eliminated first.
 
     Returns:
@@ -161,7 +166,7 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
 
     Args:
-        graph: the neighbours of each node.
+        graph: the neighbors of each node.
         edges: (m, 2) int64, the edges of `graph`.
         tree: from `elimination_tree` on the same graph.
     """
@@ -216,7 +221,7 @@ def _inverse(permutation: IntArray) -> IntArray:
 
 @kernel()
 def _parents(pointers: Any, neighbours: Any, permutation: Any, inverse: Any) -> Any:
-    """Return the elimination tree: join the earlier neighbours' trees below each step (with compression)."""
+    """Return the elimination tree: join the earlier neighbors' trees below each step (with compression)."""
     n = len(permutation)
     parent = np.full(n, -1, np.int64)
     ancestor = np.full(n, -1, np.int64)
@@ -262,7 +267,7 @@ def _postorder(parent: Any) -> Any:
 def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
     """Count the entries of each column of L.
 
-    Row i of L is the subtree that joins i's earlier neighbours to i. Entry (i, j) is charged +1 at each
+    Row i of L is the subtree that joins i's earlier neighbors to i. Entry (i, j) is charged +1 at each
     leaf j and -1 where two branches meet, so that sums over subtrees count every row that passes.
     """
     n = len(permutation)
@@ -281,7 +286,7 @@ def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: An
         for p in range(pointers[node], pointers[node + 1]):
             i = inverse[neighbours[p]]
             if i <= j or lowest[j] <= previous[i]:
-                continue  # an earlier neighbour of i lies below j: j is no leaf of row i
+                continue  # an earlier neighbor of i lies below j: j is no leaf of row i
             delta[j] += 1
             if previous[i] >= 0:
                 meet = previous[i]

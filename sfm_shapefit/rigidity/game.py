@@ -1,6 +1,6 @@
 """Step 3: the pebble game on the frames of the sets.
 
-Every camera has d pebbles, each free or covering a copy of a link that leaves the camera. A copy is
+Every node has d pebbles, each free or covering a copy of a link that leaves the node. A copy is
 independent of those placed before if d + 2 pebbles can be brought to its two ends; pebbles travel by
 reversing paths of covered copies.
 """
@@ -13,33 +13,34 @@ from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.rigidity.growth import compact, find_root, incidence, unite
 
-_GAME_WORK = 20  # cameras marked before a game is contracted and restarted, as a multiple of its cameras
+# A game is contracted and restarted when so many times its nodes have been marked.
+_GAME_WORK = 20
 
 
 class Game(NamedTuple):
-    """Sets as frames: a multigraph on the cameras they share, or on the first few of these."""
+    """Sets as frames: a multigraph on the nodes they share, or on the first few of these."""
 
     num_nodes: int
     ends: IntArray
-    """(k, 2) renumbered cameras of each link of a frame."""
+    """(k, 2) renumbered nodes of each link of a frame."""
     copies: IntArray
     """(k,) how many copies of an edge the link stands for."""
     owner: IntArray
     """(k,) the set that the link belongs to."""
     num_sets: int
     is_whole: bool
-    """Whether all shared cameras take part."""
+    """Whether all shared nodes take part."""
 
 
 def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimension: int) -> Game:
-    """Return the frames of all sets on the first `part` cameras that are shared by sets."""
+    """Return the frames of all sets on the first `part` nodes that are shared by sets."""
     num_sets = int(set_of.max(initial=-1)) + 1
-    start, cameras, back_start, _ = incidence(num_nodes, edges, set_of, num_sets)
+    start, nodes, back_start, _ = incidence(num_nodes, edges, set_of, num_sets)
     is_shared = np.diff(back_start) >= 2
     number = np.where(is_shared, np.cumsum(is_shared) - 1, part)
     owner = np.repeat(np.arange(num_sets), np.diff(start))
-    kept = number[cameras] < part
-    owner, member = owner[kept], number[cameras[kept]]
+    kept = number[nodes] < part
+    owner, member = owner[kept], number[nodes[kept]]
     order = np.lexsort((member, owner))
     owner, member = owner[order], member[order]
 
@@ -54,12 +55,12 @@ def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimen
     )
     copies = np.repeat([dimension - 1, 1], [len(from_first), len(from_second)])
     owner = np.concatenate([owner[from_first], owner[from_second]])
-    by_last_camera = np.argsort(ends.max(axis=1, initial=0), kind="stable")
+    by_last_node = np.argsort(ends.max(axis=1, initial=0), kind="stable")
     return Game(
         num_nodes=min(part, int(is_shared.sum())),
-        ends=ends[by_last_camera].astype(np.int64),
-        copies=copies[by_last_camera].astype(np.int64),
-        owner=owner[by_last_camera].astype(np.int64),
+        ends=ends[by_last_node].astype(np.int64),
+        copies=copies[by_last_node].astype(np.int64),
+        owner=owner[by_last_node].astype(np.int64),
         num_sets=num_sets,
         is_whole=bool(is_shared.sum() <= part),
     )
@@ -99,7 +100,7 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
 
 
 def _links_at(num_nodes: int, ends: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the links at each camera as a (start, links) list."""
+    """Return the links at each node as a (start, links) list."""
     order = np.argsort(ends.ravel(), kind="stable")
     start = np.zeros(num_nodes + 1, dtype=np.int64)
     start[1:] = np.cumsum(np.bincount(ends.ravel(), minlength=num_nodes))
@@ -107,16 +108,16 @@ def _links_at(num_nodes: int, ends: IntArray) -> tuple[IntArray, IntArray]:
 
 
 class _Board(NamedTuple):
-    """State of a pebble game: d pebbles per camera, each free or covering a copy that leaves it."""
+    """State of a pebble game: d pebbles per node, each free or covering a copy that leaves it."""
 
     target: IntArray
-    """(n, d) camera that the copy under each pebble leads to, -1 for a free pebble."""
+    """(n, d) node that the copy under each pebble leads to, -1 for a free pebble."""
     free: IntArray
     """(n,) number of free pebbles."""
     start: IntArray
     link_of: IntArray
     ends: IntArray
-    """Links at each camera, and their two ends, placed or not."""
+    """Links at each node, and their two ends, placed or not."""
     seen: IntArray
     came_from: IntArray
     came_by: IntArray
@@ -125,13 +126,13 @@ class _Board(NamedTuple):
     inside: IntArray
     escapes: IntArray
     members: IntArray
-    """Marks of the running rigid set, valid where they equal clock[1]; its cameras."""
+    """Marks of the running rigid set, valid where they equal clock[1]; its nodes."""
     clock: IntArray
 
 
 @kernel()
 def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
-    """Move one free pebble to camera u along a path of copies, sparing camera v; False if none is left."""
+    """Move one free pebble to node u along a path of copies, sparing node v; False if none is left."""
     board.clock[0] += 1
     now = board.clock[0]
     board.seen[u] = now
@@ -172,7 +173,7 @@ def _reverse_path(board: _Board, u: int, w: int) -> None:
 
 @kernel()
 def _free_slot(board: _Board, u: int) -> int:
-    """Return the first free pebble of a camera that has one."""
+    """Return the first free pebble of a node that has one."""
     slot = 0
     while board.target[u, slot] >= 0:
         slot += 1
@@ -196,12 +197,12 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
     """Play the game: place as many copies of each link as are independent of those before.
 
     Gathering g pebbles on the ends of a link shows that g - (d + 1) more copies are independent. If
-    that is fewer than asked, both ends lie in a rigid set; its cameras are marked, so that links inside
-    it are passed over at once. The game ends early when the whole is rigid, or when `max_work` cameras
+    that is fewer than asked, both ends lie in a rigid set; its nodes are marked, so that links inside
+    it are passed over at once. The game ends early when the whole is rigid, or when `max_work` nodes
     have been marked: contracting what was found is then cheaper than going on.
 
     Returns:
-        (n,) the link by which a camera was found to lie in a rigid set, -1 for none.
+        (n,) the link by which a node was found to lie in a rigid set, -1 for none.
     """
     n, dimension = board.target.shape
     room = dimension * n - (dimension + 1)
@@ -234,8 +235,8 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
 def _rigid_set(board: _Board, u: int, v: int) -> int:
     """Collect the largest rigid set around u and v, which hold all the d + 1 pebbles that they can.
 
-    It consists of the cameras that no path of copies leads from to a free pebble elsewhere. Returns
-    its size; its cameras stand in `members`, and `inside` marks them.
+    It consists of the nodes that no path of copies leads from to a free pebble elsewhere. Returns
+    its size; its nodes stand in `members`, and `inside` marks them.
     """
     board.clock[1] += 1
     now = board.clock[1]
@@ -257,7 +258,7 @@ def _rigid_set(board: _Board, u: int, v: int) -> int:
 
 @kernel()
 def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
-    """Follow all copies from w: if none escapes to a free pebble, all cameras met join the rigid set."""
+    """Follow all copies from w: if none escapes to a free pebble, all nodes met join the rigid set."""
     rigid = board.clock[1]
     board.clock[0] += 1
     now = board.clock[0]
@@ -289,7 +290,7 @@ def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
 
 @kernel()
 def _sets_by_marks(board: _Board, owner: IntArray, num_sets: int, mark: IntArray) -> IntArray:
-    """Return a root set for each set: sets with two cameras of the same mark have the same."""
+    """Return a root set for each set: sets with two nodes of the same mark have the same."""
     parent = np.arange(num_sets)
     for k in range(len(owner)):
         u, v = board.ends[k, 0], board.ends[k, 1]

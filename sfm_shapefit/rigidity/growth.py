@@ -1,4 +1,4 @@
-"""Steps 1 and 2: rigid sets by triangles, and by growth over the cameras that sets share.
+"""Steps 1 and 2: rigid sets by triangles, and by growth over the nodes that sets share.
 
 Rigid sets are sets of pairs. They are told apart by a label per pair; while they unite, by a forest in which
 each set is a tree and its smallest member the root.
@@ -11,8 +11,11 @@ import numpy as np
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import kernel
 
-_GROWTH_ROUNDS = 4  # a later round rarely unites anything; the pebble game is exact anyway
-_GROWTH_WORK = 30  # cameras looked at while growing, as a multiple of all (set, camera) incidences
+# A later round rarely unites anything; the pebble game is exact anyway.
+_GROWTH_ROUNDS = 4
+
+# Limit of the nodes looked at while growing, as a multiple of all incidences of sets and nodes.
+_GROWTH_WORK = 30
 
 
 def compact(label: IntArray) -> IntArray:
@@ -47,7 +50,7 @@ def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
     """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same.
 
     Each pair is directed to its end of higher degree, which leaves at most sqrt(2 m) pairs at any
-    camera, and each triangle is met once, at its lowest end.
+    node, and each triangle is met once, at its lowest end.
     """
     m = len(edges)
     degree = np.zeros(num_nodes, np.int64)
@@ -93,7 +96,7 @@ def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
 def incidence(
     num_nodes: int, edges: IntArray, set_of: IntArray, num_sets: int
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
-    """Return which cameras each set has, and which sets each camera, as two (start, items) lists."""
+    """Return which nodes each set has, and which sets each node, as two (start, items) lists."""
     m = len(edges)
     edge_start = np.zeros(num_sets + 1, np.int64)
     for e in range(m):
@@ -106,18 +109,18 @@ def incidence(
         fill[set_of[e]] += 1
 
     start = np.zeros(num_sets + 1, np.int64)
-    cameras = np.empty(2 * m, np.int64)
+    nodes = np.empty(2 * m, np.int64)
     back_start = np.zeros(num_nodes + 1, np.int64)
     last = np.full(num_nodes, -1, np.int64)
     count = 0
     for b in range(num_sets):
         for s in range(edge_start[b], edge_start[b + 1]):
             for side in range(2):
-                camera = edges[edge_of[s], side]
-                if last[camera] != b:
-                    last[camera] = b
-                    cameras[count] = camera
-                    back_start[camera + 1] += 1
+                node = edges[edge_of[s], side]
+                if last[node] != b:
+                    last[node] = b
+                    nodes[count] = node
+                    back_start[node + 1] += 1
                     count += 1
         start[b + 1] = count
     back_start = np.cumsum(back_start)
@@ -125,19 +128,19 @@ def incidence(
     rigid_sets = np.empty(count, np.int64)
     for b in range(num_sets):
         for s in range(start[b], start[b + 1]):
-            rigid_sets[fill[cameras[s]]] = b
-            fill[cameras[s]] += 1
-    return start, cameras[:count].copy(), back_start, rigid_sets
+            rigid_sets[fill[nodes[s]]] = b
+            fill[nodes[s]] += 1
+    return start, nodes[:count].copy(), back_start, rigid_sets
 
 
 def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
-    """Return set labels after growing every set of at least 3 cameras, largest first (step 2)."""
+    """Return set labels after growing every set of at least 3 nodes, largest first (step 2)."""
     for _ in range(_GROWTH_ROUNDS):
         num_sets = int(set_of.max(initial=-1)) + 1
-        start, cameras, back_start, rigid_sets = incidence(num_nodes, edges, set_of, num_sets)
+        start, nodes, back_start, rigid_sets = incidence(num_nodes, edges, set_of, num_sets)
         growth = _Growth(
             start=start,
-            cameras=cameras,
+            nodes=nodes,
             back_start=back_start,
             rigid_sets=rigid_sets,
             parent=np.arange(num_sets),
@@ -151,7 +154,7 @@ def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
         )
         size = np.diff(start)
         seeds = np.argsort(-size, kind="stable")[: int((size >= 3).sum())].astype(np.int64)
-        _grow(growth, seeds, _GROWTH_WORK * len(cameras))
+        _grow(growth, seeds, _GROWTH_WORK * len(nodes))
         if (growth.parent == np.arange(num_sets)).all():
             break
         set_of = compact(growth.parent[set_of])
@@ -162,23 +165,23 @@ class _Growth(NamedTuple):
     """State of growing sets; a mark is valid where it equals the seed that grows."""
 
     start: IntArray
-    cameras: IntArray
+    nodes: IntArray
     back_start: IntArray
     rigid_sets: IntArray
-    """Cameras of each set, sets at each camera."""
+    """Nodes of each set, sets at each node."""
     parent: IntArray
     """(number of sets,) which sets were united."""
     taken: IntArray
     met: IntArray
-    """(number of sets,) marks: part of the seed; shares a camera with it."""
+    """(number of sets,) marks: part of the seed; shares a node with it."""
     inside: IntArray
     reached: IntArray
-    """(n,) marks: camera of the seed; camera of a set that shares one with the seed, ..."""
+    """(n,) marks: node of the seed; node of a set that shares one with the seed, ..."""
     reached_by: IntArray
     reached_at: IntArray
-    """(n,) ... the first such set, and the camera that it shares."""
+    """(n,) ... the first such set, and the node that it shares."""
     queue: IntArray
-    """The seed's cameras, in the order of joining."""
+    """The seed's nodes, in the order of joining."""
 
 
 @kernel()
@@ -193,18 +196,18 @@ def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
 
 @kernel()
 def _grow_seed(growth: _Growth, seed: int) -> int:
-    """Absorb each set that meets the seed's cameras a second time; return the work done.
+    """Absorb each set that meets the seed's nodes a second time; return the work done.
 
-    A set larger than what has been grow_sets so far is not searched for cameras that it shares with
+    A set larger than what has grown so far is not searched for nodes that it shares with
     others, which bounds the work of small seeds beside large sets.
     """
     work = 0
     tail = _absorb(growth, seed, seed, 0)
     head = 0
     while head < tail:
-        camera = growth.queue[head]
+        node = growth.queue[head]
         head += 1
-        for s in range(growth.back_start[camera], growth.back_start[camera + 1]):
+        for s in range(growth.back_start[node], growth.back_start[node + 1]):
             b = growth.rigid_sets[s]
             work += 1
             if growth.taken[b] == seed:
@@ -214,27 +217,27 @@ def _grow_seed(growth: _Growth, seed: int) -> int:
                 tail = _absorb(growth, seed, b, tail)
             elif size <= tail:
                 work += size
-                tail = _reach_out(growth, seed, b, camera, tail)
+                tail = _reach_out(growth, seed, b, node, tail)
             growth.met[b] = seed
     return work
 
 
 @kernel()
-def _reach_out(growth: _Growth, seed: int, b: int, camera: int, tail: int) -> int:
-    """Mark the cameras of a set that meets the seed at `camera`; absorb it if that closes a triangle.
+def _reach_out(growth: _Growth, seed: int, b: int, node: int, tail: int) -> int:
+    """Mark the nodes of a set that meets the seed at `node`; absorb it if that closes a triangle.
 
     The triangle is the seed, this set, and one that meets the seed elsewhere and this set outside.
-    Two sets that meet the seed at the same camera, and each other outside, share two cameras.
+    Two sets that meet the seed at the same node, and each other outside, share two nodes.
     """
     for s in range(growth.start[b], growth.start[b + 1]):
-        other = growth.cameras[s]
+        other = growth.nodes[s]
         if growth.inside[other] == seed:
             continue
         if growth.reached[other] != seed:
             growth.reached[other] = seed
             growth.reached_by[other] = b
-            growth.reached_at[other] = camera
-        elif growth.reached_at[other] == camera:
+            growth.reached_at[other] = node
+        elif growth.reached_at[other] == node:
             unite(growth.parent, growth.reached_by[other], b)
         else:
             tail = _absorb(growth, seed, growth.reached_by[other], tail)
@@ -244,14 +247,14 @@ def _reach_out(growth: _Growth, seed: int, b: int, camera: int, tail: int) -> in
 
 @kernel()
 def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
-    """Unite a set with the seed and queue the cameras that it brings; return the queue's new tail."""
+    """Unite a set with the seed and queue the nodes that it brings; return the queue's new tail."""
     if growth.taken[eaten] == seed:
         return tail
     growth.taken[eaten] = seed
     unite(growth.parent, seed, eaten)
     for s in range(growth.start[eaten], growth.start[eaten + 1]):
-        if growth.inside[growth.cameras[s]] != seed:
-            growth.inside[growth.cameras[s]] = seed
-            growth.queue[tail] = growth.cameras[s]
+        if growth.inside[growth.nodes[s]] != seed:
+            growth.inside[growth.nodes[s]] = seed
+            growth.queue[tail] = growth.nodes[s]
             tail += 1
     return tail

@@ -13,8 +13,11 @@ from sfm_shapefit.rigidity.game import contract, play
 from sfm_shapefit.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.viewgraph import ViewGraph
 
-_FIRST_GAME_CAMERAS = 500  # a pebble game of this size takes milliseconds
-_FEW_LINKS = 6  # per camera: twice what rigidity needs in space, and mostly enough where pairs abound
+# A pebble game on so many nodes takes milliseconds.
+_FIRST_GAME_NODES = 500
+
+# So many pairs per node are twice what rigidity needs in space, and mostly enough where pairs abound.
+_FEW_LINKS = 6
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,40 +29,40 @@ class RigidPiece:
     edges: IntArray
     """Indices of its pairs in the graph's `edges`, ascending."""
     hinges: IntArray
-    """Those of its nodes that also belong to another piece of at least 3 cameras, ascending."""
+    """Those of its nodes that also belong to another piece of at least 3 nodes, ascending."""
 
 
 def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return the rigid piece of each pair, for positions in general position.
 
     The contraction is exact: a motion of the whole is one translation and scale per set, equal where
-    sets share a camera. A frame on the b shared cameras w_0, w_1, ... of a set (d - 1 copies of
+    sets share a node. A frame on the b shared nodes w_0, w_1, ... of a set (d - 1 copies of
     each w_0 w_k, one of each w_1 w_k, k > 1) admits the same motions there: it has d b - (d + 1)
-    copies, and it is independent, since each w_k adds d copies, at most d - 1 of them to one camera.
+    copies, and it is independent, since each w_k adds d copies, at most d - 1 of them to one node.
 
     Args:
         num_nodes: n.
-        edges: (m, 2) camera indices in [0, n), no self-loops.
+        edges: (m, 2) node indices in [0, n), no self-loops.
         dimension: d >= 2.
 
     Returns:
-        (m,) labels. Piece 0 has the most cameras; then come more edges, then the smaller first
-        camera, then the smaller second one, so labels do not depend on the order of `edges`. A pair
+        (m,) labels. Piece 0 has the most nodes; then come more edges, then the smaller first
+        node, then the smaller second one, so labels do not depend on the order of `edges`. A pair
         that belongs to nothing larger is a piece of its own.
 
     Raises:
         InputError: if an edge is a self-loop or out of range, or `dimension` is below 2.
     """
-    edges = _checked_edges(num_nodes, edges, dimension)
+    edges = _check_edges(num_nodes, edges, dimension)
     set_of = compact(triangle_sets(num_nodes, edges))
     set_of = grow_sets(num_nodes, edges, set_of)
-    part = _FIRST_GAME_CAMERAS
+    part = _FIRST_GAME_NODES
     while True:
         game = contract(num_nodes, edges, set_of, part, dimension)
         united, is_settled = play(game, dimension)
         set_of = united[set_of]
         if is_settled and game.is_whole:
-            return _ranked(num_nodes, edges, set_of)
+            return _rank(num_nodes, edges, set_of)
         if set_of.max() + 1 < game.num_sets:
             set_of = grow_sets(num_nodes, edges, set_of)
         if is_settled:
@@ -67,23 +70,23 @@ def parallel_rigid_pieces(num_nodes: int, edges: IntArray, dimension: int) -> In
 
 
 def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
-    """Return whether the pairs fix all n cameras up to one translation and one scale, generically.
+    """Return whether the pairs fix all n nodes up to one translation and one scale, generically.
 
-    A single camera without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
+    A single node without pairs is rigid; arguments and errors as in `parallel_rigid_pieces`.
     """
-    checked = _checked_edges(num_nodes, edges, dimension)
+    checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
         graph = adjacency(num_nodes, checked)
         if _grows_from_first_pair(checked, graph.pointers, graph.neighbours):
             return True
     few = checked[_among_first_links(num_nodes, checked, _FEW_LINKS)]
     if 2 * len(few) <= len(checked) and _is_one_piece(num_nodes, few, dimension):
-        return True  # more pairs only hold the cameras faster; the search takes memory by the pair
+        return True  # more pairs only hold the nodes faster; the search takes memory by the pair
     return _is_one_piece(num_nodes, checked, dimension)
 
 
 def _is_one_piece(num_nodes: int, edges: IntArray, dimension: int) -> bool:
-    """Return whether the checked pairs are one rigid piece, and touch every camera."""
+    """Return whether the checked pairs are one rigid piece, and touch every node."""
     label = parallel_rigid_pieces(num_nodes, edges, dimension)
     if len(label) == 0:
         return num_nodes == 1
@@ -96,21 +99,21 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
     if len(label) == 0:
         return []
     num_pieces = int(label.max()) + 1
-    start, cameras, _, _ = incidence(graph.num_nodes, graph.edges, label, num_pieces)
+    start, nodes, _, _ = incidence(graph.num_nodes, graph.edges, label, num_pieces)
     owner = np.repeat(np.arange(num_pieces), np.diff(start))
-    cameras = cameras[np.lexsort((cameras, owner))]
+    nodes = nodes[np.lexsort((nodes, owner))]
 
     is_large = np.diff(start)[owner] >= 3
-    large_at = np.bincount(cameras[is_large], minlength=graph.num_nodes)
-    is_hinge = large_at[cameras] - is_large > 0
+    large_at = np.bincount(nodes[is_large], minlength=graph.num_nodes)
+    is_hinge = large_at[nodes] - is_large > 0
 
     edge_order = np.argsort(label, kind="stable").astype(np.int64)
     edge_start = np.searchsorted(label[edge_order], np.arange(num_pieces + 1))
     return [
         RigidPiece(
-            nodes=frozen(cameras[start[k] : start[k + 1]]),
+            nodes=frozen(nodes[start[k] : start[k + 1]]),
             edges=frozen(edge_order[edge_start[k] : edge_start[k + 1]]),
-            hinges=frozen(cameras[start[k] : start[k + 1]][is_hinge[start[k] : start[k + 1]]]),
+            hinges=frozen(nodes[start[k] : start[k + 1]][is_hinge[start[k] : start[k + 1]]]),
         )
         for k in range(num_pieces)
     ]
@@ -118,9 +121,9 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
 
 @kernel()
 def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbours: Int32Array) -> bool:
-    """Return whether the first pair grows to all cameras by cameras that are joined to two of its own.
+    """Return whether the first pair grows to all nodes by nodes that are joined to two of its own.
 
-    Sufficient for rigidity, and linear in the pairs: each such camera has 2 (d - 1) >= d new copies of edges.
+    Sufficient for rigidity, and linear in the pairs: each such node has 2 (d - 1) >= d new copies of edges.
     """
     num_nodes = len(start) - 1
     links = np.zeros(num_nodes, dtype=np.int64)
@@ -130,21 +133,21 @@ def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbours: Int32Ar
     links[members[0]] = links[members[1]] = 2
     size, done = 2, 0
     while done < size:
-        camera = members[done]
+        node = members[done]
         done += 1
-        for p in range(start[camera], start[camera + 1]):
+        for p in range(start[node], start[node + 1]):
             other = neighbours[p]
-            links[other] += last[other] != camera
-            if links[other] == 2 and last[other] != camera:
+            links[other] += last[other] != node
+            if links[other] == 2 and last[other] != node:
                 members[size] = other
                 size += 1
-            last[other] = camera
+            last[other] = node
     return bool(size == num_nodes)
 
 
 @kernel()
 def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
-    """Return which pairs are among the first `few` kept at one of their cameras, at least, (m,)."""
+    """Return which pairs are among the first `few` kept at one of their nodes, at least, (m,)."""
     kept = np.zeros(num_nodes, dtype=np.int64)
     is_kept = np.zeros(len(edges), dtype=np.bool_)
     for e in range(len(edges)):
@@ -156,7 +159,7 @@ def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray
     return is_kept
 
 
-def _checked_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
+def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
@@ -172,7 +175,7 @@ def _checked_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
 
 @kernel()
 def _first_bad_edge(num_nodes: int, edges: IntArray) -> int:
-    """Return the first pair that leaves the cameras or joins one with itself; the number of pairs if none."""
+    """Return the first pair that leaves the nodes or joins one with itself; the number of pairs if none."""
     for e in range(len(edges)):
         i, j = edges[e, 0], edges[e, 1]
         if i == j or min(i, j) < 0 or max(i, j) >= num_nodes:
@@ -180,16 +183,16 @@ def _first_bad_edge(num_nodes: int, edges: IntArray) -> int:
     return len(edges)
 
 
-def _ranked(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
-    """Renumber final pieces: more cameras, more edges, smaller first, smaller second camera first."""
+def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
+    """Renumber final pieces: more nodes, more edges, smaller first, smaller second node first."""
     if len(set_of) == 0:
         return set_of
     num_sets = int(set_of.max()) + 1
-    start, cameras, _, _ = incidence(num_nodes, edges, set_of, num_sets)
+    start, nodes, _, _ = incidence(num_nodes, edges, set_of, num_sets)
     num_edges = np.bincount(set_of, minlength=num_sets)
-    smallest = np.minimum.reduceat(cameras, start[:-1])
+    smallest = np.minimum.reduceat(nodes, start[:-1])
     owner = np.repeat(np.arange(num_sets), np.diff(start))
-    others = np.where(cameras == smallest[owner], num_nodes, cameras)
+    others = np.where(nodes == smallest[owner], num_nodes, nodes)
     second = np.minimum.reduceat(others, start[:-1])  # two pieces never share both
     order = np.lexsort((second, smallest, -num_edges, -np.diff(start)))
     rank = np.empty(num_sets, dtype=np.int64)

@@ -26,7 +26,7 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
     degree = graph.degrees()
     component = graph.components()
     main = component[pieces[0].nodes[0]] if pieces else -1
-    neighbour = _a_neighbour(graph)
+    neighbour = _a_neighbor(graph)
     home = _large_piece_of(graph.num_nodes, pieces)
 
     reasons: dict[int, str] = {}
@@ -48,8 +48,8 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
     return reasons
 
 
-def _a_neighbour(graph: ViewGraph) -> IntArray:
-    """Return one neighbour of each camera (n,), -1 without any: the neighbour where there is one only."""
+def _a_neighbor(graph: ViewGraph) -> IntArray:
+    """Return one neighbor of each camera (n,), -1 without any: the neighbor where there is one only."""
     neighbour = np.full(graph.num_nodes, -1, dtype=np.int64)
     neighbour[graph.edges[:, 0]] = graph.edges[:, 1]
     neighbour[graph.edges[:, 1]] = graph.edges[:, 0]

@@ -14,7 +14,7 @@ photographed (`make_rendered_scene`), and bare graphs of directions (`random_gra
     problem = random_graph_problem(50, p=0.5, sigma=0.01, q=0.2)
     problem.view_graph, problem.locations, problem.corrupted
 
-`sfm_shapefit.synthetic.workspace` and `.photographs` write scenes as COLMAP workspaces, and
+`sfm_shapefit.synthetic.workspace` and `.rendered_workspace` write scenes as COLMAP workspaces, and
 `sfm_shapefit.synthetic.fixtures` is a pytest plugin with all of these as fixtures, and with comparisons.
 The same options give the same values on every run.
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic.graphs import (
         Corruption,
         GraphProblem,
+        Noise,
         box_graph_problem,
         community_graph_problem,
         corridor_graph_problem,
@@ -54,6 +55,7 @@ _HOMES = {
     "graphs": (
         "Corruption",
         "GraphProblem",
+        "Noise",
         "box_graph_problem",
         "community_graph_problem",
         "corridor_graph_problem",
@@ -81,6 +83,7 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 __all__ = [
     "Corruption",
     "GraphProblem",
+    "Noise",
     "RenderOptions",
     "RenderedScene",
     "RigScene",

@@ -38,7 +38,7 @@ What there is:
 
 Scenes and graphs are values that nobody changes: they are made once per session for the same arguments.
 Workspaces are folders of your own, in the test's `tmp_path`. Everything is the same on every run; another
-`seed` makes another one. COLMAP's images are named `0001.jpg` and so on; one unit is a metre.
+`seed` makes another one. COLMAP's images are named `0001.jpg` and so on; one unit is a meter.
 
 This module needs pytest, and no part of the package imports it.
 """
@@ -108,8 +108,8 @@ def assert_reconstruction_near(
 
     Args:
         found, truth: reconstructions or model folders.
-        max_error: of any placed camera's centre, in units of the truth.
-        max_median_error: of the median placed camera's centre, in units of the truth.
+        max_error: of any placed camera's center, in units of the truth.
+        max_median_error: of the median placed camera's center, in units of the truth.
         max_rotation_error_deg: of any placed camera's rotation.
         min_placed: the fraction of the true cameras that must be placed.
 
@@ -147,7 +147,7 @@ def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: fl
 
     Args:
         found, truth: (n, d).
-        max_error: the paper's relative error: both centred and scaled to Frobenius norm 1, the norm of
+        max_error: the paper's relative error: both centered and scaled to Frobenius norm 1, the norm of
             their difference.
 
     Raises:
@@ -231,7 +231,7 @@ def workspace_of(tmp_path: Path) -> WorkspaceMaker:
 
     def workspace(scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path:
         from sfm_shapefit.synthetic import Scene
-        from sfm_shapefit.synthetic.photographs import write_rendered_workspace
+        from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
         from sfm_shapefit.synthetic.workspace import write_workspace
 
         folder = tmp_path / f"workspace{len(list(tmp_path.glob('workspace*'))) + 1}"

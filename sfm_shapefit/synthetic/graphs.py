@@ -12,7 +12,7 @@ and long chains, where errors add up:
     lawn         strips flown back and forth
     corridor     a corridor with five side branches, no loops
 
-Each direction is the true one plus sigma times a random unit vector, normalised, or with probability q a
+Each direction is the true one plus sigma times a random unit vector, normalized, or with probability q a
 wrong one. What wrong directions are like is the corruption:
 
     uniform           each a uniformly random unit vector: the model of the theorems
@@ -28,7 +28,7 @@ Source of the random model: Hand, Lee, Voroninski (2015), arXiv 1506.01437, sect
 """
 
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, TypedDict, Unpack, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -39,6 +39,19 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 Seed = int | np.random.Generator
 Corruption = Literal["uniform", "self-consistent", "concentrated"]
+
+
+class Noise(TypedDict, total=False):
+    """What is wrong with the directions, and the draws; all that is not given is 0, or uniform."""
+
+    sigma: float
+    """Size of the noise of the directions that are not corrupted."""
+    q: float
+    """Probability that a direction is a wrong one."""
+    seed: Seed
+    """An integer, or a Generator to draw from."""
+    corruption: Corruption
+    """What wrong directions are like."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -66,10 +79,7 @@ def random_graph_problem(
     n: int,
     p: float = 0.5,
     d: int = 3,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return the random model of the paper: locations N(0, I_d), an Erdos-Renyi graph G(n, p).
 
@@ -77,64 +87,53 @@ def random_graph_problem(
         n: number of locations.
         p: probability of each pair.
         d: dimension, at least 2.
-        sigma: size of the noise of the directions that are not corrupted.
-        q: probability that a direction is a wrong one.
-        seed: an integer, or a Generator to draw from.
-        corruption: what wrong directions are like; the other families take it as well.
+        noise: `sigma`, `q`, `seed` and `corruption`, see `Noise`; the other families take them as well.
 
     Source: Hand, Lee, Voroninski (2015), section 4.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     locations = rng.standard_normal((n, d))
     i, j = np.triu_indices(n, k=1)
     present = rng.random(len(i)) < p
     edges = np.stack([i[present], j[present]], axis=1).astype(np.int64)
-    return _measured(locations, edges, sigma, q, rng, corruption)
+    return _measure(locations, edges, rng, noise)
 
 
 def expander_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return locations N(0, I) and n degree / 2 pairs drawn uniformly; repeated draws are merged."""
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     locations = rng.standard_normal((n, 3))
     i, j = rng.integers(n, size=(2, round(n * degree / 2.0)))
-    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
+    return _measure(locations, _unique_pairs(i, j), rng, noise)
 
 
 def box_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
 
-    The model of an area mapped from a drone. About degree / 1.25 neighbours are taken, because the union of
-    the neighbourhoods is larger than each of them.
+    The model of an area mapped from a drone. About degree / 1.25 neighbors are taken, because the union of
+    the neighborhoods is larger than each of them.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
     neighbours = _nearest(locations, round(degree / 1.25))
     camera = np.repeat(np.arange(n), neighbours.shape[1])
-    return _measured(locations, _unique_pairs(camera, neighbours.ravel()), sigma, q, rng, corruption)
+    return _measure(locations, _unique_pairs(camera, neighbours.ravel()), rng, noise)
 
 
 def trajectory_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    *,
     speed_ratio: float = 1.0,
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
 
@@ -142,7 +141,7 @@ def trajectory_graph_problem(
     varies smoothly, three times up and down, by the factor `speed_ratio`: equal steps are a cue that methods
     with a bound on each length profit from by chance.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     heading = np.cumsum(0.15 * rng.standard_normal(n))
     steps = np.stack([np.cos(heading), np.sin(heading), 0.2 * rng.standard_normal(n)], axis=1)
     steps *= _speeds(n, speed_ratio)[:, None]
@@ -152,22 +151,19 @@ def trajectory_graph_problem(
     closing = rng.integers(n, size=len(i) // 50)
     closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
     edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
-    return _measured(locations, edges, sigma, q, rng, corruption)
+    return _measure(locations, edges, rng, noise)
 
 
 def ring_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return cameras round a circle, a step of 1 apart, each joined to the next degree / 2, and 5 far links.
 
     The model of a walk round a large building.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     angle = 2.0 * np.pi * np.arange(n) / n
     circle = np.stack([np.cos(angle), np.sin(angle), np.zeros(n)], axis=1) * n / (2.0 * np.pi)
     locations = circle + 0.3 * rng.standard_normal((n, 3))
@@ -177,22 +173,19 @@ def ring_graph_problem(
     far = rng.integers(n, size=5)
     across = (far + rng.integers(n // 4, max(n - n // 4, n // 4 + 1), size=5)) % n
     edges = _unique_pairs(np.concatenate([i, far]), np.concatenate([j, across]))
-    return _measured(locations, edges, sigma, q, rng, corruption)
+    return _measure(locations, edges, rng, noise)
 
 
 def lawn_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return strips of 50 cameras, each joined to the next degree / 4 along and to as many across.
 
     The model of an area mapped strip by strip with little overlap. Strips are 3 steps apart.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     strip, place = np.divmod(np.arange(n), 50)
     locations = np.stack([place, 3.0 * strip, np.zeros(n)], axis=1) + 0.2 * rng.standard_normal((n, 3))
     reach = max(round(degree / 4.0), 1)
@@ -205,23 +198,20 @@ def lawn_graph_problem(
         pairs.append(np.stack([across, across + 50 + shift], axis=1))
     i, j = np.concatenate(pairs).T
     edges = _unique_pairs(i[j < n], j[j < n])
-    return _measured(locations, edges, sigma, q, rng, corruption)
+    return _measure(locations, edges, rng, noise)
 
 
 def corridor_graph_problem(
     n: int,
     degree: float = 20.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return a corridor of about n / 2 cameras with 5 side branches.
 
     The model of a building's inside. Cameras within degree / 2 steps of one another are joined. Nothing
     closes a loop: each branch hangs on its junction.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     length = n // 10
     main = n - 5 * length
     walks = [_walk(np.zeros(2), 0.0, main, rng)]
@@ -241,7 +231,7 @@ def corridor_graph_problem(
         i, j = np.nonzero(steps <= reach)
         pairs.append(np.stack([i + first, j], axis=1))
     i, j = np.concatenate(pairs).T
-    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
+    return _measure(locations, _unique_pairs(i, j), rng, noise)
 
 
 def _walk(start: FloatArray, heading: float, n: int, rng: np.random.Generator) -> FloatArray:
@@ -269,19 +259,16 @@ def _next_ones(n: int, degree: float) -> tuple[IntArray, IntArray]:
 def community_graph_problem(
     n: int,
     degree: float = 30.0,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
-    Locations are N(0, I) around centres N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
+    Locations are N(0, I) around centers N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
     cluster, 7 % those of a cluster and one of its 3 nearest; ends are drawn with power-law weights
     (1 - u)^(-1/2), at most 50. A backbone joins each camera with the next 4. Repeated draws are merged, so
     that the mean degree stays somewhat below `degree`.
     """
-    rng = np.random.default_rng(seed)
+    rng = _rng(noise)
     num_clusters = max(round(n / 400), 1)
     cluster_centers = rng.standard_normal((num_clusters, 3)) * [10.0, 10.0, 1.0]
     cluster = np.sort(rng.integers(num_clusters, size=n))
@@ -303,30 +290,25 @@ def community_graph_problem(
     backbone = [(np.arange(n - step), np.arange(step, n)) for step in range(1, min(5, n))]
     i = np.concatenate([i, *(a for a, _ in backbone)])
     j = np.concatenate([j, *(b for _, b in backbone)])
-    return _measured(locations, _unique_pairs(i, j), sigma, q, rng, corruption)
+    return _measure(locations, _unique_pairs(i, j), rng, noise)
 
 
 def measured_problem(
     locations: FloatArray,
     edges: IntArray,
-    sigma: float = 0.0,
-    q: float = 0.0,
-    seed: Seed = 0,
-    corruption: Corruption = "uniform",
+    **noise: Unpack[Noise],
 ) -> GraphProblem:
     """Return directions between given locations (n, d) along given pairs (m, 2)."""
-    return _measured(locations, edges, sigma, q, np.random.default_rng(seed), corruption)
+    return _measure(locations, edges, _rng(noise), noise)
 
 
-def _measured(
-    locations: FloatArray,
-    edges: IntArray,
-    sigma: float,
-    q: float,
-    rng: np.random.Generator,
-    corruption: Corruption,
-) -> GraphProblem:
+def _rng(noise: Noise) -> np.random.Generator:
+    return np.random.default_rng(noise.get("seed", 0))
+
+
+def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, noise: Noise) -> GraphProblem:
     """Return the directions of `edges` with noise and corruption."""
+    sigma, q, corruption = noise.get("sigma", 0.0), noise.get("q", 0.0), noise.get("corruption", "uniform")
     if corruption not in get_args(Corruption):
         raise ValueError(f"corruption must be one of {', '.join(get_args(Corruption))}, got {corruption!r}")
 

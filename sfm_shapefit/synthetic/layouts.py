@@ -1,6 +1,6 @@
 """Where the cameras of a synthetic scene stand, and which surface points lie before them, for each shape.
 
-World axes: z is up; one unit is a metre. Every surface is convex towards its cameras, so that which way a
+World axes: z is up; one unit is a meter. Every surface is convex towards its cameras, so that which way a
 point faces also decides whether it is hidden.
 """
 
@@ -25,7 +25,7 @@ class Layout:
     """Surfaces and cameras, before any photograph."""
 
     centers: FloatArray
-    """(n, 3) camera centres."""
+    """(n, 3) camera centers."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world."""
     points: FloatArray
@@ -49,7 +49,7 @@ def _ring(n: int, p: int, rng: np.random.Generator) -> Layout:
         rotations=looking_along(target - centers),
         points=outward * rng.uniform(1.35, 1.45, (p, 1)),
         normals=outward,
-        colors=_checkered(4.0 * longitude, 6.0 * outward[:, 2], (214, 96, 77), (247, 224, 190), rng),
+        colors=_draw_board(4.0 * longitude, 6.0 * outward[:, 2], (214, 96, 77), (247, 224, 190), rng),
     )
 
 
@@ -66,8 +66,8 @@ def _facade(n: int, p: int, rng: np.random.Generator) -> Layout:
         centers=centers,
         rotations=looking_along(forward),
         points=np.stack([along, rng.uniform(-0.5, 0.5, p), height], axis=1),
-        normals=_tilted(np.broadcast_to([0.0, -1.0, 0.0], (p, 3)), rng),
-        colors=_checkered(along / 1.5, height / 1.5, (205, 170, 125), (92, 107, 130), rng),
+        normals=_tilt(np.broadcast_to([0.0, -1.0, 0.0], (p, 3)), rng),
+        colors=_draw_board(along / 1.5, height / 1.5, (205, 170, 125), (92, 107, 130), rng),
     )
 
 
@@ -87,13 +87,13 @@ def _drive(n: int, p: int, rng: np.random.Generator) -> Layout:
     points = foot + lateral[:, None] * across
     points[:, 2] = height
     normals = np.where(on_ground[:, None], [0.0, 0.0, 1.0], -side[:, None] * across)
-    walls = _checkered(along / 2.0, height / 1.5, (188, 143, 110), (84, 96, 112), rng)
-    asphalt = _checkered(along / 3.0, lateral / 3.0, (96, 96, 96), (120, 120, 118), rng)
+    walls = _draw_board(along / 2.0, height / 1.5, (188, 143, 110), (84, 96, 112), rng)
+    asphalt = _draw_board(along / 3.0, lateral / 3.0, (96, 96, 96), (120, 120, 118), rng)
     return Layout(
         centers=centers,
         rotations=looking_along(ahead + 0.02 * rng.standard_normal((n, 3))),
         points=points,
-        normals=_tilted(normals, rng),
+        normals=_tilt(normals, rng),
         colors=np.where(on_ground[:, None], asphalt, walls),
     )
 
@@ -117,7 +117,7 @@ def _cloud(n: int, p: int, rng: np.random.Generator) -> Layout:
         rotations=looking_along(target - centers, up=rng.standard_normal((n, 3))),
         points=points,
         normals=normalized(rng.standard_normal((p, 3))),
-        colors=_checkered(points[:, 0], points[:, 1] + points[:, 2], (67, 147, 195), (244, 165, 130), rng),
+        colors=_draw_board(points[:, 0], points[:, 1] + points[:, 2], (67, 147, 195), (244, 165, 130), rng),
     )
 
 
@@ -139,13 +139,13 @@ def _courtyard(n: int, p: int, rng: np.random.Generator) -> Layout:
     depth = np.sum(flat * normals, axis=1)
     points = flat + (-surface + relief - depth)[:, None] * normals
     along = np.where(wall < 2, flat[:, 0], flat[:, 1])
-    bricks = _checkered(along / 1.5, flat[:, 2] / 1.5, (178, 102, 78), (226, 205, 170), rng)
-    paving = _checkered(flat[:, 0] / 2.0, flat[:, 1] / 2.0, (128, 128, 120), (150, 150, 140), rng)
+    bricks = _draw_board(along / 1.5, flat[:, 2] / 1.5, (178, 102, 78), (226, 205, 170), rng)
+    paving = _draw_board(flat[:, 0] / 2.0, flat[:, 1] / 2.0, (128, 128, 120), (150, 150, 140), rng)
     return Layout(
         centers=centers,
         rotations=looking_along(forward),
         points=points,
-        normals=_tilted(normals, rng),
+        normals=_tilt(normals, rng),
         colors=np.where((wall == 4)[:, None], paving, bricks),
     )
 
@@ -160,7 +160,7 @@ LAYOUTS: dict[Shape, Callable[[int, int, np.random.Generator], Layout]] = {
 """By shape: (number of images, number of points, generator) -> layout."""
 
 
-def turned_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:
+def turn_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Generator) -> FloatArray:
     """Return the rotations (n, 3, 3) after small random turns, N(0, sigma^2) about each camera axis."""
     from scipy.spatial.transform import Rotation
 
@@ -182,19 +182,19 @@ def looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArr
     return np.stack([right, np.cross(ahead, right), ahead], axis=1)
 
 
-def _tilted(normals: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _tilt(normals: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Return unit normals (p, 3) tilted at random by about 15 degrees: masonry is not a mirror."""
     return normalized(normals + 0.2 * rng.standard_normal(normals.shape))
 
 
-def _checkered(
+def _draw_board(
     u: FloatArray,
     v: FloatArray,
     light: tuple[int, int, int],
     dark: tuple[int, int, int],
     rng: np.random.Generator,
 ) -> ByteArray:
-    """Return colours (p, 3) of a board with unit fields at texture coordinates u, v, with some grain."""
+    """Return colors (p, 3) of a board with unit fields at texture coordinates u, v, with some grain."""
     odd = (np.floor(u) + np.floor(v)) % 2.0 == 1.0
     grain = rng.integers(-8, 9, size=(len(u), 1))
     return np.asarray(np.clip(np.where(odd[:, None], dark, light) + grain, 0, 255), dtype=np.uint8)

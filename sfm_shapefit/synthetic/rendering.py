@@ -16,7 +16,7 @@ is right. Source of the projection: Olano and Greer, Triangle scan conversion us
 coordinates (1997).
 
 Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner,
-so that the first pixel's centre is (0.5, 0.5).
+so that the first pixel's center is (0.5, 0.5).
 """
 
 from dataclasses import dataclass
@@ -28,14 +28,18 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, turned_at_random
+from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, turn_at_random
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
-_SAMPLES = 2  # along either side of a pixel
-_RAY_SLACK = 1e-6  # far below the spacing of rays, far above rounding
-_NEAREST_DEPTH_M = 0.05  # a triangle that comes nearer than this is drawn without bounds
-_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))  # at the horizon and above: too smooth for features
+# A pixel has so many samples along either side.
+_SAMPLES = 2
+# This is far below the spacing of rays, and far above rounding.
+_RAY_SLACK = 1e-6
+# A triangle that comes nearer than this is drawn without bounds.
+_NEAREST_DEPTH_M = 0.05
+# These are the colors at the horizon and above: too smooth for features.
+_SKY = ((200.0, 214.0, 235.0), (120.0, 158.0, 216.0))
 _OF_POINTS_ONLY = (
     "num_points",
     "pixel_noise_px",
@@ -57,7 +61,7 @@ class RenderedScene:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world, true."""
     centers: FloatArray
-    """(n, 3) camera centres, true."""
+    """(n, 3) camera centers, true."""
     stated_rotations: FloatArray
     """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     surfaces: Surfaces
@@ -98,7 +102,7 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
         render=render,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turned_at_random(layout.rotations, np.radians(options.rotation_noise_deg), rngs[5]),
+        stated_rotations=turn_at_random(layout.rotations, np.radians(options.rotation_noise_deg), rngs[5]),
         surfaces=make_surfaces(options.shape, options.num_images, render.repeated_fraction, surface_rng),
     )
     _refuse_folding(scene)
@@ -112,7 +116,7 @@ def draw_image(scene: RenderedScene, image: int) -> ByteArray:
     """
     rng = np.random.default_rng([scene.options.seed, 2, image])
     rays = _sample_rays(scene)
-    samples = _shaded(scene, image, rays)
+    samples = _shade(scene, image, rays)
     height, width = scene.options.image_height, scene.options.image_width
     pixels = samples.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
     pixels *= 1.0 + scene.render.exposure_spread * rng.standard_normal()
@@ -120,7 +124,7 @@ def draw_image(scene: RenderedScene, image: int) -> ByteArray:
     return np.asarray(np.clip(np.rint(pixels), 0.0, 255.0), dtype=np.uint8)
 
 
-def encoded_image(scene: RenderedScene, image: int) -> bytes:
+def encode_image(scene: RenderedScene, image: int) -> bytes:
     """Return one photograph as the content of a JPEG file."""
     bgr = np.ascontiguousarray(draw_image(scene, image)[:, :, ::-1])
     done, data = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, scene.render.jpeg_quality])
@@ -131,7 +135,7 @@ def encoded_image(scene: RenderedScene, image: int) -> bytes:
 
 def surface_points(scene: RenderedScene, image: int, xy: FloatArray) -> FloatArray:
     """Return the (k, 3) points in world axes that pixels (k, 2) of an image show; NaN where it is sky."""
-    rays = _undistorted(scene, xy).reshape(1, -1, 2)
+    rays = _undistort(scene, xy).reshape(1, -1, 2)
     inverse, kept = _inverse_corners(scene, image)
     bounds = np.tile(np.array([0, 1, 0, rays.shape[1]], dtype=np.int64), (len(kept), 1))
     triangle, inverse_depth = _nearest_triangles(rays, inverse, bounds)
@@ -182,7 +186,7 @@ def _refuse_folding(scene: RenderedScene) -> None:
 # --- rays and triangles ------------------------------------------------------------------------------------
 
 
-def _undistorted(scene: RenderedScene, xy: FloatArray) -> FloatArray:
+def _undistort(scene: RenderedScene, xy: FloatArray) -> FloatArray:
     """Return the (k, 2) rays (x, y, 1) in camera axes of distorted pixels (k, 2)."""
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-12)
     pixels = np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 1, 2)
@@ -198,7 +202,7 @@ def _sample_rays(scene: RenderedScene) -> FloatArray:
     y, x = np.meshgrid(
         (np.arange(rows) + 0.5) / _SAMPLES, (np.arange(columns) + 0.5) / _SAMPLES, indexing="ij"
     )
-    return _undistorted(scene, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(rows, columns, 2)
+    return _undistort(scene, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(rows, columns, 2)
 
 
 def _inverse_corners(scene: RenderedScene, image: int) -> tuple[FloatArray, IntArray]:
@@ -260,11 +264,11 @@ def _nearest_triangles(
     return nearest, inverse_depth
 
 
-# --- colours -----------------------------------------------------------------------------------------------
+# --- colors -----------------------------------------------------------------------------------------------
 
 
-def _shaded(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np.float32]:
-    """Return the colours (rows, columns, 3) of the samples of an image, 0 to 255."""
+def _shade(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np.float32]:
+    """Return the colors (rows, columns, 3) of the samples of an image, 0 to 255."""
     inverse, kept = _inverse_corners(scene, image)
     nearest, _ = _nearest_triangles(rays, inverse, _bounds(scene, image, kept, rays))
     pyramid, levels = _mipmaps(scene.surfaces.textures)
@@ -323,7 +327,7 @@ def _paint(
     pyramid: ByteArray,
     levels: IntArray,
 ) -> None:
-    """Write the colour of each sample that shows a triangle."""
+    """Write the color of each sample that shows a triangle."""
     rows, columns = nearest.shape
     for r in range(rows):
         for c in range(columns):
@@ -358,7 +362,7 @@ def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float,
 
 @kernel(exact=True)
 def _bilinear(pyramid: ByteArray, levels: IntArray, level: int, u: float, v: float, channel: int) -> float:
-    """Return one colour of a picture that repeats for ever, at a position in pixels of its first level."""
+    """Return one color of a picture that repeats for ever, at a position in pixels of its first level."""
     offset, height, width = levels[level, 0], levels[level, 1], levels[level, 2]
     x = u * width / levels[0, 2] - 0.5
     y = v * height / levels[0, 1] - 0.5

@@ -56,7 +56,7 @@ def rig_model(
         rigs: the scene.
         camera: whose intrinsics all have.
         images: in the order of the scene, with their cameras' ids.
-        centers: (f, 3) centres of the frames.
+        centers: (f, 3) centers of the frames.
     """
     model = pycolmap.Reconstruction()
     cameras, made = new_rigs(rigs, camera)

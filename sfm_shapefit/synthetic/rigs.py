@@ -20,8 +20,10 @@ from sfm_shapefit.synthetic.scenes import Scene, scene_of
 
 NUM_RIGS, NUM_SENSORS = 2, 3
 
-_STEP_M = 1.5  # between two frames of a vehicle
-_YAW_DEG = np.array([0.0, 40.0, -40.0])  # to the left of ahead
+# Two frames of a vehicle are so far apart.
+_STEP_M = 1.5
+# Angles count to the left of ahead.
+_YAW_DEG = np.array([0.0, 40.0, -40.0])
 _OFFSETS_M = np.array(
     [
         [[0.0, 0.0, 0.0], [-0.8, 0.1, -0.3], [0.8, 0.1, -0.3]],
@@ -46,7 +48,7 @@ class RigScene:
     sensor_rotations: FloatArray
     """(rigs, sensors, 3, 3) sensor_from_rig."""
     sensor_centers: FloatArray
-    """(rigs, sensors, 3) of each sensor in its rig, in metres; 0 for the reference."""
+    """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
 
 
 def make_rig_drive(options: SceneOptions) -> RigScene:
@@ -93,7 +95,7 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
 def _frames(
     num_frames: int, rig_of_frame: IntArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rig_from_world rotations (f, 3, 3) and centres (f, 3) of the frames along the street."""
+    """Return rig_from_world rotations (f, 3, 3) and centers (f, 3) of the frames along the street."""
     at = _STEP_M / NUM_RIGS * np.arange(num_frames)
     road, ahead, left = street(at)
     centers = road + (_LANES_M[rig_of_frame] + 0.1 * rng.standard_normal(num_frames))[:, None] * left

@@ -12,7 +12,7 @@ constraint of the true relative rotation and of a baseline that does not exist, 
 gives it away. Its second image gets keypoints of its own for that, which belong to no point.
 
 Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner.
-World axes: z is up; one unit is a metre. OpenCV is imported when a scene is projected and
+World axes: z is up; one unit is a meter. OpenCV is imported when a scene is projected and
 not before.
 """
 
@@ -25,14 +25,19 @@ from scipy.sparse import coo_array, csr_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turned_at_random
+from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turn_at_random
 from sfm_shapefit.synthetic.options import SceneOptions
 
-_NEAREST_DEPTH_M = 0.3  # nothing is photographed closer than this
-_LARGEST_VIEW_ANGLE_DEG = 80.0  # between a surface's normal and the line of sight; also the occlusion rule
-_SMALLEST_FALSE_ANGLE_DEG = 10.0  # a corrupted pair's direction is off by at least this
-_MOST_FALSE_MATCHES = 200  # of a corrupted pair: keeps the number of extra keypoints low
-_RELATIVE_POSE_DIRECTION_FACTOR = 3.0  # direction error over rotation error of a two-view estimate, roughly
+# Nothing is photographed closer than this.
+_NEAREST_DEPTH_M = 0.3
+# This angle between a surface's normal and the line of sight is also the occlusion rule.
+_LARGEST_VIEW_ANGLE_DEG = 80.0
+# A corrupted pair's direction is off by at least this.
+_SMALLEST_FALSE_ANGLE_DEG = 10.0
+# A corrupted pair has at most so many matches, which keeps the number of extra keypoints low.
+_MOST_FALSE_MATCHES = 200
+# This is roughly the direction error over the rotation error of a two-view estimate.
+_RELATIVE_POSE_DIRECTION_FACTOR = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -46,7 +51,7 @@ class Scene:
     rotations: FloatArray
     """(n, 3, 3) cam_from_world, true."""
     centers: FloatArray
-    """(n, 3) camera centres, true."""
+    """(n, 3) camera centers, true."""
     stated_rotations: FloatArray
     """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     points: FloatArray
@@ -131,8 +136,8 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
 
     false_lists = _false_lists(layout, keypoint_points, pairs, options, corruption_rng)
     lists = _match_lists(keypoints, keypoint_points, pairs, false_lists)
-    lists = [_thinned(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
-    scrambled = [_scrambled(rows, options.wrong_match_fraction, match_rng) for rows in lists]
+    lists = [_thin(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
+    scrambled = [_scramble(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
     relative_rotations, relative_translations = _relative_poses(
         layout, pairs, false_lists, ray_noise_rad, pose_rng
@@ -142,7 +147,7 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
         calibration=options.calibration,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turned_at_random(
+        stated_rotations=turn_at_random(
             layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng
         ),
         points=layout.points,
@@ -167,7 +172,7 @@ def project_points(
     Args:
         points: (k, 3) in world axes.
         cam_from_world: (3, 3) rotation.
-        center: (3,) camera centre in world axes.
+        center: (3,) camera center in world axes.
         calibration: (3, 3) K.
 
     Raises:
@@ -238,7 +243,7 @@ def _in_view_from(
     cam_from_world: FloatArray,
     options: SceneOptions,
 ) -> BoolArray:
-    """Return (c, k): which of the points a camera at each of the centres would show, whatever they face."""
+    """Return (c, k): which of the points a camera at each of the centers would show, whatever they face."""
     img_from_world = options.calibration @ cam_from_world
     homogeneous = (points @ img_from_world.T)[None, :, :] - (centers @ img_from_world.T)[:, None, :]
     depth = homogeneous[:, :, 2]
@@ -317,14 +322,14 @@ def _shared_keypoints(points_i: IntArray, points_j: IntArray) -> IntArray:
     return np.stack([in_i, in_j], axis=1).astype(np.int64)
 
 
-def _thinned(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
+def _thin(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
     """Return a random share of the matches, in their order; all, if they are few enough."""
     if most is None or len(matches) <= most:
         return matches
     return matches[np.sort(rng.choice(len(matches), most, replace=False))]
 
 
-def _scrambled(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
+def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:
     """Return the matches with `fraction` of them joining random keypoints of the list, and which those are.
 
     The chosen rows pass their second keypoints on in a random cycle: each of them becomes wrong, and no
@@ -378,9 +383,9 @@ def _false_list(
     options: SceneOptions,
     rng: np.random.Generator,
 ) -> _FalseList | None:
-    """Return what one camera would show of the other image's points from a false centre, if any fits.
+    """Return what one camera would show of the other image's points from a false center, if any fits.
 
-    Its rotation is kept. Centres are tried in the order of `_false_centers`; the first that is wrong by
+    Its rotation is kept. Centers are tried in the order of `_false_centers`; the first that is wrong by
     enough and keeps enough points in view is taken. The list is as long as the true one, at most.
     """
     side = int(rng.integers(2))
@@ -407,10 +412,10 @@ def _false_list(
 
 
 def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Return candidate centres (c, 3), c <= 40, of a camera that never was, beside the one at `center`.
+    """Return candidate centers (c, 3), c <= 40, of a camera that never was, beside the one at `center`.
 
     First 16 at the true distance in uniformly random directions, the corruption of the paper; then 24
-    around the true centre, ever nearer to it, for pairs whose view axes leave less freedom. None is so
+    around the true center, ever nearer to it, for pairs whose view axes leave less freedom. None is so
     near to the other camera that its direction would be ill determined.
     """
     baseline = float(np.linalg.norm(center - true_center))
@@ -439,7 +444,7 @@ def _relative_poses(
     for e, false in false_lists.items():
         centers[e, false.displaced] = false.center
     rotation_i, rotation_j = layout.rotations[pairs].swapaxes(0, 1)
-    rotation = turned_at_random(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
+    rotation = turn_at_random(rotation_j @ rotation_i.swapaxes(1, 2), ray_noise_rad, rng)
     translation = normalized(np.einsum("eab,eb->ea", rotation_j, centers[:, 0] - centers[:, 1]))
     noise = _RELATIVE_POSE_DIRECTION_FACTOR * ray_noise_rad * rng.standard_normal(translation.shape)
     return rotation, normalized(translation + noise)

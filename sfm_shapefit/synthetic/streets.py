@@ -1,7 +1,7 @@
 """A straight street whose truth is known: parallel baselines between cameras, and points at the roadside.
 
 Cameras drive along a line, so that the directions between them say nothing of their distances; rays to points
-3 to 10 m aside do. Cameras are a metre apart on average, the speed varies smoothly by a factor of 3. Each
+3 to 10 m aside do. Cameras are a meter apart on average, the speed varies smoothly by a factor of 3. Each
 camera starts tracks, seen by it and the next 3 to 7, of a point beside the middle of them. Noise is a random
 vector of 0.01 rad between cameras and of 1e-3 rad, a pixel at a focal length of 1000, towards points.
 """
@@ -14,10 +14,12 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.synthetic.graphs import Seed
 
-_BAND = 10  # cameras ahead that a camera is paired with
+# A camera is paired with so many cameras ahead.
+_BAND = 10
 _PAIR_NOISE_RAD, _PAIR_SHARE_WRONG = 0.01, 0.1
 _RAY_NOISE_RAD, _RAY_SHARE_WRONG = 1e-3, 0.15
-_SPEED_RATIO, _WAVE = 3.0, 50.0  # largest over smallest speed, and cameras per wave of it
+# These are the largest over the smallest speed, and the cameras per wave of it.
+_SPEED_RATIO, _WAVE = 3.0, 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -25,7 +27,7 @@ class StreetProblem:
     """Cameras and points of a street, with the directions between them."""
 
     locations: FloatArray
-    """(n, 3) the truth in metres: cameras 0..num_cameras-1, then points."""
+    """(n, 3) the truth in meters: cameras 0..num_cameras-1, then points."""
     num_cameras: int
     edges: IntArray
     """(m, 2) pairs of cameras, then (camera, point)."""
@@ -45,7 +47,7 @@ def street_problem(
     Args:
         num_cameras: at least 8, the longest track.
         tracks_per_camera: tracks that start at each camera.
-        jitter: standard deviation of the cameras' distance from the line, per axis, in metres.
+        jitter: standard deviation of the cameras' distance from the line, per axis, in meters.
         seed: an integer, or a Generator to draw from.
     """
     rng = np.random.default_rng(seed)

@@ -5,7 +5,7 @@ thing that it belongs to: along its front, into it, and up. Where houses repeat,
 picture, same balconies. Boxes and ground never repeat.
 
 The surfaces stand where the layout of the same shape has its points, and its cameras look at them. World
-axes: z is up; one unit is a metre.
+axes: z is up; one unit is a meter.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,13 +23,17 @@ from sfm_shapefit.synthetic.textures import facade_texture, ground_texture
 
 _HOUSE_DEPTH_M = 4.0
 _HOUSE_WIDTH_M = 8.0
-_TOWER_SIDES = 8  # with a picture each
+# Each side has a picture of its own.
+_TOWER_SIDES = 8
 _STOREY_M = 2.6
-_MOST_TEXELS = 2048  # along either side of the ground's picture
+# The ground's picture has at most so many texels along either side.
+_MOST_TEXELS = 2048
 _TEXELS_PER_M = 64.0
-_TEXELS_PER_M_NEAR = 160.0  # of the tower, which is photographed from nearby
+# The tower has more texels, for it is photographed from nearby.
+_TEXELS_PER_M_NEAR = 160.0
 _LIGHT = normalized(np.array([0.3, -0.5, 0.8]))
-_SHADE = 0.7  # brightness of a surface that the light does not reach
+# This is the brightness of a surface that the light does not reach.
+_SHADE = 0.7
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -43,7 +47,7 @@ class Surfaces:
     texture: IntArray
     """(t,) the picture of each triangle."""
     brightness: FloatArray
-    """(t,) factor to the picture's colours."""
+    """(t,) factor to the picture's colors."""
     textures: tuple[ByteArray, ...]
     """The pictures, (height, width, 3): red, green, blue."""
 
@@ -181,7 +185,7 @@ def _ring(_num_images: int, repeated: float, rng: np.random.Generator) -> list[_
     size = (round(height * _TEXELS_PER_M_NEAR), round(radius * side_angle * _TEXELS_PER_M_NEAR))
     repeating = facade_texture(*size, 100, rng)
     parts = []
-    for k, repeats in enumerate(_chosen(_TOWER_SIDES, repeated, rng)):
+    for k, repeats in enumerate(_choose(_TOWER_SIDES, repeated, rng)):
         picture = repeating if repeats else facade_texture(*size, 100, rng)
         rows = side == k
         parts.append(
@@ -219,7 +223,7 @@ def _house_maker(
         return picture, low, extent
 
     repeating = drawn()
-    repeats = iter(_chosen(num_houses, repeated, rng))
+    repeats = iter(_choose(num_houses, repeated, rng))
 
     def house(place: _Place) -> list[_Part]:
         picture, low, extent = repeating if next(repeats) else drawn()
@@ -231,7 +235,7 @@ def _house_maker(
     return house
 
 
-def _chosen(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
+def _choose(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
     """Return which of so many things are among a random fraction of them."""
     chosen: list[bool] = (rng.permutation(count) < round(fraction * count)).tolist()
     return chosen
@@ -253,7 +257,7 @@ def _boxes(
     floor_m: float = 0.0,
     texels_per_m: float = _TEXELS_PER_M,
 ) -> list[_Part]:
-    """Return boxes of about a size, turned at random, with their centres at (k, 2) on the floor."""
+    """Return boxes of about a size, turned at random, with their centers at (k, 2) on the floor."""
     parts = []
     for x, y in at.tolist():
         angle = rng.uniform(0.0, 2.0 * np.pi)

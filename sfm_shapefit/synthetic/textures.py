@@ -9,7 +9,8 @@ import numpy as np
 
 from sfm_shapefit.synthetic.layouts import ByteArray
 
-_STONE_AREA_PX = 700  # of picture per stone
+# There is a stone to so many pixels of the picture.
+_STONE_AREA_PX = 700
 
 
 def ground_texture(height_px: int, width_px: int, rng: np.random.Generator) -> ByteArray:
@@ -34,7 +35,7 @@ def facade_texture(height_px: int, width_px: int, storey_px: int, rng: np.random
 
 
 def _clouds(height_px: int, width_px: int, tint: np.ndarray, rng: np.random.Generator) -> ByteArray:
-    """Return a picture of smooth noise at four scales around a colour."""
+    """Return a picture of smooth noise at four scales around a color."""
     field = np.zeros((height_px, width_px))
     for cell_px, gray in ((128, 18.0), (32, 14.0), (8, 10.0), (3, 8.0)):
         shape = (height_px // cell_px + 2, width_px // cell_px + 2)

@@ -18,11 +18,13 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.atomic_folder import atomic_folder
+from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.synthetic import RigScene, Scene, WorkspaceOptions
 from sfm_shapefit.synthetic.rig_workspace import camera_id_of, new_frames, new_rigs, rig_model
 
 _CAMERA_ID = 1
-_CALIBRATED = 2  # COLMAP's TwoViewGeometry::ConfigurationType
+# This is a value of COLMAP's TwoViewGeometry::ConfigurationType.
+_CALIBRATED = 2
 
 
 def write_workspace(
@@ -53,22 +55,22 @@ def _write_contents(scene: Scene, workspace: Path, options: WorkspaceOptions, ri
         model = _rotations_only_model(scene, rigs)
     else:
         model = _full_model(scene, scene.stated_rotations, rigs) if perturbed else truth
-    write_model(model, workspace / "sparse" / "0")
-    if model is not truth:
-        write_model(truth, workspace / "truth")
+    write_models(model, truth, workspace)
 
 
 # --- models ----------------------------------------------------------------------------------------------
 
 
-def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write a model in COLMAP's binary format."""
-    folder.mkdir(parents=True)
-    model.write_binary(folder)
+def write_models(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction, workspace: Path) -> None:
+    """Write sparse/0, and the truth where it is another model."""
+    for written, folder in ((model, workspace / "sparse" / "0"), (truth, workspace / "truth")):
+        if folder.name != "truth" or truth is not model:
+            folder.mkdir(parents=True)
+            write_model(written, folder)
 
 
 def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Reconstruction:
-    """Return cameras and images with rotations, all centres (of frames) at the origin, and nothing else."""
+    """Return cameras and images with rotations, all centers (of frames) at the origin, and nothing else."""
     if rigs is not None:
         images = [_image(k, camera_id=camera_id_of(rigs, k)) for k in range(scene.num_images)]
         return rig_model(rigs, _camera(scene), images, np.zeros((len(rigs.rig_of_frame), 3)))
@@ -80,7 +82,7 @@ def _rotations_only_model(scene: Scene, rigs: RigScene | None) -> pycolmap.Recon
 
 
 def _full_model(scene: Scene, rotations: FloatArray, rigs: RigScene | None) -> pycolmap.Reconstruction:
-    """Return the model at the true centres and points, with the given rotations.
+    """Return the model at the true centers and points, with the given rotations.
 
     Points that fewer than two images show are left out. Point p of the scene has id p + 1.
     """

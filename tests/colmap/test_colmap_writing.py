@@ -22,9 +22,9 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
 from sfm_shapefit.colmap.structure import (
-    colored,
+    color_points,
     correspondence_graph,
-    filtered,
+    filter_points,
     triangulate,
 )
 from sfm_shapefit.colmap.structure_options import StructureOptions
@@ -153,8 +153,8 @@ def test_the_input_of_every_stage_stays_as_it_was():
     for tracks in (graph, original):
         structure = triangulate(seed, tracks)
         structure_before = dump(structure)
-        colored(structure, original)
-        filtered(structure, StructureOptions(max_reprojection_error_px=0.1))
+        color_points(structure, original)
+        filter_points(structure, StructureOptions(max_reprojection_error_px=0.1))
         assert dump(structure) == structure_before
         bundle_adjust(seed, tracks)
     assert dump(seed) == seed_before
@@ -215,7 +215,7 @@ def test_a_placed_image_without_finite_centre_is_refused_by_name():
 def test_exact_data_give_every_point_back_with_its_colour(source):
     original, points = ring_model()
     seed, graph = seeded(original)
-    structure = colored(triangulate(seed, graph if source == "matches" else original), original)
+    structure = color_points(triangulate(seed, graph if source == "matches" else original), original)
     assert structure.num_points3D() == len(points)
     for point in structure.points3D.values():
         truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
@@ -284,7 +284,7 @@ def test_twice_the_same_gives_the_same_bits(source):
     def run():
         seed, graph = seeded(original, ring_centers() + 0.01)
         tracks = graph if source == "matches" else original
-        structure = colored(triangulate(seed, tracks), original)
+        structure = color_points(triangulate(seed, tracks), original)
         return dump(structure), dump(bundle_adjust(seed, tracks).reconstruction)
 
     first = run()
@@ -365,7 +365,7 @@ def test_a_source_without_colours_leaves_colours_as_they_are_and_costs_no_copy()
     structure = triangulate(seeded(original)[0], original)
     for point in original.points3D.values():
         point.color = np.zeros(3, dtype=np.uint8)
-    assert colored(structure, original) is structure
+    assert color_points(structure, original) is structure
     assert all(point.color.any() for point in structure.points3D.values())
 
 
@@ -380,9 +380,9 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         original.add_point3D(np.zeros(3), half, np.array([20, 20, 33], dtype=np.uint8))
     seed, graph = seeded(original)
     black = triangulate(seed, graph)
-    structure = colored(black, original)
+    structure = color_points(black, original)
     assert not any(point.color.any() for point in black.points3D.values())
-    assert colored(black, original, in_place=True) is black
+    assert color_points(black, original, in_place=True) is black
     assert all((p.color == structure.point3D(k).color).all() for k, p in black.points3D.items())
     assert structure.num_points3D() == 120
     for point in structure.points3D.values():
@@ -398,7 +398,7 @@ def test_colours_come_only_from_images_with_the_same_keypoints():
         keypoints = {k: moved[k] for k in changed}
         seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
         graph = correspondence_graph(seed, model.image_ids, all_matches())
-        structure = colored(triangulate(seed, graph), original)
+        structure = color_points(triangulate(seed, graph), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
 
@@ -438,7 +438,7 @@ def with_one_more_point(xyz, image_ids, offset_px=0.0):
 )
 def test_a_point_is_removed_that_is(xyz, image_ids, why):
     seed, point_id = with_one_more_point(xyz, image_ids)
-    kept = filtered(seed)
+    kept = filter_points(seed)
     assert not kept.exists_point3D(point_id), why
     assert kept.num_points3D() == 120
 
@@ -447,14 +447,14 @@ def test_a_point_far_away_stays_if_the_angle_asked_for_is_smaller_than_its_own()
     # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
     seed, point_id = with_one_more_point([-4000.0, 0.0, 0.0], [15, 75])
     for angle_deg, stays in ((0.10, True), (0.14, False)):
-        kept = filtered(seed, StructureOptions(min_triangulation_angle_deg=angle_deg))
+        kept = filter_points(seed, StructureOptions(min_triangulation_angle_deg=angle_deg))
         assert kept.exists_point3D(point_id) == stays
 
 
 @pytest.mark.parametrize(("offset_px", "length"), [(3.9, 4), (4.1, 3)])
 def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offset_px, length):
     seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45, 65], offset_px)
-    point = filtered(seed).points3D[point_id]
+    point = filter_points(seed).points3D[point_id]
     assert point.track.length() == length
     assert point.error == pytest.approx(offset_px / 4 if length == 4 else 0.0, abs=1e-6)
 
@@ -464,7 +464,7 @@ def test_point_errors_are_those_of_the_observations_that_are_left():
     loose = triangulate(*seeded(original), StructureOptions(max_reprojection_error_px=8.0))
     for point in loose.points3D.values():
         point.xyz, point.error = point.xyz + 0.003, 77.0
-    kept = filtered(loose, StructureOptions(max_reprojection_error_px=3.0))
+    kept = filter_points(loose, StructureOptions(max_reprojection_error_px=3.0))
     assert 0 < kept.compute_num_observations() < loose.compute_num_observations()
     lengths = [point.track.length() for point in kept.points3D.values()]
     errors_px = np.split(reprojection_errors_px(kept), np.cumsum(lengths)[:-1])
@@ -475,8 +475,8 @@ def test_point_errors_are_those_of_the_observations_that_are_left():
 
 def test_tracks_shorter_than_asked_for_are_removed():
     seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45])
-    assert filtered(seed, StructureOptions(min_track_length=3)).exists_point3D(point_id)
-    kept = filtered(seed, StructureOptions(min_track_length=4))
+    assert filter_points(seed, StructureOptions(min_track_length=3)).exists_point3D(point_id)
+    kept = filter_points(seed, StructureOptions(min_track_length=4))
     assert not kept.exists_point3D(point_id)
     assert kept.num_points3D() == 120
 
@@ -624,7 +624,7 @@ def test_the_colmap_binary_analyses_and_adjusts_the_model(tmp_path, unplaced):
     placed = np.arange(NUM_IMAGES) != unplaced
     seed, graph = seeded(original, ring_centers() + 0.01, placed)
     with atomic_folder(tmp_path / "out") as partial:
-        write_model(colored(triangulate(seed, graph), original), partial)
+        write_model(color_points(triangulate(seed, graph), original), partial)
     (tmp_path / "adjusted").mkdir()
 
     analysis = colmap("model_analyzer", "--path", tmp_path / "out")

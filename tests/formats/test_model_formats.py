@@ -16,15 +16,15 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.other_programs import reconstruction_of, relative_poses_of, scene_of
+from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_relative_poses, relative_poses_text
-from sfm_shapefit.formats.models import read_scene
+from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
-from sfm_shapefit.formats.scene import quaternion_from_rotation, rotation_from_quaternion
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
 from tests.program import run
@@ -179,12 +179,12 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
     data = content["intrinsics"][0]["value"]["ptr_wrapper"]["data"]
     data["disto_t2"] = [0.1, 0.2, 0.3, 0.04, 0.05]
     del data["disto_k3"]
-    camera = read_scene(openmvg_file(tmp_path, content)).cameras[0]
+    camera = read_model_file(openmvg_file(tmp_path, content)).cameras[0]
     assert camera.model == "FULL_OPENCV"
     assert camera.params == (100.0, 100.0, 50.0, 40.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     brown = {"projection_type": "brown", "width": 80, "height": 100, "focal_x": 1.0, "focal_y": 1.1}
     brown |= {"c_x": 0.01, "c_y": -0.02, "k1": 0.1, "k2": 0.2, "k3": 0.3, "p1": 0.04, "p2": 0.05}
-    camera = read_scene(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).cameras[0]
+    camera = read_model_file(opensfm_file(tmp_path, [OPENSFM[0] | {"cameras": {"c": brown}}])).cameras[0]
     expected = (100.0, 110.0, 41.0, 48.0, 0.1, 0.2, 0.04, 0.05, 0.3, 0.0, 0.0, 0.0)
     np.testing.assert_allclose(camera.params, expected, rtol=1e-15)
 
@@ -238,7 +238,7 @@ def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tm
 )
 def test_a_malformed_bundler_file_is_refused_by_its_line(tmp_path, change, message):
     with pytest.raises(InputError, match=message):
-        read_scene(bundler_file(tmp_path, BUNDLER.replace(*change, 1)))
+        read_model_file(bundler_file(tmp_path, BUNDLER.replace(*change, 1)))
 
 
 @pytest.mark.parametrize(
@@ -257,7 +257,7 @@ def test_a_malformed_openmvg_file_is_refused_by_its_key(tmp_path, change, messag
     assert change[0] in text
     file.write_text(text.replace(*change, 1))
     with pytest.raises(InputError, match=message):
-        read_scene(file)
+        read_model_file(file)
 
 
 @pytest.mark.parametrize(
@@ -275,12 +275,12 @@ def test_a_malformed_opensfm_file_is_refused_by_its_key(tmp_path, change, messag
     assert change[0] in text
     file.write_text(text.replace(*change, 1))
     with pytest.raises(InputError, match=message):
-        read_scene(file)
+        read_model_file(file)
 
 
 def test_a_malformed_line_of_tracks_is_refused_by_its_number(tmp_path):
     with pytest.raises(InputError, match=r"tracks\.csv, line 2: expected image, track"):
-        read_scene(opensfm_file(tmp_path, tracks=TRACKS.replace("0.1\t-0.2", "left", 1)))
+        read_model_file(opensfm_file(tmp_path, tracks=TRACKS.replace("0.1\t-0.2", "left", 1)))
 
 
 def test_a_file_that_is_no_model_is_refused(tmp_path):
@@ -294,11 +294,11 @@ def test_a_file_that_is_no_model_is_refused(tmp_path):
 
 @pytest.fixture(scope="module")
 def courtyard():
-    return scene_of(pycolmap.Reconstruction(COURTYARD / "truth"))
+    return posed_model_of(pycolmap.Reconstruction(COURTYARD / "truth"))
 
 
 def test_transforms_json_has_opengl_axes(tmp_path):
-    frames = json.loads(nerf_text(read_scene(openmvg_file(tmp_path))))
+    frames = json.loads(nerf_text(read_model_file(openmvg_file(tmp_path))))
     # Columns: right is -y, up is +z, backwards is -x; then the centre.
     expected = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
     np.testing.assert_array_equal(frames["frames"][0]["transform_matrix"], expected)
@@ -324,7 +324,7 @@ def test_a_camera_model_that_nerf_has_not_is_refused(courtyard):
 
 
 def test_a_trajectory_has_world_from_camera_and_the_names_as_times(tmp_path):
-    scene = replace(read_scene(openmvg_file(tmp_path)), names=("2.5.png", "1.25.png"))
+    scene = replace(read_model_file(openmvg_file(tmp_path)), names=("2.5.png", "1.25.png"))
     lines = tum_text(scene).splitlines()
     # R^T is a turn by -120 degrees about (1, -1, 1) / sqrt(3): qw = cos 60, q = -sin 60 / sqrt(3) (1, -1, 1).
     assert lines[1].split()[0] == "1.25"
@@ -339,32 +339,15 @@ def test_poses_come_back_from_text(courtyard, kind):
         rows = [line.split() for line in tum_text(courtyard).splitlines()[1:]]
         order = np.argsort([int(name.split(".")[0]) for name in courtyard.names])
         centers = np.array([row[1:4] for row in rows], dtype=float)
-        wxyz = np.array([[row[7], *row[4:7]] for row in rows], dtype=float)
-        rotations = np.array([rotation_from_quaternion(q).T for q in wxyz])
+        rotations = Rotation.from_quat([row[4:8] for row in rows]).as_matrix().swapaxes(1, 2)
     else:
         rows = list(csv.DictReader(poses_csv(courtyard).splitlines()))
         order = np.arange(len(rows))
         assert [row["name"] for row in rows] == list(courtyard.names)
         centers = np.array([[row[k] for k in "xyz"] for row in rows], dtype=float)
-        wxyz = np.array([[row[f"q{k}"] for k in "wxyz"] for row in rows], dtype=float)
-        rotations = np.array([rotation_from_quaternion(q) for q in wxyz])
+        rotations = Rotation.from_quat([[row[f"q{k}"] for k in "xyzw"] for row in rows]).as_matrix()
     np.testing.assert_array_equal(centers, courtyard.centers[order])
     np.testing.assert_allclose(rotations, courtyard.rotations[order], atol=1e-14)
-
-
-def test_quaternions_of_all_angles_come_back():
-    rng = np.random.default_rng(8)
-    for q in [
-        *rng.normal(size=(50, 4)),
-        [0, 1, 0, 0],
-        [0, 0, 1, 0],
-        [0, 0, 0, 1],
-        [1, 0, 0, 0],
-        [1e-9, 1, 1, 1],
-    ]:
-        rotation = rotation_from_quaternion(np.array(q, dtype=float))
-        back = rotation_from_quaternion(quaternion_from_rotation(rotation))
-        np.testing.assert_allclose(back, rotation, atol=1e-14)
 
 
 # --- relative poses ----------------------------------------------------------------------------------
@@ -473,7 +456,7 @@ def test_a_foreign_model_becomes_a_colmap_model(tmp_path):
 
 
 def test_a_scene_survives_the_way_through_pycolmap(courtyard):
-    back = scene_of(reconstruction_of(courtyard, "test"))
+    back = posed_model_of(reconstruction_of(courtyard, "test"))
     assert back.names == courtyard.names
     assert back.cameras == courtyard.cameras
     np.testing.assert_allclose(back.rotations, courtyard.rotations, atol=1e-15)

@@ -21,7 +21,7 @@ from sfm_shapefit.synthetic import (
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.photographs import judge_matches, write_rendered_workspace
+from sfm_shapefit.synthetic.rendered_workspace import judge_matches, write_rendered_workspace
 from sfm_shapefit.synthetic.surfaces import Surfaces
 from tests.program import run
 from tests.scenes import BUNDLED

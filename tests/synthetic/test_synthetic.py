@@ -594,12 +594,12 @@ def test_graph_problems_have_about_the_degree_asked_for(family, degree):
 
 @pytest.mark.parametrize("d", [2, 3, 10])
 def test_the_paper_model_has_any_dimension_and_one_answer_per_seed(d):
-    problem = random_graph_problem(30, 0.5, d, 0.05, 0.2, 9)
+    problem = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=9)
     assert problem.locations.shape == (30, d)
     assert problem.directions.shape == (len(problem.edges), d)
-    again = random_graph_problem(30, 0.5, d, 0.05, 0.2, np.random.default_rng(9))
+    again = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=np.random.default_rng(9))
     np.testing.assert_array_equal(problem.directions, again.directions)
-    other = random_graph_problem(30, 0.5, d, 0.05, 0.2, 10)
+    other = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=10)
     assert not np.array_equal(problem.locations, other.locations)
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.adjustment import Adjusted, bundle_adjust
-from sfm_shapefit.colmap.seed import build_seed, turned
-from sfm_shapefit.colmap.structure import TrackSource, colored, correspondence_graph, triangulate
+from sfm_shapefit.colmap.seed import build_seed, turn_model
+from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import MatchBatch
@@ -74,8 +74,8 @@ def build_seeded_model(
     del tracks  # the graph of all matches is large
     if source.database is not None:  # points of the model's own tracks have their colours already
         with clock("colours"):
-            seeded = colored(seeded, source.model.reconstruction, in_place=True)
-    return seeded if axes is None else turned(seeded, axes), adjusted
+            seeded = color_points(seeded, source.model.reconstruction, in_place=True)
+    return seeded if axes is None else turn_model(seeded, axes), adjusted
 
 
 def place_further_pieces(

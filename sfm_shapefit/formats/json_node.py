@@ -1,57 +1,15 @@
-"""A posed scene in plain arrays: what the model formats of other programs are read into and written from.
-
-COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pixels with the centre of the
-first one at (0.5, 0.5), camera models and the order of their parameters by COLMAP's names.
-"""
+"""JSON files whose values know where they stand, for messages."""
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import text_of
-
-FLIP_YZ = np.diag([1.0, -1.0, -1.0])
-"""From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SceneCamera:
-    """Intrinsics of a camera."""
-
-    model: str
-    """COLMAP's name of the camera model."""
-    width: int
-    height: int
-    params: tuple[float, ...]
-    """In COLMAP's order."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SceneFile:
-    """The posed images and the tracks of a model."""
-
-    cameras: tuple[SceneCamera, ...]
-    names: tuple[str, ...]
-    """(n,) of the posed images."""
-    camera_of: IntArray
-    """(n,) index of each image's camera."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world."""
-    centers: FloatArray
-    """(n, 3) camera centres in the world."""
-    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
-    """(p, 3)"""
-    colors: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
-    """(p, 3) in 0..255."""
-    observed: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
-    """(o, 2) point and image of each observation."""
-    pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
-    """(o, 2) where."""
 
 
 def read_json(file: Path) -> Any:
@@ -72,7 +30,7 @@ def read_json(file: Path) -> Any:
 
 @dataclass(frozen=True, slots=True)
 class JsonNode:
-    """A value of a JSON file that knows where it stands, for messages."""
+    """A value of a JSON file."""
 
     file: Path
     where: str
@@ -145,33 +103,3 @@ class JsonNode:
 def is_rotation(matrix: FloatArray, tolerance: float = 1e-4) -> bool:
     """Return whether a (3, 3) matrix is a rotation up to what printing with few digits costs."""
     return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance and np.linalg.det(matrix) > 0.0)
-
-
-def rotation_from_quaternion(wxyz: FloatArray) -> FloatArray:
-    """Return the (3, 3) rotation of a quaternion w, x, y, z that is not zero."""
-    w, x, y, z = wxyz / np.linalg.norm(wxyz)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-            [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-            [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )
-
-
-def quaternion_from_rotation(rotation: FloatArray) -> FloatArray:
-    """Return the unit quaternion w, x, y, z with w >= 0 of a (3, 3) rotation.
-
-    The eigenvector of Bar-Itzhack's symmetric matrix to its largest eigenvalue: stable at every angle.
-    """
-    m = rotation
-    k = np.array(
-        [
-            [m[0, 0] + m[1, 1] + m[2, 2], m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1]],
-            [m[2, 1] - m[1, 2], m[0, 0] - m[1, 1] - m[2, 2], m[0, 1] + m[1, 0], m[0, 2] + m[2, 0]],
-            [m[0, 2] - m[2, 0], m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], m[1, 2] + m[2, 1]],
-            [m[1, 0] - m[0, 1], m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1]],
-        ]
-    )
-    quaternion: FloatArray = np.linalg.eigh(k)[1][:, -1]
-    return quaternion if quaternion[0] >= 0.0 else -quaternion

@@ -26,15 +26,16 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import (
     RenderedScene,
-    encoded_image,
+    encode_image,
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_model
+from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_models
 from sfm_shapefit.viewgraph import connected_components
 
 _CAMERA_ID = 1
-_LARGEST_ERROR_PX = 4.0  # of a right match: COLMAP's own limit for inliers
+# A right match is off by no more: this is COLMAP's own limit for inliers.
+_LARGEST_ERROR_PX = 4.0
 _POINT_COLOR = np.array([160, 160, 160], dtype=np.uint8)
 
 
@@ -90,7 +91,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     with open_database(database, model) as opened:
         keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
         batches = list(opened.iter_matches(min_matches))
-    joined = _joined(batches)
+    joined = _join(batches)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)
@@ -106,7 +107,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     return JudgedMatches(matches=joined, is_right=is_right, pair_is_wrong=wrong)
 
 
-def _joined(batches: list[MatchBatch]) -> MatchBatch:
+def _join(batches: list[MatchBatch]) -> MatchBatch:
     """Return batches as one."""
     offsets, num_matches = [np.zeros(1, dtype=np.int64)], 0
     for batch in batches:
@@ -139,7 +140,7 @@ def _write_images(scene: RenderedScene, folder: Path) -> None:
     """Write the photographs as JPEG files."""
     folder.mkdir()
     for k in range(scene.num_images):
-        (folder / image_name(k)).write_bytes(encoded_image(scene, k))
+        (folder / image_name(k)).write_bytes(encode_image(scene, k))
 
 
 def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool) -> None:
@@ -180,9 +181,7 @@ def _write_models(scene: RenderedScene, workspace: Path, options: WorkspaceOptio
         model = truth
     else:
         model = _posed_model(scene, scene.stated_rotations, tracks)
-    write_model(model, workspace / "sparse" / "0")
-    if model is not truth:
-        write_model(truth, workspace / "truth")
+    write_models(model, truth, workspace)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -223,7 +222,7 @@ def _true_tracks(scene: RenderedScene, database: Path) -> _Tracks:
 def _posed_model(
     scene: RenderedScene, rotations: FloatArray, tracks: _Tracks | None = None, *, at_origin: bool = False
 ) -> pycolmap.Reconstruction:
-    """Return a model with the given rotations at the true centres, or all at the origin, and its tracks."""
+    """Return a model with the given rotations at the true centers, or all at the origin, and its tracks."""
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(_camera(scene))
     for k, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):

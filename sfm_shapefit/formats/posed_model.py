@@ -1,0 +1,46 @@
+"""A posed model in plain arrays: what the model formats of other programs are read into and written from.
+
+COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pixels with the center of the
+first one at (0.5, 0.5), camera models and the order of their parameters by COLMAP's names.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Intrinsics:
+    """A camera model with its parameters."""
+
+    model: str
+    """COLMAP's name of the camera model."""
+    width: int
+    height: int
+    params: tuple[float, ...]
+    """In COLMAP's order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedModelFile:
+    """The posed images and the tracks of a model."""
+
+    cameras: tuple[Intrinsics, ...]
+    names: tuple[str, ...]
+    """(n,) of the posed images."""
+    camera_of: IntArray
+    """(n,) index of each image's camera."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3) camera centers in the world."""
+    points: FloatArray = field(default_factory=lambda: np.zeros((0, 3)))
+    """(p, 3)"""
+    colors: IntArray = field(default_factory=lambda: np.zeros((0, 3), dtype=np.int64))
+    """(p, 3) in 0..255."""
+    observed: IntArray = field(default_factory=lambda: np.zeros((0, 2), dtype=np.int64))
+    """(o, 2) point and image of each observation."""
+    pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
+    """(o, 2) where."""
