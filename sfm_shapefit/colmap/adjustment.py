@@ -42,9 +42,8 @@ class _Round:
 
 
 _ROUNDS = (_Round(4.0, 2.0), _Round(1.0, 1.0), _Round(1.0, 1.0))
-_FUNCTION_TOLERANCE = (
-    1e-6  # relative fall of the cost; 0, pycolmap's default, doubles the time for equal errors
-)
+# Steps end at this relative fall of the cost; 0, pycolmap's default, doubles the time for equal errors.
+_FUNCTION_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
