@@ -21,8 +21,8 @@ from sfm_shapefit.viewgraph import ViewGraph
 _ITERATIONS = 10
 # A triangle's weight falls so fast, per radian, with the scores of its sides, at the end.
 _SHARPEST = 20.0
-# Two sides are opposite if one and the other turned round are so near. A noise of 0.05 then bends the plane by
-# 0.3.
+# Two sides are opposite if one is so near to the other turned round; a noise of 0.05 then bends the
+# plane by 0.3.
 _OPPOSITE_RAD = 0.2
 # This score, in radians, lies between those of wrong pairs, around one, and those of noisy ones.
 _KEPT = 0.2

@@ -64,7 +64,7 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
         ids.append(key)
         points.append(node.get("coordinates").numbers(3))
         colors.append(node.get("color").numbers(3) if node.has("color") else [0.0, 0.0, 0.0])
-    observed, normalised = _observations(file, ids, names)
+    observed, scaled = _observations(file, ids, names)
     sizes = np.array([[cameras[k].width, cameras[k].height] for k in camera_of], dtype=np.float64).reshape(
         -1, 2
     )
@@ -78,7 +78,7 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
         points=np.array(points).reshape(-1, 3),
         colors=np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.int64),
         observed=observed,
-        pixels=normalised * of_image.max(axis=1, keepdims=True, initial=0.0) + of_image / 2.0,
+        pixels=scaled * of_image.max(axis=1, keepdims=True, initial=0.0) + of_image / 2.0,
     )
 
 

@@ -11,9 +11,10 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.judgement.uncertainty import MAX_BYTES, Uncertainty, scatter
+from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.program import adjoint, differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -37,7 +38,7 @@ def propagate_groups(
     information: FloatArray,
     gauge: GroupGauge,
     errors: FloatArray | None = None,
-    max_bytes: int = MAX_BYTES,
+    max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of groups from the information of the directions between them.
 

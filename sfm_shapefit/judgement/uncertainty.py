@@ -36,11 +36,8 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
-
-MAX_BYTES = 2_000_000_000
-"""What the factor may take unless something else is asked for; beyond, standard deviations are left out."""
 
 # Shares of each block's trace that are added: what nothing holds becomes large, not singular.
 _RIDGES = (1e-12, 1e-10, 1e-8)
@@ -78,7 +75,7 @@ def propagate(
     information: FloatArray,
     num_cameras: int | None = None,
     errors: Iterable[FloatArray] | None = None,
-    max_bytes: int = MAX_BYTES,
+    max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> Uncertainty | None:
     """Return the uncertainty of locations from the information of the directions.
 

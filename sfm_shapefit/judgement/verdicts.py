@@ -30,7 +30,8 @@ from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, 
 from sfm_shapefit.judgement.conditioning import LooseGroup, condition
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
-from sfm_shapefit.judgement.uncertainty import MAX_BYTES, propagate
+from sfm_shapefit.judgement.uncertainty import propagate
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import along, differences
@@ -117,7 +118,7 @@ def assess(
     locations: FloatArray,
     *,
     undetermined_nodes: IntArray | None = None,
-    max_bytes: int = MAX_BYTES,
+    max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> Assessment:
     """Judge pairs and cameras by a solution.
 

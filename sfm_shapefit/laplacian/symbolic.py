@@ -27,6 +27,9 @@ from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
+DEFAULT_FACTOR_BYTES = 2_000_000_000
+"""What one factor may take if the caller says nothing."""
+
 # A child joins its parent if the merged panel has at most this share of zeros, or the share that the limits
 # give while it has at most so many columns.
 _MERGE_ALWAYS = 0.03

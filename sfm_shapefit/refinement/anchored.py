@@ -16,10 +16,9 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import allocate_factor
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.refinement.angular import (
     DAMPING,
-    DEFAULT_MAX_BYTES,
     KERNEL_WIDTH,
     AngularTerms,
     Metric,
@@ -53,7 +52,7 @@ def refine_anchored(
     levels: FloatArray,
     anchors: Anchors,
     *,
-    max_bytes: int = DEFAULT_MAX_BYTES,
+    max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> FloatArray:
     """Return locations (n, d), in the anchors' units, of least cost of directions and anchors together.
 

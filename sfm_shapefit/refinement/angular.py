@@ -42,7 +42,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorisation
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
@@ -73,8 +73,6 @@ _HOPELESS = 20.0
 _MAX_STEPS = 60
 # One factorization in blocks of so many operations takes about a second, and 15 to 40 are needed.
 _MAX_FLOPS = 3e10
-DEFAULT_MAX_BYTES = 2_000_000_000
-"""What a factor may take if the caller says nothing."""
 
 
 class NormalFactor(Protocol):
@@ -111,7 +109,7 @@ class AngularResult:
 
 
 def plan_refinement(
-    graph: GraphShape, max_bytes: int = DEFAULT_MAX_BYTES
+    graph: GraphShape, max_bytes: int = DEFAULT_FACTOR_BYTES
 ) -> SymbolicFactor | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 

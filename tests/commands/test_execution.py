@@ -17,7 +17,7 @@ from sfm_shapefit.commands.stages.execution import (
     WorkerError,
     measure_task,
     open_executor,
-    shared_out,
+    share_out,
 )
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import concatenate
@@ -53,7 +53,7 @@ def serial(workspace, model):
 def shared(workspace, model, executor, matches_per_task=700):
     seen = []
     with open_database(workspace / "database.db", model) as database:
-        parts = shared_out(
+        parts = share_out(
             database, model, DirectionOptions(), executor, lambda *done: seen.append(done), matches_per_task
         )
     return concatenate(parts), seen

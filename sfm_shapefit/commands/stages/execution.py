@@ -66,7 +66,7 @@ def directions_of(
     )
 
 
-def shared_out(
+def share_out(
     database: MatchDatabase,
     model: PosedModel,
     options: DirectionOptions,

@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
-from sfm_shapefit.commands.stages.execution import directions_of, shared_out
+from sfm_shapefit.commands.stages.execution import directions_of, share_out
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.memory import Workload
 from sfm_shapefit.directions.pair_directions import (
@@ -54,7 +54,7 @@ def measure_directions(
             options,
         )
     if executor is not None and source.database is not None:
-        parts = shared_out(source.database, model, options, executor, clock.advance)
+        parts = share_out(source.database, model, options, executor, clock.advance)
     else:
         wanted, threads = options, options.num_threads()
         batches = source.counted(source.batches(), clock.advance)

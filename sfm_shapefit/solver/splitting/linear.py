@@ -21,11 +21,8 @@ from sfm_shapefit.laplacian.approximate import (
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.laplacian.symbolic import EliminationTree, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorisation
 from sfm_shapefit.viewgraph import ViewGraph
-
-DEFAULT_MEMORY_BYTES = 2_000_000_000
-"""What the factor may take if the caller says nothing."""
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
 # factorizations at 80 Gflop/s as much from 150,000 operations per edge on. Geometric and community graphs of
@@ -131,7 +128,7 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 
 def laplacian_factor(
     graph: ViewGraph,
-    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    memory_bytes: int = DEFAULT_FACTOR_BYTES,
     *,
     prediction: Prediction | None = None,
     threads: int = 1,

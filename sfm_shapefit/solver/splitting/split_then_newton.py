@@ -15,12 +15,13 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.certificate import Certificate, certify, certify_within
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import IterationInfo, OnIteration
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
-from sfm_shapefit.solver.splitting.linear import DEFAULT_MEMORY_BYTES, LaplacianFactor, Prediction
+from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Prediction
 from sfm_shapefit.viewgraph import ViewGraph
 
 # The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
@@ -74,7 +75,7 @@ def solve_hybrid(
     max_iterations: int,
     *,
     threads: int = 1,
-    memory_bytes: int = DEFAULT_MEMORY_BYTES,
+    memory_bytes: int = DEFAULT_FACTOR_BYTES,
     prediction: Prediction | None = None,
     on_iteration: OnIteration | None = None,
 ) -> HybridResult:
