@@ -289,7 +289,7 @@ def test_the_table_of_choices(method, n, flops, chosen, reason, monkeypatch):
 
 
 def test_a_factor_that_does_not_fit_is_replaced_and_the_answer_says_how_it_ended():
-    graph = box(1200)
+    graph = box(3000)  # its factor takes 1.6 MB
     within, beyond = (
         solve(graph, SolverOptions(solver="admm", tol=1e-4, factor_memory_mb=memory)) for memory in (2000, 1)
     )
