@@ -370,7 +370,7 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
 
 
 @pytest.mark.parametrize(
-    ("gaps", "cheap", "stops", "begins", "finish"),
+    ("gaps", "cheap", "stops", "begins", "stop"),
     [
         ((1e-9,), True, False, ["there"], HybridStop.NEWTON),
         ((1e-3, 1e-9), True, False, ["there", "anew"], HybridStop.NEWTON),
