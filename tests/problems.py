@@ -8,6 +8,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import differences
+from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.viewgraph import ViewGraph
 
 Floats = npt.NDArray[np.float64]
@@ -45,6 +46,37 @@ def measure_graph(
     rng = np.random.default_rng(seed)
     v = _measure(differences(truth, edges), sigma, q, rng)
     return ViewGraph(len(truth), edges, v, rng.uniform(0.5, 2.0, len(edges)))
+
+
+def rig_problem(
+    seed: int, frames: int = 8, sensors: int = 3, wrong: float = 0.2, noise: float = 0.0, share: float = 0.5
+) -> tuple[ViewGraph, RigidGroups, Floats]:
+    """Return the directions of a share of all pairs, the rigid groups, and the true locations (n, 3).
+
+    Frames stand about 4 apart, turned at random, with their sensors about 0.7 from their origin.
+    """
+    rng = np.random.default_rng(seed)
+    turns = np.linalg.qr(rng.normal(size=(frames, 3, 3)))[0]
+    own = 0.7 * rng.normal(size=(sensors, 3))
+    centers = 4.0 * rng.normal(size=(frames, 3))
+    labels = np.repeat(np.arange(frames), sensors)
+    offsets = np.einsum("fab,sb->fsa", turns, own).reshape(-1, 3)
+    t = centers[labels] + offsets
+    n = len(t)
+    edges = np.array(all_pairs(n))
+    edges = edges[rng.random(len(edges)) < share]
+    v = normalized(differences(t, edges))
+    v = normalized(v + noise * rng.normal(size=v.shape))
+    bad = rng.random(len(edges)) < wrong
+    v[bad] = normalized(rng.normal(size=v.shape))[bad]
+    graph = ViewGraph(n, edges, v, rng.uniform(0.5, 2.0, len(edges)))
+    return graph, RigidGroups(group_of=labels, offsets=offsets), t
+
+
+def outer(graph: ViewGraph, groups: RigidGroups) -> tuple[ViewGraph, npt.NDArray[np.bool_]]:
+    """Return the graph without the pairs inside a rigid group, and which pairs are left."""
+    kept = groups.joins(graph.edges)
+    return ViewGraph(graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
 
 
 def _measure(baselines: Floats, sigma: float, q: float, rng: np.random.Generator) -> Floats:

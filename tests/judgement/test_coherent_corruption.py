@@ -4,16 +4,11 @@ import numpy as np
 import pytest
 
 from harness.graphs import relative_error
-from sfm_shapefit import ViewGraph
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import box_graph_problem, community_graph_problem, random_graph_problem
-
-
-def placed(problem):
-    return place(ViewGraph(len(problem.locations), problem.edges, problem.directions))
 
 
 def test_wrong_pairs_agree_on_the_second_configuration_and_right_ones_on_the_truth():
@@ -55,13 +50,14 @@ def test_an_unknown_corruption_is_refused():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_fifth_of_wrong_pairs_that_agree_does_no_harm(seed):
     problem = random_graph_problem(60, q=0.2, seed=seed, corruption="self-consistent")
-    assert relative_error(placed(problem).solve.locations, problem.locations) < 1e-6  # exact recovery
+    found = place(problem.view_graph).solve
+    assert relative_error(found.locations, problem.locations) < 1e-6  # exact recovery
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_wrong_pairs_that_agree_are_found_and_nothing_but_their_agreement_is_warned_of(seed):
     problem = random_graph_problem(60, sigma=0.01, q=0.2, seed=seed, corruption="self-consistent")
-    placement = placed(problem)
+    placement = place(problem.view_graph)
     rejected = np.isin(np.arange(len(problem.edges)), placement.edges[~placement.assessment.inliers])
     true = normalized(differences(problem.locations, problem.edges))
     off_deg = angle_between_deg(problem.directions, true)
@@ -75,7 +71,7 @@ def test_wrong_pairs_that_agree_are_found_and_nothing_but_their_agreement_is_war
 @pytest.mark.parametrize("q", [0.45, 0.5])
 def test_at_the_limit_the_optimum_is_wrong_and_an_answer_that_is_wrong_is_warned_of(seed, q):
     problem = random_graph_problem(60, sigma=0.01, q=q, seed=seed, corruption="self-consistent")
-    placement = placed(problem)
+    placement = place(problem.view_graph)
     assert relative_error(placement.solve.locations, problem.locations) > 0.1  # without corruption 0.005
     if relative_error(placement.locations, problem.locations) > 0.1:  # the refinement may still find it
         assert any(quality_warnings(placement))

@@ -13,7 +13,7 @@ from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.solver.test_rigid_groups import outer, rig_problem
+from tests.problems import outer, rig_problem, shape
 
 
 class Problem(NamedTuple):
@@ -54,12 +54,6 @@ def problem():
 @pytest.fixture(scope="module")
 def answers(problem):
     return {name: shape(run(problem)) for name, run in METHODS.items()}
-
-
-def shape(locations):
-    """Locations with centroid 0 and norm 1."""
-    centred = locations - locations.mean(axis=0)
-    return centred / np.linalg.norm(centred)
 
 
 def check(answers, name, changed, undo=lambda t: t):

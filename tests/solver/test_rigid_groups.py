@@ -20,32 +20,7 @@ from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
-
-
-def rig_problem(seed, frames=8, sensors=3, wrong=0.2, noise=0.0, share=0.5):
-    """Frames turned at random with sensors 0.7 from their origin, 4 apart; a share of all pairs."""
-    rng = np.random.default_rng(seed)
-    turns = np.linalg.qr(rng.normal(size=(frames, 3, 3)))[0]
-    own = 0.7 * rng.normal(size=(sensors, 3))
-    centres = 4.0 * rng.normal(size=(frames, 3))
-    labels = np.repeat(np.arange(frames), sensors)
-    offsets = np.einsum("fab,sb->fsa", turns, own).reshape(-1, 3)
-    t = centres[labels] + offsets
-    n = len(t)
-    edges = np.stack(np.triu_indices(n, 1), axis=1)
-    edges = edges[rng.random(len(edges)) < share]
-    v = normalized(t[edges[:, 0]] - t[edges[:, 1]])
-    v = normalized(v + noise * rng.normal(size=v.shape))
-    bad = rng.random(len(edges)) < wrong
-    v[bad] = normalized(rng.normal(size=v.shape))[bad]
-    graph = ViewGraph(n, edges, v, rng.uniform(0.5, 2.0, len(edges)))
-    return graph, RigidGroups(group_of=labels, offsets=offsets), t
-
-
-def outer(graph, groups):
-    """The graph without the pairs inside a body."""
-    kept = groups.joins(graph.edges)
-    return ViewGraph(graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
+from tests.problems import outer, rig_problem
 
 
 def centred(t):
