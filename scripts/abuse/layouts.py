@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 # Parameters of the camera models that the base scenes may have.
 _NUM_PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12}
-_HAS_POSE_BYTES = 1
 
 
 @dataclass(frozen=True, slots=True)

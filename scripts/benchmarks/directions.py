@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks import weights
 from benchmarks.real import SCENES
-from harness.driver import NOT_FOUND, Benchmark, positive
+from harness.driver import Benchmark, if_there, positive
 from harness.driver import Case as AnyCase
 from harness.metrics import Check, Quantity, number, numbers, verdict
 from harness.process import resident_memory_mb
@@ -125,8 +125,8 @@ def cases(args: argparse.Namespace) -> dict[str, AnyCase]:
     }
     found |= {case.name: partial(measure_case, case, args.draws) for case in (*CASES, *STILL)}
     for name in SCENES:
-        is_there = (args.data / name).is_dir()
-        found[name] = partial(weights.compare_real, name, args.data / name) if is_there else NOT_FOUND
+        folder = args.data / name
+        found[name] = if_there(folder, partial(weights.compare_real, name, folder))
     for shape in weights.MADE:
         for seed in range(weights.SEEDS):
             found[f"{shape}, made {seed}"] = partial(weights.compare_made, shape, seed)

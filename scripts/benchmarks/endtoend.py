@@ -20,7 +20,7 @@ from functools import partial
 from pathlib import Path
 
 from harness import ours
-from harness.driver import NOT_FOUND, ROOT, Benchmark, Case, positive
+from harness.driver import ROOT, Benchmark, Case, if_there, positive
 from harness.metrics import Check, Quantity, number, ratio, verdict
 from harness.process import peak_memory_mb, reset_peak
 from harness.record import table, table_of
@@ -104,8 +104,8 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         for size in sorted(args.images)
     }
     for name in () if args.quick else SETS:
-        is_there = (args.data / name).is_dir()
-        found[name] = partial(measure, name, args.data / name, args.threads) if is_there else NOT_FOUND
+        folder = args.data / name
+        found[name] = if_there(folder, partial(measure, name, folder, args.threads))
     return found
 
 

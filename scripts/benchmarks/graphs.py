@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from harness import ours
-from harness.driver import DATA, NOT_FOUND, Benchmark, Case
+from harness.driver import DATA, ROOT, Benchmark, Case, if_there
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
 from harness.metrics import Check, Quantity, number, verdict
 from harness.record import table_of
@@ -143,9 +143,8 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     found: dict[str, Case] = {}
     for name, problem in (QUICK if args.quick else PROBLEMS).items():
         seeds = 1 if problem.spec.n >= 5000 else args.repeats
-        found[name] = partial(measure_seeds, name, problem, seeds, args.data)
-        if problem.spec.family == "madrid" and not (args.data / MADRID).is_dir():
-            found[name] = NOT_FOUND
+        needed = args.data / MADRID if problem.spec.family == "madrid" else ROOT
+        found[name] = if_there(needed, partial(measure_seeds, name, problem, seeds, args.data))
     return found
 
 

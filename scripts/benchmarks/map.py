@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from harness import ours
-from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.metrics import Check, Quantity, number, ratio, verdict
 from harness.process import call, thread_environment
 from harness.record import table_of
@@ -61,9 +61,10 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     if args.quick:
         return {"ring": partial(measure_scene, "ring", args.data, 1, QUICK_RING)}
     return {
-        scene: NOT_FOUND
-        if scene != "ring" and not (args.data / scene).is_dir()
-        else partial(measure_scene, scene, args.data, args.threads, RING)
+        scene: if_there(
+            ROOT if scene == "ring" else args.data / scene,
+            partial(measure_scene, scene, args.data, args.threads, RING),
+        )
         for scene in SCENES
     }
 

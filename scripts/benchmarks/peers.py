@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from benchmarks.real import SCENES, Scene, show_errors
-from harness.driver import NOT_FOUND, Benchmark, Case, positive
+from harness.driver import Benchmark, Case, if_there, positive
 from harness.graphs import GraphSpec, draw
 from harness.metrics import Check, Quantity, number, verdict
 from harness.process import call, thread_environment
@@ -47,7 +47,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     }
     for name, scene in {} if args.quick else SCENES.items():
         folder = args.data / name
-        found[name] = partial(measure_scene, scene, folder, args.cpu_limit) if folder.is_dir() else NOT_FOUND
+        found[name] = if_there(folder, partial(measure_scene, scene, folder, args.cpu_limit))
     return found
 
 
@@ -57,7 +57,7 @@ def measure_graph(name: str, spec: GraphSpec, cpu_limit_s: int) -> on_graphs.Com
         if contender.package is None:
             call(on_graphs.measure, contender.name, QUICK, environment=thread_environment(1))
     answers = tuple(on_graphs.answer(one, spec, cpu_limit_s) for one in on_graphs.CONTENDERS)
-    return on_graphs.Compared(name=name, num_cameras=spec.n, num_edges=len(draw(spec).edges), answers=answers)
+    return on_graphs.Compared(name=name, num_edges=len(draw(spec).edges), answers=answers)
 
 
 def measure_scene(scene: Scene, folder: Path, cpu_limit_s: int) -> OnScene:

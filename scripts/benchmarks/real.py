@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 
 from harness import ours
-from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.metrics import Check, Quantity, median, number, numbers, ratio, verdict
 from harness.process import peak_memory_mb
 from harness.record import table_of
@@ -142,9 +142,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     if args.quick:
         return {QUICK.name: partial(measure, QUICK, ROOT / "data_synthetic" / QUICK.name, args)}
     return {
-        name: partial(measure, scene, args.data / name, args)
-        if (args.data / name / "sparse" / "0").is_dir()
-        else NOT_FOUND
+        name: if_there(args.data / name, partial(measure, scene, args.data / name, args))
         for name, scene in SCENES.items()
     }
 

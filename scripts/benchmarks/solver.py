@@ -30,7 +30,7 @@ from typing import TYPE_CHECKING
 
 from benchmarks.real import SCENES
 from harness import ours
-from harness.driver import NOT_FOUND, Benchmark, Case
+from harness.driver import Benchmark, Case, if_there
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
 from harness.metrics import Check, Quantity, median, number, numbers, ratio, times, verdict
 from harness.process import call, thread_environment
@@ -149,10 +149,8 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     for name in () if args.quick else SCENES:
         folder = args.data / name
         for points in POINTS:
-            is_there = (folder / "sparse" / "0").is_dir()
-            found[f"{name}, points {points}"] = (
-                partial(measure_real, name, folder, points) if is_there else NOT_FOUND
-            )
+            case = partial(measure_real, name, folder, points)
+            found[f"{name}, points {points}"] = if_there(folder, case)
     return found | {"first solve": partial(measure_first_solve, args.quick)}
 
 

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from harness import ours
-from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
+from harness.driver import ROOT, Benchmark, Case, if_there
 from harness.graphs import view_graph
 from harness.metrics import Check, Quantity, number, numbers, verdict
 from harness.record import table_of
@@ -100,8 +100,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     }
     found |= {name: partial(rank, name, args.repeats) for name in SPOILED}
     for name in (*SETS, *FURTHER_SETS):
-        is_there = (args.data / name).is_dir()
-        found[name] = partial(flag, args.data / name) if is_there else NOT_FOUND
+        found[name] = if_there(args.data / name, partial(flag, args.data / name))
     if args.quick:
         chosen = ("graph box, 20% wrong", "scene cloud, 25 images, 0.5 px", *list(SPOILED)[:1])
         found = {name: found[name] for name in chosen}

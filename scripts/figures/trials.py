@@ -74,15 +74,6 @@ class Results:
         errors = self.values[:, self.methods.index(method), :, 0]
         return np.asarray(np.minimum(errors, 1.0).mean(axis=1))
 
-    def select(self, **fixed: object) -> "Results":
-        """Return the cells whose fields have the given values."""
-        rows = [
-            k
-            for k, cell in enumerate(self.cells)
-            if all(getattr(cell, name) == value for name, value in fixed.items())
-        ]
-        return Results(tuple(self.cells[k] for k in rows), self.methods, self.values[rows], self.seconds)
-
 
 def run_trials(
     cells: Sequence[Cell],

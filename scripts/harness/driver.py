@@ -172,6 +172,11 @@ class Kept:
         return self._answers[name]
 
 
+def if_there(folder: Path, case: Case) -> Case:
+    """Return a case if its data is there, or the reason why it is skipped."""
+    return case if folder.exists() else NOT_FOUND
+
+
 def choose(cases: Mapping[str, Case], beginnings: Sequence[str]) -> dict[str, Case]:
     """Return the cases whose names begin with one of these; all without any.
 

@@ -64,8 +64,6 @@ class Positioned:
 
     reconstruction: pycolmap.Reconstruction
     num_tracks: int
-    tracks_s: float
-    """Reading the copied database and building tracks, here in Python."""
     positioning_s: float
     """`run_global_positioning` alone."""
     positioning_cpu_s: float
@@ -106,7 +104,6 @@ def position(database: Path, model: Path, setting: Setting) -> Positioned:
         RuntimeError: if no pair is left, or pycolmap reports that the positioning failed.
     """
     reference = pycolmap.Reconstruction(str(model))
-    start = time.perf_counter()
     reconstruction, graph, pose_graph = _read(database, setting.min_num_matches)
     take_rotations(reconstruction, reference)
     pose_graph.invalidate_pairs_outside_active_image_ids(set(reconstruction.reg_image_ids()))
@@ -126,7 +123,7 @@ def position(database: Path, model: Path, setting: Setting) -> Positioned:
     if not pycolmap.run_global_positioning(settings, pose_graph, reconstruction):
         raise RuntimeError("pycolmap.run_global_positioning reports failure")
     done, cpu = time.perf_counter(), time.process_time() - cpu
-    return Positioned(reconstruction, num_tracks, read - start, done - read, cpu)
+    return Positioned(reconstruction, num_tracks, done - read, cpu)
 
 
 def map_database(

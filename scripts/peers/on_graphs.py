@@ -82,7 +82,6 @@ class Compared:
     """A problem and all answers."""
 
     name: str
-    num_cameras: int
     num_edges: int
     answers: tuple[Answer, ...]
 

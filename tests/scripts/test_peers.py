@@ -81,7 +81,7 @@ def answers(*rows):
         on_graphs.Answer(name=name, ours=name.startswith("ours"), error=error, seconds=seconds)
         for name, error, seconds in rows
     )
-    return on_graphs.Compared(name="geo-1000", num_cameras=1000, num_edges=9, answers=found)
+    return on_graphs.Compared(name="geo-1000", num_edges=9, answers=found)
 
 
 def test_a_peer_is_beaten_by_error_or_by_time():
