@@ -62,7 +62,7 @@ def own_camera_rows(
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
-    sigmas = scale * (assessment.sigmas if axes is None else _turned_sigmas(assessment.covariances, axes))
+    sigmas = scale * (assessment.sigmas if axes is None else _turn_sigmas(assessment.covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -82,7 +82,7 @@ def own_camera_rows(
     return rows
 
 
-def _turned_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+def _turn_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
     """Return standard deviations (n, d) along other axes, infinite where nothing holds a node."""
     held = ~np.isinf(covariances).any(axis=(1, 2))
     sigmas = np.full(covariances.shape[:2], np.inf)
