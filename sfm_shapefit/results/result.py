@@ -99,7 +99,7 @@ class LocateResult(Displayed):
     @property
     def certified(self) -> SolverResult:
         """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.solve
+        return self.placement.certified
 
     @property
     def pieces(self) -> list[RigidPiece]:
@@ -215,7 +215,7 @@ class GraphResult(Displayed):
     @property
     def certified(self) -> SolverResult:
         """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.solve
+        return self.placement.certified
 
     @cached_property
     def cameras(self) -> list[CameraRow]:

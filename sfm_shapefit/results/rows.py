@@ -102,8 +102,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     graph = placement.graph
     judged: dict[int, tuple[Placement, int, float]] = {}
     for piece in (placement, *further):
-        dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
-        if not piece.solve.status.has_certificate:
+        dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
+        if not piece.certified.status.has_certificate:
             dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
     dropped = set(placement.dropped.tolist())
