@@ -80,7 +80,7 @@ def test_completion_shows_public_names_only():
 
 
 def test_what_follows_the_first_two_arguments_is_given_by_name():
-    more = {"certify": 3, "place": 6}
+    more = {"certify": 3}
     functions = [getattr(sfm_shapefit, name) for name in sfm_shapefit.__all__]
     for function in (one for one in functions if inspect.isfunction(one)):
         kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
@@ -105,6 +105,9 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     solved = sfm_shapefit.solve(problem.view_graph, tol=1e-6)
     assert solved.converged
     assert repr(solved).startswith("<SolverResult: 12 locations, converged")
+    placed = sfm_shapefit.place(problem.view_graph, refine=False)
+    assert (placed.refined.is_refined, placed.certified.converged) == (False, True)
+    assert repr(placed).startswith("<Placement: 12 of 12 nodes placed, 0 of")
     located.timings_s["<script>"] = 1.0
     table = located._repr_html_()
     del located.timings_s["<script>"]

@@ -218,7 +218,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
         best = relative_error(oracle(one)[rows], truth)
     placed = relative_error(placement.locations, truth)
     return Trial(
-        shapefit=relative_error(placement.solve.locations[:count], truth),
+        shapefit=relative_error(placement.certified.locations[:count], truth),
         lud=np.nan if lud is None else relative_error(lud[:count], truth),
         placed=placed,
         oracle=best,

@@ -164,4 +164,4 @@ def _errors(directions: "PairDirections", weights: "FloatArray", centers: "Float
         distances = np.linalg.norm(aligned.apply(t[known]) - true[known], axis=1)
         return float(np.median(distances)), float(np.mean(distances))
 
-    return Errors(shapefit=errors_of(placement.solve.locations), placed=errors_of(placement.locations))
+    return Errors(shapefit=errors_of(placement.certified.locations), placed=errors_of(placement.locations))

@@ -79,9 +79,9 @@ def map_database(
             clock.advance,
         )
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
-    for members, averaging in run.components(unposed.num_images, relative, reasons):
+    for members, averaging in run.average_components(unposed.num_images, relative, reasons):
         try:
-            found = run.located(path, images, unposed, members, averaging)
+            found = run.locate_component(path, images, unposed, members, averaging)
         except UnsolvableError as error:
             reasons |= dict.fromkeys(members.tolist(), f"its component cannot be placed: {error}")
             continue
@@ -90,7 +90,7 @@ def map_database(
         for k in members.tolist():
             del reasons[k]
     if not models:
-        raise UnsolvableError(_nothing_placed(path, relative, reasons))
+        raise UnsolvableError(_explain_failure(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
     left_out = {unposed.names[k]: reason for k, reason in sorted(reasons.items())}
     return MapResult(
@@ -112,14 +112,14 @@ class _Run:
     options: MapOptions
     clock: Clock
 
-    def components(
+    def average_components(
         self, num_images: int, relative: RelativeRotations, reasons: dict[int, str]
     ) -> Iterator[tuple[IntArray, AveragedRotations]]:
         """Yield the images of each component that got rotations, ascending, and those rotations.
 
         Why an image belongs to none is written to `reasons`.
         """
-        waiting = _connected(num_images, relative.pairs)
+        waiting = _group_images(num_images, relative.pairs)
         while waiting:
             members = waiting.pop(0)
             if len(members) < self.options.min_model_size:
@@ -129,7 +129,7 @@ class _Run:
                 continue
             with self.clock("rotation averaging"):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-                local = _renumbered(inside, members)
+                local = _renumber(inside, members)
                 try:
                     answer = averaged(len(members), local, self.options.min_matches)
                 except UnsolvableError as error:
@@ -139,12 +139,12 @@ class _Run:
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
                 rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
-                among = _connected(num_images, rest)
+                among = _group_images(num_images, rest)
                 waiting = [*waiting, *(group for group in among if len(group) > 1)]
             if answer.registered.sum() >= self.options.min_model_size:
-                yield members[answer.registered], _of_registered(answer)
+                yield members[answer.registered], _drop_unregistered(answer)
 
-    def located(
+    def locate_component(
         self,
         path: Path,
         images: UnposedImages,
@@ -162,13 +162,13 @@ class _Run:
         rotations = averaging.rotations
         if self.options.bundle_adjust:
             with self.clock("draft"):
-                rotations = self._drafted(path, images, image_ids, rotations, settings)
+                rotations = self._refine_by_draft(path, images, image_ids, rotations, settings)
             settings["refine_rotations"] = False
         with self.clock("locate"):
             model = pose_at_origin(images.reconstruction, image_ids, rotations)
             return locate(model, path, options=LocateOptions(**settings), progress=self.clock.progress)
 
-    def _drafted(
+    def _refine_by_draft(
         self,
         path: Path,
         images: UnposedImages,
@@ -202,14 +202,14 @@ class _Run:
         return np.where(posed[:, None, None], turned, rotations @ common)
 
 
-def _connected(num_images: int, pairs: IntArray) -> list[IntArray]:
+def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:
     """Return the connected components, ascending, the largest first; single images are components too."""
     labels = connected_components(num_images, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
 
 
-def _renumbered(relative: RelativeRotations, members: IntArray) -> RelativeRotations:
+def _renumber(relative: RelativeRotations, members: IntArray) -> RelativeRotations:
     """Return pairs among `members` (ascending) as positions in it."""
     return RelativeRotations(
         pairs=np.searchsorted(members, relative.pairs),
@@ -219,7 +219,7 @@ def _renumbered(relative: RelativeRotations, members: IntArray) -> RelativeRotat
     )
 
 
-def _of_registered(answer: AveragedRotations) -> AveragedRotations:
+def _drop_unregistered(answer: AveragedRotations) -> AveragedRotations:
     """Return the answer for the images that have a rotation."""
     kept = answer.registered
     return replace(
@@ -230,7 +230,7 @@ def _of_registered(answer: AveragedRotations) -> AveragedRotations:
     )
 
 
-def _nothing_placed(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:
+def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:
     """Say why no component could be placed."""
     if len(relative.pairs) == 0:
         return (

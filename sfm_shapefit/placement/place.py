@@ -7,11 +7,13 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.baselines import FILTERS, solve_baseline
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.judgement.second_configuration import SecondConfiguration, find_second_configuration
 from sfm_shapefit.judgement.verdicts import Assessment, assess
@@ -21,6 +23,7 @@ from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, re
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.rigs import solve_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
@@ -33,8 +36,8 @@ _MOST_WATCHED = 100_000
 """Edges up to which the iterations of the solve are recorded; beyond, the objectives cost seconds."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Placement:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Placement(Displayed):
     """The locations of one rigid piece of a measured graph, and the evidence for them."""
 
     measured: MeasuredGraph
@@ -45,7 +48,7 @@ class Placement:
     """The parallel-rigid pieces of the others, most cameras first; or the one of tied rigid groups."""
     piece: int
     """The one that is placed: 0, the largest, or one of the further ones."""
-    solve: SolverResult
+    certified: SolverResult
     """The certified ShapeFit optimum, or a baseline's answer without certificate. Row k belongs to node
     `nodes[k]` of the graph, row e of the dual to its edge `edges[e]`."""
     refined: RefinedPlacement
@@ -116,6 +119,23 @@ class Placement:
         pairs: IntArray = self.graph.edges[self.edges[rejected]]
         return pairs
 
+    def summary(self) -> dict[str, Any]:
+        """Return the main figures in plain values."""
+        return {
+            "num_nodes": self.graph.num_nodes,
+            "num_placed": len(self.nodes),
+            "num_pairs": self.num_pairs,
+            "num_pairs_rejected": len(self.rejected_pairs),
+            "num_pairs_filtered": len(self.dropped),
+            "residual_level_deg": self.assessment.level_deg,
+            "start": self.refined.start,
+            "solve": self.certified.summary(),
+        }
+
+    def _headline(self) -> str:
+        rejected = f"{len(self.rejected_pairs)} of {self.num_pairs} pairs rejected"
+        return f"{len(self.nodes)} of {self.graph.num_nodes} nodes placed, {rejected}"
+
     def measured_part(self) -> MeasuredGraph:
         """Return what was measured of the piece that is placed."""
         return self.measured.part(self.edges)[0]
@@ -126,6 +146,7 @@ def place(
     options: PlacementOptions | None = None,
     *,
     on_iteration: OnIteration | None = None,
+    **overrides: Any,
 ) -> Placement:
     """Place the cameras of a view graph: pieces, both convex starts, refinement, verdicts, trust.
 
@@ -139,9 +160,10 @@ def place(
     Args:
         measured: any view graph with at least one edge, best with what is known of its directions; what its
             largest rigid piece leaves out is not placed.
-        options: settings; defaults if None.
+        options: settings, see `help(PlacementOptions)`; defaults if None.
         on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
             False ends the solve there, and the placement goes on from the last iterate.
+        **overrides: single options by name: `place(graph, refine=False)`.
 
     Raises:
         InputError: if an option does not go with rigid groups.
@@ -150,7 +172,7 @@ def place(
     """
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)
-    options = options or PlacementOptions()
+    options = merge_options(options, PlacementOptions, overrides)
     dropped, pieces = _split(measured, options)
     return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
 
@@ -193,7 +215,7 @@ def _place_piece(
         dropped=dropped,
         pieces=pieces,
         piece=k,
-        solve=solved,
+        certified=solved,
         refined=refined,
         assessment=assessment,
         second_configuration=second,

@@ -50,22 +50,22 @@ def write_meshes(drawing: Drawing, folder: Path) -> None:
     right, forward, up = drawing.axes
     turn = np.stack([right, up, -forward])
 
-    def turned(points: FloatArray) -> FloatArray:
+    def turn_upright(points: FloatArray) -> FloatArray:
         moved: FloatArray = (points - middle) @ turn.T
         return moved
 
     shown = trimesh.Scene()
     if len(faces):
-        shown.add_geometry(_mesh(turned(vertices), faces, colors), geom_name="cameras")
+        shown.add_geometry(_mesh(turn_upright(vertices), faces, colors), geom_name="cameras")
     if len(drawing.points.positions):
-        positions = turned(drawing.points.positions)
+        positions = turn_upright(drawing.points.positions)
         shown.add_geometry(
             trimesh.PointCloud(positions, colors=_opaque(drawing.points.colors)), geom_name="points"
         )
     for kind in PairClass:
         mine = (line_colors == PAIR_COLORS[kind]).all(axis=1)
         if mine.any():
-            lines = trimesh.load_path(turned(ends[mine].reshape(-1, 3)).reshape(-1, 2, 3))
+            lines = trimesh.load_path(turn_upright(ends[mine].reshape(-1, 3)).reshape(-1, 2, 3))
             lines.colors = np.tile([*PAIR_COLORS[kind], 255], (len(lines.entities), 1))
             shown.add_geometry(lines, geom_name=f"pairs: {kind.name.lower().replace('_', ' ')}")
     (folder / "scene.glb").write_bytes(shown.export(file_type="glb"))

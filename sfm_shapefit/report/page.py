@@ -25,7 +25,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, PairClass, frustum_corners
-from sfm_shapefit.report.sentences import Hint, first_looks, shortened, summary_sentences
+from sfm_shapefit.report.sentences import Hint, first_looks, shorten, summary_sentences
 from sfm_shapefit.results.tables import IN_MEMORY
 
 MAX_PAIRS = 20_000
@@ -95,10 +95,10 @@ def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
         "cameras": _cameras(drawing, cameras, display, reasons),
         "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
-            "positions": _packed(display(drawing.points.positions), "f4"),
-            "colors": _packed(drawing.points.colors, "u1"),
+            "positions": _pack(display(drawing.points.positions), "f4"),
+            "colors": _pack(drawing.points.colors, "u1"),
         },
-        "reasons": [shortened(text) for text in reasons],
+        "reasons": [shorten(text) for text in reasons],
         "sceneNote": _scene_note(drawing),
         "pairsNote": _pairs_note(drawing),
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
@@ -114,7 +114,7 @@ def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
         "options": [[name.replace("_", " "), _option(value)] for name, value in facts["options"].items()],
         "versions": [
-            [shortened(str(name)), shortened(_option(value), 400)]
+            [shorten(str(name)), shorten(_option(value), 400)]
             for name, value in (facts["versions"] | facts["inputs"]).items()
         ],
     }
@@ -148,17 +148,17 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
     corners = frustum_corners(drawing, order, cameras.centers[order])
     shown = display(cameras.poses.centers[order]) if drawing.input_is_aligned else None
     return {
-        "names": [shortened(cameras.names[k]) for k in order.tolist()],
-        "placed": _packed(cameras.placed[order], "u1"),
-        "trust": _packed(cameras.trust[order], "f4"),
-        "sigma": _packed(np.where(np.isfinite(cameras.sigmas), cameras.sigmas, np.nan)[order], "f4"),
-        "degree": _packed(cameras.degrees[order], "i4"),
-        "piece": _packed(cameras.pieces[order], "i4"),
-        "reason": _codes([cameras.reasons[k] for k in order.tolist()], reasons),
-        "world": _packed(cameras.centers[order], "f8"),
-        "center": _packed(display(cameras.centers[order]), "f4"),
-        "corners": _packed(display(corners), "f4"),
-        "inputCenter": None if shown is None else _packed(shown, "f4"),
+        "names": [shorten(cameras.names[k]) for k in order.tolist()],
+        "placed": _pack(cameras.placed[order], "u1"),
+        "trust": _pack(cameras.trust[order], "f4"),
+        "sigma": _pack(np.where(np.isfinite(cameras.sigmas), cameras.sigmas, np.nan)[order], "f4"),
+        "degree": _pack(cameras.degrees[order], "i4"),
+        "piece": _pack(cameras.pieces[order], "i4"),
+        "reason": _encode([cameras.reasons[k] for k in order.tolist()], reasons),
+        "world": _pack(cameras.centers[order], "f8"),
+        "center": _pack(display(cameras.centers[order]), "f4"),
+        "corners": _pack(display(corners), "f4"),
+        "inputCenter": None if shown is None else _pack(shown, "f4"),
     }
 
 
@@ -174,20 +174,20 @@ def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str,
         "dual": pairs.dual_norms,
     }
     return {
-        "first": _packed(ends[:, 0], "i4"),
-        "second": _packed(ends[:, 1], "i4"),
-        "verdict": _packed(pairs.classes[order], "u1"),
-        "support": _packed(pairs.support[order], "i4"),
-        "reason": _codes([pairs.reasons[k] for k in order.tolist()], reasons),
-    } | {name: _packed(values[order], "f4") for name, values in columns.items()}
+        "first": _pack(ends[:, 0], "i4"),
+        "second": _pack(ends[:, 1], "i4"),
+        "verdict": _pack(pairs.classes[order], "u1"),
+        "support": _pack(pairs.support[order], "i4"),
+        "reason": _encode([pairs.reasons[k] for k in order.tolist()], reasons),
+    } | {name: _pack(values[order], "f4") for name, values in columns.items()}
 
 
-def _codes(texts: Sequence[str], known: dict[str, int]) -> dict[str, str]:
+def _encode(texts: Sequence[str], known: dict[str, int]) -> dict[str, str]:
     """Return the numbers of texts, and add those that are new to the known ones."""
-    return _packed(np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64), "i4")
+    return _pack(np.array([known.setdefault(text, len(known)) for text in texts], dtype=np.int64), "i4")
 
 
-def _packed(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
+def _pack(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
     """Return an array as base64 of little-endian numbers, which the page decodes."""
     raw = np.ascontiguousarray(values, dtype=np.dtype(_TYPES[kind]).newbyteorder("<")).tobytes()
     return {"type": kind, "bytes": base64.b64encode(raw).decode("ascii")}
@@ -198,9 +198,9 @@ def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
     return {
         "side": len(matrix.cells),
         "perCell": matrix.cameras_per_cell,
-        "cells": _packed(matrix.cells, "f4"),
-        "counts": _packed(matrix.counts, "i4"),
-        "rowOf": _packed(rank, "i4"),
+        "cells": _pack(matrix.cells, "f4"),
+        "counts": _pack(matrix.counts, "i4"),
+        "rowOf": _pack(rank, "i4"),
     }
 
 
@@ -226,14 +226,14 @@ def _title(facts: dict[str, Any]) -> str:
     inputs = facts["inputs"]
     model, database = inputs.get("model"), inputs.get("database")
     named = database if model == IN_MEMORY and database else model or inputs.get("graph")
-    return shortened(str(named))
+    return shorten(str(named))
 
 
 def _subtitle(facts: dict[str, Any]) -> str:
     inputs = facts["inputs"]
     directions = inputs.get("directions")
     origin = f"directions from {directions}; " if directions else f"{facts.get('dimension', 3)} dimensions; "
-    return shortened(origin + f"{sum(facts['timings_s'].values()):.1f} s in all", 400)
+    return shorten(origin + f"{sum(facts['timings_s'].values()):.1f} s in all", 400)
 
 
 def _tiles(drawing: Drawing, facts: dict[str, Any]) -> list[list[str]]:
@@ -341,7 +341,7 @@ def _convergence_note(drawing: Drawing) -> str:
 
 
 def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
-    hinges = [shortened(name, 60) for name in piece["hinges"][:_MAX_HINGES]]
+    hinges = [shorten(name, 60) for name in piece["hinges"][:_MAX_HINGES]]
     if len(piece["hinges"]) > _MAX_HINGES:
         hinges.append(f"and {len(piece['hinges']) - _MAX_HINGES:,} more")
     return {
@@ -349,7 +349,7 @@ def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
         "cameras": piece["num_cameras"],
         "placed": piece["num_placed"],
         "hinges": ", ".join(hinges),
-        "scale": shortened(piece["scale"]),
+        "scale": shorten(piece["scale"]),
         "folder": piece["folder"],
     }
 

@@ -49,7 +49,7 @@ def _certified(placement: Placement, num_rows: int) -> FloatArray:
     """Return the certified optimum by camera, NaN for those that it does not place."""
     locations = np.full((num_rows, placement.graph.dimension), np.nan)
     cameras = placement.cameras
-    locations[cameras] = placement.solve.locations[: len(cameras)]
+    locations[cameras] = placement.certified.locations[: len(cameras)]
     return locations
 
 

@@ -1,7 +1,7 @@
 """The report in words: what was placed, how certain it is, and what to look at first.
 
 Sentences are plain text. Names in them come from strangers: whoever shows a sentence shows it as text, and
-`shortened` keeps a name of any length readable.
+`shorten` keeps a name of any length readable.
 """
 
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ class Hint:
     """A row of the pairs."""
 
 
-def shortened(text: str, limit: int = MAX_TEXT) -> str:
+def shorten(text: str, limit: int = MAX_TEXT) -> str:
     """Return text on one line, of bounded length, without control characters; the end of a name is kept."""
     head, tail = limit * 2 // 3, limit // 3
     if len(text) > limit:
@@ -53,14 +53,14 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         _pairs(drawing, facts),
         *_certainty(drawing),
         _optimum(facts["solve"]),
-        f"Scale and origin: {shortened(_scale(facts), 2 * MAX_TEXT)}.",
+        f"Scale and origin: {shorten(_scale(facts), 2 * MAX_TEXT)}.",
     ]
 
 
 def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
     return [
-        *(Hint(text=shortened(text, 2 * MAX_TEXT)) for text in facts["warnings"]),
+        *(Hint(text=shorten(text, 2 * MAX_TEXT)) for text in facts["warnings"]),
         *_left_out(drawing),
         *_least_trusted(drawing),
         *_contradictions(drawing),
@@ -108,7 +108,7 @@ def _certainty(drawing: Drawing) -> Iterator[str]:
     yield (
         f"The median standard deviation of a position is {median:.2g} units, "
         f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
-        f"{drawing.cameras.sigmas[worst]:.2g}, of {shortened(drawing.cameras.names[worst])}."
+        f"{drawing.cameras.sigmas[worst]:.2g}, of {shorten(drawing.cameras.names[worst])}."
     )
 
 
@@ -136,7 +136,7 @@ def _left_out(drawing: Drawing) -> Iterator[Hint]:
     rows = np.flatnonzero(~drawing.cameras.placed).tolist()
     for row in rows[:_SHOWN]:
         name, reason = drawing.cameras.names[row], drawing.cameras.reasons[row]
-        yield Hint(text=f"{shortened(name)} is not placed: {shortened(reason)}", camera=row)
+        yield Hint(text=f"{shorten(name)} is not placed: {shorten(reason)}", camera=row)
     if len(rows) > _SHOWN:
         yield Hint(text=f"{len(rows) - _SHOWN:,} more are not placed; the table of cameras says why")
 
@@ -145,9 +145,9 @@ def _least_trusted(drawing: Drawing) -> Iterator[Hint]:
     trust = np.where(drawing.cameras.placed, drawing.cameras.trust, np.nan)
     low = np.flatnonzero(trust < _LOW_TRUST)
     for row in low[np.argsort(trust[low], kind="stable")][:_SHOWN].tolist():
-        reason = shortened(drawing.cameras.reasons[row] or "its pairs speak against it")
+        reason = shorten(drawing.cameras.reasons[row] or "its pairs speak against it")
         yield Hint(
-            text=f"{shortened(drawing.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row
+            text=f"{shorten(drawing.cameras.names[row])} has trust {trust[row]:.2f}: {reason}", camera=row
         )
 
 
@@ -167,7 +167,7 @@ def _contradictions(drawing: Drawing) -> Iterator[Hint]:
     against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
     for row in against[order][:_SHOWN].tolist():
-        first, second = (shortened(drawing.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
+        first, second = (shorten(drawing.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
         matches = f" with {pairs.support[row]:,} matches" if pairs.support[row] else ""
         yield Hint(
             text=f"{first} to {second}{matches} contradicts the solution "
@@ -178,9 +178,9 @@ def _contradictions(drawing: Drawing) -> Iterator[Hint]:
 
 def _loose(facts: dict[str, Any]) -> Iterator[Hint]:
     for group in facts["loose_groups"][:_SHOWN]:
-        names = ", ".join(shortened(name, 40) for name in group["cameras"][:_SHOWN])
+        names = ", ".join(shorten(name, 40) for name in group["cameras"][:_SHOWN])
         more = f" and {len(group['cameras']) - _SHOWN:,} more" if len(group["cameras"]) > _SHOWN else ""
-        yield Hint(text=f"{names}{more}: loose, {shortened(group['cause'])}")
+        yield Hint(text=f"{names}{more}: loose, {shorten(group['cause'])}")
 
 
 def _unchecked(drawing: Drawing) -> Iterator[Hint]:

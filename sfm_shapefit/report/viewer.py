@@ -16,7 +16,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
-from sfm_shapefit.report.sentences import shortened
+from sfm_shapefit.report.sentences import shorten
 
 if TYPE_CHECKING:
     import viser
@@ -49,7 +49,7 @@ class Thresholds:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DrawnPairs:
+class SelectedPairs:
     """The pairs that some thresholds leave."""
 
     rows: IntArray
@@ -57,7 +57,7 @@ class DrawnPairs:
     """By the threshold, not by the verdict."""
 
 
-def drawn_pairs(drawing: Drawing, thresholds: Thresholds) -> DrawnPairs:
+def select_pairs(drawing: Drawing, thresholds: Thresholds) -> SelectedPairs:
     """Return which pairs are drawn and how, the worst first."""
     cameras, pairs = drawing.cameras, drawing.pairs
     shown = cameras.placed & ~(cameras.trust < thresholds.min_trust)
@@ -67,7 +67,7 @@ def drawn_pairs(drawing: Drawing, thresholds: Thresholds) -> DrawnPairs:
         kept &= (pairs.cameras == thresholds.camera).any(axis=1)
     worst = pairs.worst_first()
     rows = worst[kept[worst]][:_MAX_PAIRS]
-    return DrawnPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
+    return SelectedPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
 
 
 def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> int | None:
@@ -158,7 +158,7 @@ class _View:
         self._support = gui.add_slider("least matches", 0, max(top, 1), 1, 0)
         self._trust = gui.add_slider("least trust", 0.0, 1.0, 0.01, 0.0)
         names = [
-            f"{k + 1}: {shortened(drawing.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
+            f"{k + 1}: {shorten(drawing.cameras.names[row], 80)}" for k, row in enumerate(self._by_trust)
         ]
         self._picked = gui.add_dropdown("pairs of", [_NOBODY, *names], initial_value=_NOBODY)
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
@@ -191,7 +191,7 @@ class _View:
         colors = trust_colors(drawing.cameras.trust[rows])
         colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
         self._frusta("/cameras", rows, drawing.cameras.centers[rows], colors)
-        drawn = drawn_pairs(drawing, thresholds)
+        drawn = select_pairs(drawing, thresholds)
         kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
         ends = drawing.cameras.centers[drawing.pairs.cameras[drawn.rows]]
         self._lines("/pairs", ends, PAIR_COLORS[kinds])

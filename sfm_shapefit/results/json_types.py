@@ -247,7 +247,7 @@ class InspectSummary(TypedDict):
     points: Annotated[str, "Whether 3D points join the graph, and why."]
     diagnosis: Diagnosis
     theory: Annotated[dict[str, Any] | None, "Constants of the recovery theorems, if asked for."]
-    expected: Annotated[Expected | None, "What locate will take on this machine; null for a bare graph."]
+    expected: Annotated[Expected | None, "What locate will take; null for a bare graph."]
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
 
 

@@ -99,7 +99,7 @@ class LocateResult(Displayed):
     @property
     def certified(self) -> SolverResult:
         """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.solve
+        return self.placement.certified
 
     @property
     def pieces(self) -> list[RigidPiece]:
@@ -142,7 +142,7 @@ class LocateResult(Displayed):
         names = self.model.names
         axes = self.gauge.axes
         return [
-            _turned(next(usable), axes)
+            _turn(next(usable), axes)
             if status is DirectionStatus.USABLE
             else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
             for (i, j), status, support in zip(
@@ -154,7 +154,7 @@ class LocateResult(Displayed):
         ]
 
 
-def _turned(row: PairRow, axes: FloatArray | None) -> PairRow:
+def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:
     """Return a pair's row with its direction in the output's axes."""
     return row if axes is None else replace(row, direction=tuple((axes @ np.array(row.direction)).tolist()))
 
@@ -215,7 +215,7 @@ class GraphResult(Displayed):
     @property
     def certified(self) -> SolverResult:
         """The solve of the largest rigid piece, with its certificate, before any refinement."""
-        return self.placement.solve
+        return self.placement.certified
 
     @cached_property
     def cameras(self) -> list[CameraRow]:

@@ -62,7 +62,7 @@ def own_camera_rows(
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
-    sigmas = scale * (assessment.sigmas if axes is None else _turned_sigmas(assessment.covariances, axes))
+    sigmas = scale * (assessment.sigmas if axes is None else _turn_sigmas(assessment.covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -82,7 +82,7 @@ def own_camera_rows(
     return rows
 
 
-def _turned_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+def _turn_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
     """Return standard deviations (n, d) along other axes, infinite where nothing holds a node."""
     held = ~np.isinf(covariances).any(axis=(1, 2))
     sigmas = np.full(covariances.shape[:2], np.inf)
@@ -102,8 +102,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     graph = placement.graph
     judged: dict[int, tuple[Placement, int, float]] = {}
     for piece in (placement, *further):
-        dual_norms = np.linalg.norm(piece.solve.dual, axis=1) / graph.weights[piece.edges]
-        if not piece.solve.status.has_certificate:
+        dual_norms = np.linalg.norm(piece.certified.dual, axis=1) / graph.weights[piece.edges]
+        if not piece.certified.status.has_certificate:
             dual_norms[:] = np.nan
         judged |= {edge: (piece, e, dual_norms[e]) for e, edge in enumerate(piece.edges.tolist())}
     dropped = set(placement.dropped.tolist())

@@ -92,7 +92,7 @@ def summarize_graph(found: "GraphResult") -> GraphSummary:
         "pieces": _describe_pieces(
             placement, [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)]
         ),
-        "solve": cast("Solve", placement.solve.summary()),
+        "solve": cast("Solve", placement.certified.summary()),
         "finish": _summarize_finish(placement.refined),
         "timings_s": found.timings_s,
         "warnings": list(graph_warnings(placement)),

@@ -65,7 +65,10 @@ OnIteration = Callable[[IterationInfo], bool | None]
 @explained
 @dataclass(frozen=True, kw_only=True)
 class SolverOptions(Settings):
-    """The certified program, unit-free: it fixes its own scale."""
+    """The certified program.
+
+    It has no unit: it fixes its own scale.
+    """
 
     solver: Solver = option(
         "auto",

@@ -19,7 +19,7 @@ import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.options import LocateOptions
 from tests.program import run
-from tests.scenes import COURTYARD, FACADE, RING, ROOT, copied, fingerprint
+from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, ROOT, copied, fingerprint
 
 RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
 
@@ -89,6 +89,26 @@ def test_version_and_both_flags_of_help_are_there():
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
     assert run("view", "-h").stdout.startswith("Usage:")
+
+
+def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
+    graph = BUNDLED / "graph40.txt"
+    flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
+    options = json.loads(run("solve", graph, tmp_path / "out", *flags).stdout)["options"]
+    assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
+    text = run("place", "--help").stdout
+    assert "--method" not in text
+    assert "--factor-memory " not in text
+    assert run("solve", "--help").stdout == text.replace(" place ", " solve ", 1)
+    assert "solve" not in run("--help").stdout
+
+
+def test_help_lists_flags_in_the_groups_of_the_stages():
+    text = run("locate", "--help").stdout
+    titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert titles[:2] == ["Arguments:", "Options:"]
+    assert titles[-1] == "What is written and shown:"
+    assert len(titles) == 8
 
 
 def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_path):

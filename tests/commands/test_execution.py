@@ -16,8 +16,8 @@ from sfm_shapefit.commands.stages.execution import (
     DirectionTask,
     WorkerError,
     measure_task,
+    measure_with_workers,
     open_executor,
-    share_out,
 )
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import concatenate
@@ -53,7 +53,7 @@ def serial(workspace, model):
 def shared(workspace, model, executor, matches_per_task=700):
     seen = []
     with open_database(workspace / "database.db", model) as database:
-        parts = share_out(
+        parts = measure_with_workers(
             database, model, DirectionOptions(), executor, lambda *done: seen.append(done), matches_per_task
         )
     return concatenate(parts), seen

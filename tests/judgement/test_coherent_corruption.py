@@ -50,7 +50,7 @@ def test_an_unknown_corruption_is_refused():
 @pytest.mark.parametrize("seed", range(3))
 def test_a_fifth_of_wrong_pairs_that_agree_does_no_harm(seed):
     problem = random_graph_problem(60, q=0.2, seed=seed, corruption="self-consistent")
-    found = place(problem.view_graph).solve
+    found = place(problem.view_graph).certified
     assert relative_error(found.locations, problem.locations) < 1e-6  # exact recovery
 
 
@@ -72,6 +72,6 @@ def test_wrong_pairs_that_agree_are_found_and_nothing_but_their_agreement_is_war
 def test_at_the_limit_the_optimum_is_wrong_and_an_answer_that_is_wrong_is_warned_of(seed, q):
     problem = random_graph_problem(60, sigma=0.01, q=q, seed=seed, corruption="self-consistent")
     placement = place(problem.view_graph)
-    assert relative_error(placement.solve.locations, problem.locations) > 0.1  # without corruption 0.005
+    assert relative_error(placement.certified.locations, problem.locations) > 0.1  # without corruption 0.005
     if relative_error(placement.locations, problem.locations) > 0.1:  # the refinement may still find it
         assert any(quality_warnings(placement))

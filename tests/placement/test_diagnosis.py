@@ -123,8 +123,8 @@ def test_the_plan_is_what_a_placement_does(method):
     graph = problem.view_graph
     options = PlacementOptions(solver=method, tol=1e-4)
     plan, done = diagnose(graph, options).plan, place(graph, options)
-    assert plan.solver == done.solve.method
-    assert done.solve.method_reason.startswith(plan.solver_reason)
+    assert plan.solver == done.certified.method
+    assert done.certified.method_reason.startswith(plan.solver_reason)
     assert plan.second_start == (done.refined.lud is not None)
     assert isinstance(options, SolverOptions)
 

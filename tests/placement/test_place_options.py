@@ -51,10 +51,13 @@ def measure(kind, wrong=0.2, other=None):
 
 # Another value of each option, and what must then be so of the placement, given that with the defaults.
 OPTIONS = {
-    "solver": ("admm", lambda found, _: found.solve.method == "admm"),
-    "tol": (1e-2, lambda found, usual: found.solve.iterations < usual.solve.iterations),
-    "max_iterations": (1, lambda found, _: found.solve.status is Status.MAX_ITERATIONS),
-    "uniqueness": (False, lambda found, usual: (found.solve.unique, usual.solve.unique) == (None, True)),
+    "solver": ("admm", lambda found, _: found.certified.method == "admm"),
+    "tol": (1e-2, lambda found, usual: found.certified.iterations < usual.certified.iterations),
+    "max_iterations": (1, lambda found, _: found.certified.status is Status.MAX_ITERATIONS),
+    "uniqueness": (
+        False,
+        lambda found, usual: (found.certified.unique, usual.certified.unique) == (None, True),
+    ),
     "factor_memory_mb": (
         NO_FACTOR,
         lambda found, _: not found.refined.is_refined and np.isnan(found.assessment.sigmas).all(),
@@ -100,7 +103,7 @@ def test_every_option_is_obeyed_or_refused_in_one_sentence(usual, name):
 def test_baselines_are_refused_with_groups_and_the_conic_solver_knows_them():
     with pytest.raises(InputError, match="rigs and fixed cameras go with the objectives"):
         place(measure("rigs"), PlacementOptions(objective="linf"))
-    assert place(measure("rigs"), PlacementOptions(solver="conic")).solve.method == "conic"
+    assert place(measure("rigs"), PlacementOptions(solver="conic")).certified.method == "conic"
 
 
 @pytest.mark.parametrize("kind", ["rigs", "fixed"])
@@ -116,8 +119,10 @@ def test_groups_are_placed_without_the_refinement_where_only_its_factor_would_be
 
 def test_iterations_are_recorded_told_and_can_be_cancelled(usual):
     _, measured, placement = usual
-    assert [info.iteration for info in placement.history] == list(range(1, placement.solve.iterations + 1))
-    assert placement.history[-1].objective == pytest.approx(placement.solve.objective, abs=1e-8)
+    assert [info.iteration for info in placement.history] == list(
+        range(1, placement.certified.iterations + 1)
+    )
+    assert placement.history[-1].objective == pytest.approx(placement.certified.objective, abs=1e-8)
     told = []
 
     def cancel(info):
@@ -125,7 +130,7 @@ def test_iterations_are_recorded_told_and_can_be_cancelled(usual):
         return len(told) < 2
 
     cancelled = place(measured, on_iteration=cancel)
-    assert cancelled.solve.status is Status.CANCELLED
+    assert cancelled.certified.status is Status.CANCELLED
     assert len(told) == len(cancelled.history) == 2
     assert all(info.limit >= 2 for info in told)
 

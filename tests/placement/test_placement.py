@@ -54,7 +54,7 @@ def test_rows_speak_of_the_whole_graph():
     t, edges, v = two_pieces()
     graph = ViewGraph(7, edges, v, names=[f"image{k}" for k in range(7)])
     placement = place(graph)
-    rows = camera_rows(placement, placement.solve.locations, 2.0)
+    rows = camera_rows(placement, placement.certified.locations, 2.0)
     assert [row.placed for row in rows] == [True] * 5 + [False] * 2
     assert [row.piece for row in rows] == [0] * 5 + [1, 1]
     assert rows[5].reason == "another rigid piece, hinged at image4"

@@ -73,7 +73,7 @@ def test_a_fifth_of_wrong_directions_costs_less_than_8_percent(family):
     assert len(placement.cameras) == len(problem.locations)
     assert not placement.refined.collapsed
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best  # measured 1.02 to 1.04
-    assert shape_error(placement.solve.locations, problem.locations) > 1.5 * best
+    assert shape_error(placement.certified.locations, problem.locations) > 1.5 * best
 
 
 @pytest.mark.parametrize("family", CHAINS)
@@ -82,7 +82,7 @@ def test_chains_on_which_shapefit_collapses_are_placed(family):
     placement = place(problem.view_graph)
     finish = placement.refined
     assert finish.lud is not None
-    assert shape_error(placement.solve.locations, problem.locations) > 0.3
+    assert shape_error(placement.certified.locations, problem.locations) > 0.3
     assert finish.collapsed
     assert finish.start == "LUD"
     error = shape_error(placement.locations, problem.locations)
@@ -95,7 +95,7 @@ def test_strips_flown_back_and_forth_are_placed_with_nearly_a_third_of_wrong_dir
     placement = place(problem.view_graph)
     best = shape_error(oracle(problem), problem.locations)
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best
-    assert shape_error(placement.solve.locations, problem.locations) > 5.0 * best
+    assert shape_error(placement.certified.locations, problem.locations) > 5.0 * best
 
 
 def test_the_plane_is_as_good_a_space():

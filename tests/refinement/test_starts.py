@@ -68,7 +68,7 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
     graph = chain.view_graph
     options = PlacementOptions(objective="shapefit")
     placement = place(graph, options)
-    assert np.array_equal(placement.locations, placement.solve.locations)
+    assert np.array_equal(placement.locations, placement.certified.locations)
     assert not placement.refined.is_refined
     assert placement.refined.start == "ShapeFit"
     assert "as asked" in placement.refined.statement()

@@ -13,7 +13,7 @@ import pytest
 from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
-from sfm_shapefit.report.sentences import first_looks, shortened, summary_sentences
+from sfm_shapefit.report.sentences import first_looks, shorten, summary_sentences
 from tests.drawings import make_drawing
 
 HOSTILE = [
@@ -99,7 +99,7 @@ def test_hostile_names_stay_text_in_the_file():
     assert "<img" not in page.split("<script>", 1)[0]
     assert "<title>&lt;script&gt;" in page
     names = data_of(page)["cameras"]["names"]
-    assert sorted(names) == sorted(shortened(name) for name in HOSTILE)
+    assert sorted(names) == sorted(shorten(name) for name in HOSTILE)
     assert max(map(len, names)) < 200
     page.encode("utf-8")  # lone surrogates would raise
 
@@ -224,7 +224,7 @@ def test_up_is_where_level_cameras_have_it():
 
 
 def test_a_long_name_keeps_both_its_ends():
-    text = shortened("a" * 300 + "end.jpg")
+    text = shorten("a" * 300 + "end.jpg")
     assert text.startswith("aaa")
     assert text.endswith("end.jpg")
     assert len(text) < 180

@@ -14,7 +14,7 @@ import pytest
 
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.report.viewer import Thresholds, camera_at, drawn_pairs, input_centers, serve
+from sfm_shapefit.report.viewer import Thresholds, camera_at, input_centers, select_pairs, serve
 from tests.drawings import make_drawing
 from tests.program import run
 from tests.scenes import BUNDLED, FACADE, ROOT
@@ -76,7 +76,7 @@ def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, 
 def test_thresholds_decide_which_pairs_are_drawn():
     drawing, _ = make_drawing()
     everything = Thresholds(residual_deg=180.0, min_support=0, min_trust=0.0, camera=None)
-    drawn = drawn_pairs(drawing, everything)
+    drawn = select_pairs(drawing, everything)
     placed = drawing.cameras.placed[drawing.pairs.cameras].all(axis=1) & np.isfinite(
         drawing.pairs.residuals_deg
     )
@@ -84,7 +84,7 @@ def test_thresholds_decide_which_pairs_are_drawn():
     assert not drawn.contradicts.any()
 
     strict = Thresholds(residual_deg=4.0, min_support=50, min_trust=0.7, camera=3)
-    drawn = drawn_pairs(drawing, strict)
+    drawn = select_pairs(drawing, strict)
     assert len(drawn.rows) > 0
     assert (drawing.pairs.support[drawn.rows] >= 50).all()
     assert (drawing.pairs.cameras[drawn.rows] == 3).any(axis=1).all()

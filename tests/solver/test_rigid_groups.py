@@ -412,7 +412,7 @@ def test_fixed_nodes_keep_their_shape_and_the_others_find_their_scale():
     errors = np.linalg.norm(found - t[placed.cameras], axis=1)
     assert errors[still].max() < 1e-9  # roundings of numbers of 1e4
     assert errors.max() < 0.05  # 2e-3 rad over 5, with several pairs each
-    assert placed.solve.gap <= 1e-8
+    assert placed.certified.gap <= 1e-8
     # Variances that cancel leave their rounding, and its root is 1e-8.
     assert placed.assessment.sigmas[still].max() < 1e-6 * placed.assessment.sigmas[~still].min()
 

@@ -51,7 +51,7 @@ class DirectionTask:
     options: DirectionOptions
 
 
-def directions_of(
+def measure_batch(
     batch: MatchBatch, focal_lengths_px: FloatArray, options: DirectionOptions, threads: int
 ) -> PairDirections:
     """Return the directions of a batch of pairs."""
@@ -66,7 +66,7 @@ def directions_of(
     )
 
 
-def share_out(
+def measure_with_workers(
     database: MatchDatabase,
     model: PosedModel,
     options: DirectionOptions,
@@ -103,7 +103,7 @@ def measure_task(task: DirectionTask) -> list[PairDirections]:
     model = from_posed_cameras(task.cameras)
     with open_database(task.database, model) as database:
         found = [
-            directions_of(batch, model.focal_lengths_px, task.options, threads=1)
+            measure_batch(batch, model.focal_lengths_px, task.options, threads=1)
             for batch in database.iter_matches(1, part=task.part)
         ]
     return [concatenate(found)] if found else []

@@ -8,7 +8,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
-from sfm_shapefit.commands.stages.execution import directions_of, share_out
+from sfm_shapefit.commands.stages.execution import measure_batch, measure_with_workers
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.memory import Workload
 from sfm_shapefit.directions.pair_directions import (
@@ -54,11 +54,11 @@ def measure_directions(
             options,
         )
     if executor is not None and source.database is not None:
-        parts = share_out(source.database, model, options, executor, clock.advance)
+        parts = measure_with_workers(source.database, model, options, executor, clock.advance)
     else:
         wanted, threads = options, options.num_threads()
         batches = source.counted(source.batches(), clock.advance)
-        parts = [directions_of(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
+        parts = [measure_batch(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
