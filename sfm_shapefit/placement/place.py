@@ -7,6 +7,7 @@ the fixed cameras, have one piece, the groups that the pairs tie to one another.
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from sfm_shapefit.placement.tied_groups import find_tied_piece, measure_unit, re
 from sfm_shapefit.refinement.options import Filter, PlacementOptions
 from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
+from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
 from sfm_shapefit.solver.rigs import solve_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
@@ -126,6 +128,7 @@ def place(
     options: PlacementOptions | None = None,
     *,
     on_iteration: OnIteration | None = None,
+    **overrides: Any,
 ) -> Placement:
     """Place the cameras of a view graph: pieces, both convex starts, refinement, verdicts, trust.
 
@@ -142,6 +145,7 @@ def place(
         options: settings; defaults if None.
         on_iteration: called after each iteration of the solve, on graphs where that costs little; returning
             False ends the solve there, and the placement goes on from the last iterate.
+        **overrides: single options by name: `place(graph, objective="lud")`.
 
     Raises:
         InputError: if an option does not go with rigid groups.
@@ -150,7 +154,7 @@ def place(
     """
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)
-    options = options or PlacementOptions()
+    options = merge_options(options, PlacementOptions, overrides)
     dropped, pieces = _split(measured, options)
     return _place_piece(measured, dropped, pieces, 0, options, on_iteration)
 

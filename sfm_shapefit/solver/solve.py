@@ -75,6 +75,9 @@ def solve(
         result = solve(graph)
         result.locations, result.gap, result.unique
 
+    This is the certified program alone, whose optimum collapses on long chains and under heavy corruption; to
+    place the cameras of a graph, call `sfm_shapefit.place`.
+
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
         options: solver settings, see `help(SolverOptions)`; defaults if None.
