@@ -1,4 +1,4 @@
-"""Robust refinement of locations in the angles of their directions: the common finish of both convex starts.
+"""Robust refinement of locations in the angles of their directions: what becomes of both convex starts.
 
 With d_e = t_i - t_j and u_e = d_e / |d_e|, the residual u_e - v_e does not depend on lengths, so that nothing
 can be gained by shrinking, as it can in the convex programs. It is judged in the direction's own metric,
@@ -129,7 +129,7 @@ def refine_angles(
     start: FloatArray,
     metric: Metric,
     plan: SymbolicFactor | NormalFactor,
-    rival: FloatArray | None = None,
+    other: FloatArray | None = None,
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
 
@@ -139,8 +139,8 @@ def refine_angles(
         metric: covariance and class of each pair.
         plan: what `plan_refinement` says; or memory for a factor, such as that over groups, in which case
             locations are and stay those of the groups.
-        rival: (n, d) refined locations; once the levels have settled, the refinement ends where it has come
-            as low as these, and where it clearly cannot.
+        other: (n, d) refined locations of the other start; once the levels have settled, the refinement ends
+            where it has come as low as these, and where it clearly cannot.
 
     Returns:
         Locations whose cost at the final levels is not above that of the start: these, if nothing better
@@ -151,7 +151,7 @@ def refine_angles(
     )
     spread = _spread(graph, metric)
     first = _unit(start)
-    other = None if rival is None else _unit(rival)
+    other = None if other is None else _unit(other)
     t, damping, steps = first, DAMPING.first, 0
     levels = np.full(int(metric.classes.max()) + 1, _FIRST_LEVEL_RAD)
     while steps < _MAX_STEPS:
@@ -173,9 +173,9 @@ def refine_angles(
     return AngularResult(locations=t, levels_rad=levels, cost=cost, iterations=steps)
 
 
-def _is_decided(before: float, after: float, rival: float) -> bool:
-    """Whether a cost has reached the rival's, or stays above it even if it falls many times as much again."""
-    return abs(after - rival) <= _ALIKE * rival or after - rival > _HOPELESS * (before - after)
+def _is_decided(before: float, after: float, other_cost: float) -> bool:
+    """Whether a cost has reached another, or stays above it even if it falls many times as much again."""
+    return abs(after - other_cost) <= _ALIKE * other_cost or after - other_cost > _HOPELESS * (before - after)
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:

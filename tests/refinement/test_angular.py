@@ -304,16 +304,16 @@ def test_a_factor_that_is_too_large_is_not_planned(monkeypatch):
     assert isinstance(plan_refinement(graph), IterativeNormal)
 
 
-def test_a_rival_out_of_reach_ends_the_refinement_early():
+def test_another_start_out_of_reach_ends_the_refinement_early():
     problem = random_graph_problem(40, 0.5, sigma=0.02, q=0.2, seed=2)
     graph, plan = problem.view_graph, plan_refinement(problem.view_graph)
     assert plan is not None
     best = refined(graph, problem.locations)
-    again = refine_angles(graph, shaken(problem, 0.05), one_class(graph), plan, rival=best.locations)
+    again = refine_angles(graph, shaken(problem, 0.05), one_class(graph), plan, other=best.locations)
     assert again.iterations <= refined(graph, shaken(problem, 0.05)).iterations
-    assert angular._is_decided(before=100.0, after=99.0, rival=50.0)  # 50 above, falling by 1
-    assert not angular._is_decided(before=120.0, after=99.0, rival=50.0)
-    assert angular._is_decided(before=120.0, after=99.0, rival=99.0)
+    assert angular._is_decided(before=100.0, after=99.0, other_cost=50.0)  # 50 above, falling by 1
+    assert not angular._is_decided(before=120.0, after=99.0, other_cost=50.0)
+    assert angular._is_decided(before=120.0, after=99.0, other_cost=99.0)
 
 
 def test_the_refinement_improves_the_certified_optimum_on_noisy_data():
