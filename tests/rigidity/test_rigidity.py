@@ -209,10 +209,10 @@ def test_the_shortcuts_change_nothing(dimension, span, monkeypatch):
     graphs = [local_graph(rng, 200, dimension, span) for _ in range(12)]
     expected = [parallel_rigid_pieces(200, edges, dimension) for edges in graphs]
 
-    monkeypatch.setattr(rigidity.pieces, "_FIRST_GAME_CAMERAS", 5)
+    monkeypatch.setattr(rigidity.pieces, "_FIRST_GAME_NODES", 5)
     monkeypatch.setattr(rigidity.game, "_GAME_WORK", 0)
     in_steps = [parallel_rigid_pieces(200, edges, dimension) for edges in graphs]
-    monkeypatch.setattr(rigidity.pieces, "_FIRST_GAME_CAMERAS", 200)
+    monkeypatch.setattr(rigidity.pieces, "_FIRST_GAME_NODES", 200)
     monkeypatch.setattr(rigidity.game, "_GAME_WORK", 10**6)
     monkeypatch.setattr(rigidity.pieces, "triangle_sets", lambda _, edges: np.arange(len(edges)))
     monkeypatch.setattr(rigidity.pieces, "grow_sets", lambda *given: given[-1])
@@ -447,7 +447,7 @@ def test_a_random_graph_of_few_triangles_is_decided_by_the_game_in_steps():
     edges = np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
     label = parallel_rigid_pieces(3000, edges, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(rigidity.pieces, "_FIRST_GAME_CAMERAS", 3000)
+        patch.setattr(rigidity.pieces, "_FIRST_GAME_NODES", 3000)
         np.testing.assert_array_equal(parallel_rigid_pieces(3000, edges, 3), label)
     assert np.bincount(label)[0] > 1000
     assert label.max() > 100
