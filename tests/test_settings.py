@@ -45,7 +45,7 @@ def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
         ({"max_iterations": 1.5}, "max_iterations must be of type int"),
         ({"threads": 257}, r"threads must lie in \[0, 256\]"),
         ({"min_trust": float("nan")}, "min_trust must lie in"),
-        ({"factor_memory_mb": 0}, "factor_memory_mb must be at least 1"),
+        ({"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
         ({"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
     ],
 )
