@@ -1,7 +1,7 @@
 """The cases of `answers`: a name that stays, and a command line in the folder that `answer_inputs` makes.
 
 A case whose output has a truth is followed by others that read that output. Of large sets the default alone
-is run, so that all of it takes about twenty minutes.
+is run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -63,6 +63,8 @@ _LOCATE = {
     "directions-relative-poses": "--directions relative-poses",
     "fix-names": "--fix scenes/{scene}/fixed.txt",
     "fix-solved": "--fix solved",
+    "fix-solved-bundle-adjust": "--fix solved --bundle-adjust",
+    "fix-solved-shapefit": "--fix solved --objective shapefit",
     "fix-names-bundle-adjust": "--fix scenes/{scene}/fixed.txt --bundle-adjust",
     "priors": "--priors scenes/{scene}/priors.txt",
     "priors-refine": "--priors scenes/{scene}/priors.txt --refine-with-priors",
@@ -74,7 +76,8 @@ _LOCATE = {
     "max-memory": "--max-memory 1",
     "scene": "--scene",
 }
-_OF_ALL = " ".join(sorted({*_LOCATE} - {"min-trust-0", "scale-prior", "gps", "gps-refine"}))
+_FIXED = ("fix-solved-bundle-adjust", "fix-solved-shapefit")
+_OF_ALL = " ".join(sorted({*_LOCATE} - {"min-trust-0", "scale-prior", "gps", "gps-refine"} - {*_FIXED}))
 _LOCATED = {
     "courtyard": _OF_ALL,
     "castle-P19": _OF_ALL,
@@ -91,6 +94,9 @@ _LOCATED = {
     "ring8-hinged": "points-never priors",
     "ring8-pendant": "points-never",
     "ring8-cycle": "points-never",
+    "courtyard-new": "fix-names fix-names-bundle-adjust fix-solved fix-solved-bundle-adjust "
+    "fix-solved-shapefit priors-refine directions-tracks scale-input",
+    "photographed-new": "fix-solved fix-solved-bundle-adjust",
     "castle-P30": "bundle-adjust objective-shapefit refine-rotations",
     "Herz-Jesus-P8": "directions-relative-poses filter-triangles",
     "lego100": "points-never objective-shapefit",
@@ -211,7 +217,8 @@ _QUICK = (
 def all_cases(folders: Mapping[str, Path]) -> list[Case]:
     """Return all cases; `folders` are those of the scenes and sets that are at hand."""
     scenes = [*BUNDLED, *_SETS, *sorted(set(folders) - {*BUNDLED, *_SETS, MADRID}), *MADE]
-    truths = {name: truth_of(folders[name]) for name in scenes if name in folders} | {"rig": "truth"}
+    truths = {name: truth_of(folders[name]) for name in scenes if name in folders}
+    truths |= dict.fromkeys(("rig", "courtyard-new", "photographed-new"), "truth")
     cases = [
         *(case for name in scenes for case in _locate_cases(name, truths.get(name, "sparse/0"))),
         *(case for name in _MAPPED for case in _map_cases(name, truths.get(name, "sparse/0"))),

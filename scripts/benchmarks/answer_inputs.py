@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-TRUTHS = ("gt", "truth", "sparse/0")
+_TRUTHS = ("gt", "truth", "sparse/0")
 _PARTS = ("sparse/0", "database.db", "gt", "truth", "gps.csv")
 _PAIR_BASE = 2147483647  # COLMAP's pair_id is id1 * this + id2
 _PRUNED: dict[str, Callable[[int, int], bool]] = {
@@ -26,22 +26,27 @@ _PRUNED: dict[str, Callable[[int, int], bool]] = {
     "ring8-cycle": lambda i, j: j - i in (1, 7),
 }
 """Which pairs of images of the ring are kept."""
-MADE = ("rig", *_PRUNED)
+_EXTENDED = ("courtyard", "photographed")
+"""Of their truth a third of the images become new ones, posed by their rotations alone."""
+MADE = ("rig", *_PRUNED, *(f"{name}-new" for name in _EXTENDED))
 """Scenes that are made, not copied."""
 
 
 def truth_of(folder: Path) -> str:
     """Return which of a scene's models is the best there is."""
-    return next(name for name in TRUTHS if (folder / name).is_dir())
+    return next(name for name in _TRUTHS if (folder / name).is_dir())
 
 
 def make_inputs(work: Path, scenes: Mapping[str, Path]) -> None:
-    """Copy scenes given by name and folder, and make everything else; the ring must be among them."""
+    """Copy scenes given by name and folder, and make everything else; the bundled must be among them."""
     for name, folder in scenes.items():
         _copy(folder, work / "scenes" / name)
     for name, kept in _PRUNED.items():
         _copy(scenes["ring8"], work / "scenes" / name)
         _keep_pairs(work / "scenes" / name / "database.db", kept)
+    for name in _EXTENDED:
+        _copy(scenes[name], work / "scenes" / f"{name}-new")
+        _forget_some(work / "scenes" / f"{name}-new")
     _make_rig(work / "scenes" / "rig")
     for folder in sorted((work / "scenes").iterdir()):
         _write_tables(folder)
@@ -72,6 +77,19 @@ def _keep_pairs(database: Path, wanted: Callable[[int, int], bool]) -> None:
     connection.executemany("DELETE FROM two_view_geometries WHERE pair_id = ?", dropped)
     connection.commit()
     connection.close()
+
+
+def _forget_some(folder: Path) -> None:
+    """Let sparse/0 be the truth in which the last third of the images have no points and no place."""
+    model = pycolmap.Reconstruction(folder / "truth")
+    for image_id in sorted(model.images)[-(len(model.images) // 3) :]:
+        image = model.image(image_id)
+        for index in [k for k, point in enumerate(image.points2D) if point.has_point3D()]:
+            if model.image(image_id).point2D(index).has_point3D():  # a track of two goes as a whole
+                model.delete_observation(image_id, index)
+        frame = model.frame(image.frame_id)
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
+    model.write(folder / "sparse" / "0")
 
 
 def _make_rig(folder: Path) -> None:

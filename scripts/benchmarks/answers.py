@@ -78,7 +78,8 @@ class Runner:
         if stdout.startswith("{"):
             answer["json"]["stdout"] = _keep(json.loads(stdout))
         else:
-            answer["printed"] = _NUMBER.sub("#", _BORDERS.sub(" ", stdout)).strip()
+            printed = stdout.replace(f"{self.work}/", "")
+            answer["printed"] = _NUMBER.sub("#", _BORDERS.sub(" ", printed)).strip()
         if case.out and (self.work / case.out).exists():
             _collect(self.work / case.out, answer)
         text = json.dumps(answer).replace(f"{self.work}/", "")
