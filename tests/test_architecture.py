@@ -1,12 +1,12 @@
 """The layers of the package: a module imports only those below it, and each heavy dependency has one door."""
 
 import ast
-import subprocess
-import sys
 from functools import cache
 from pathlib import Path
 
 import pytest
+
+from tests.program import run_python
 
 PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
@@ -127,7 +127,5 @@ def test_nothing_is_unpickled_evaluated_or_sent_to_a_shell():
 def test_the_command_line_starts_without_the_heavy_dependencies():
     heavy = {name for name in DOORS if name not in {"typer", "rich", "sqlite3"}} | {"scipy", "clarabel"}
     code = f"import sys, sfm_shapefit.cli; print(*sorted({heavy!r} & set(sys.modules)))"
-    done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=PACKAGE.parent
-    )
+    done = run_python("-c", code)
     assert done.stdout == "\n"

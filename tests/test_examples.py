@@ -3,10 +3,7 @@
 import dataclasses
 import inspect
 import itertools
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -18,6 +15,7 @@ import sfm_shapefit
 from sfm_shapefit.synthetic import make_rendered_scene
 from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from tests.program import run_python
 from tests.scenes import ROOT
 
 FOCAL_LENGTH_PX = 350.0
@@ -25,13 +23,7 @@ FOCAL_LENGTH_PX = 350.0
 
 def run_example(name: str, *arguments) -> str:
     """Run an example as a program, in a process of its own; return what it prints."""
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(ROOT / "examples" / name, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -111,13 +103,7 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
 
 
 def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -158,9 +144,7 @@ def user_seconds(code: str) -> float:
     times = []
     for _ in range(3):
         end = "import resource as r; print(r.getrusage(r.RUSAGE_SELF).ru_utime)"
-        done = subprocess.run(
-            [sys.executable, "-c", f"{code}\n{end}"], cwd=ROOT, capture_output=True, text=True, check=True
-        )
+        done = run_python("-c", f"{code}\n{end}")
         times.append(float(done.stdout.split()[-1]))
     return min(times)
 
@@ -177,14 +161,7 @@ def test_the_help_of_the_command_takes_less_than_three_tenths_of_a_second():
 @pytest.mark.slow
 def test_the_api_reference_builds_without_a_warning(tmp_path):
     pytest.importorskip("pdoc")
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "scripts/api_reference.py", str(tmp_path)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-W", "error", "scripts/api_reference.py", tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")

@@ -5,8 +5,6 @@ import os
 import signal
 import sqlite3
 import stat
-import subprocess
-import sys
 import tomllib
 
 import pytest
@@ -17,7 +15,7 @@ from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
-from tests.program import run
+from tests.program import run, run_python
 from tests.scenes import RING, ROOT, copied
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
@@ -81,9 +79,7 @@ from sfm_shapefit.cli import main
 sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]
 main()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", script)
     assert (done.returncode, done.stderr) == (0, "")
 
 

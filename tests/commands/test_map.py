@@ -223,12 +223,3 @@ def test_pairs_that_contradict_known_focal_lengths_are_left_out_where_they_can_b
     assert answer.sound_only
     assert answer.share > 0.99
     assert worst_error_deg(answer, truth) < 0.5
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="min_matches must be at least 15"):
-        sfm_shapefit.MapOptions(min_matches=5)
-    with pytest.raises(ValueError, match="a database has no tracks"):
-        sfm_shapefit.MapOptions(directions="tracks")
-    with pytest.raises(ValueError, match="relative_rotations must be one of"):
-        sfm_shapefit.MapOptions(relative_rotations="guessed")

@@ -9,7 +9,6 @@ import pytest
 
 from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.synthetic import random_graph_problem
@@ -193,13 +192,6 @@ def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
 def test_without_a_filter_nothing_is_dropped():
     _, graph = corrupted()
     assert place(graph, PlacementOptions(objective="shapefit")).dropped.tolist() == []
-
-
-def test_wrong_names_are_refused_with_the_choices():
-    with pytest.raises(ValueError, match="least-squares"):
-        PlacementOptions(objective="l2")
-    with pytest.raises(ValueError, match="triangles"):
-        LocateOptions(filter="mfas")
 
 
 def test_large_graphs_are_refused_by_l_inf():

@@ -251,11 +251,6 @@ def test_the_models_own_tracks_serve_as_well():
     assert after.rotation_deg.median < 0.25 * before.rotation_deg.median
 
 
-def test_relative_poses_are_no_matches_to_refine_on():
-    with pytest.raises(ValueError, match="refine_rotations works on matches"):
-        LocateOptions(refine_rotations=True, directions="relative-poses")
-
-
 def test_averaged_rotations_of_a_real_scene_get_better():
     scene = real_scene("fountain-P11")
     model = average_rotations(scene / "database.db", scene / "sparse" / "0")

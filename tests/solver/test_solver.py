@@ -368,11 +368,3 @@ def test_a_result_is_one_line_that_says_whether_it_converged():
     assert repr(whole).startswith("SolverResult(20 nodes in 3 dimensions, converged: objective 0.")
     assert "max_iterations" in repr(short)
     assert len(repr(short)) < 150
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [("threads", 0), ("method", "magic"), ("tol", 0.0), ("max_iterations", 0)]
-)
-def test_solver_options_out_of_range_are_refused_by_name(field, value):
-    with pytest.raises(ValueError, match=field):
-        SolverOptions(**{field: value})

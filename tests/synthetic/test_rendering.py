@@ -173,15 +173,6 @@ def test_what_cannot_be_drawn_is_refused_in_a_sentence(scene, render, message):
         make_rendered_scene(replace(SMALL, **scene), RenderOptions(**render))
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0)],
-)
-def test_an_option_of_drawing_out_of_range_is_refused_by_name(field, value):
-    with pytest.raises(ValueError, match=rf"RenderOptions\.{field} must"):
-        RenderOptions(**{field: value})
-
-
 # --- COLMAP on the images --------------------------------------------------------------------------------
 
 

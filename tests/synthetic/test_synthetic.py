@@ -281,22 +281,6 @@ def test_the_same_seed_makes_the_same_scene_and_another_seed_another():
     assert not np.array_equal(first.points, other.points)
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("shape", "torus"),
-        ("num_images", 1),
-        ("pixel_noise_px", float("nan")),
-        ("wrong_match_fraction", 1.5),
-        ("corrupted_pair_fraction", -0.1),
-        ("focal_length_px", 0.0),
-    ],
-)
-def test_an_option_out_of_range_is_refused_by_name(field, value):
-    with pytest.raises(ValueError, match=rf"SceneOptions\.{field} must"):
-        SceneOptions(**{field: value})
-
-
 def test_a_scene_with_too_few_points_says_so():
     with pytest.raises(InputError, match="no two images of this scene share 30 points"):
         make_scene(SceneOptions(num_points=20))
@@ -403,11 +387,6 @@ def test_a_rotations_model_has_all_centres_at_the_origin_no_points_and_the_truth
         np.testing.assert_allclose(exact.rotation.matrix(), scene.rotations[index], atol=1e-14)
         center = truth.images[index + 1].projection_center()
         np.testing.assert_allclose(center, scene.centers[index], atol=1e-12)
-
-
-def test_a_workspace_without_points_and_without_matches_is_refused_by_both_fields():
-    with pytest.raises(ValueError, match=r"WorkspaceOptions\.model .* WorkspaceOptions\.database"):
-        WorkspaceOptions(model="rotations", database=False)
 
 
 def test_a_perturbed_full_model_keeps_centres_and_points_and_has_the_truth_beside_it(tmp_path):
