@@ -227,9 +227,6 @@ def test_an_alignment_that_holds_for_a_minority_only_is_warned_about():
     assert not found.degenerate
 
 
-# --- refusals ----------------------------------------------------------------------------------------
-
-
 def test_too_few_common_names_are_explained_with_an_example_from_each_side():
     reference = scene(11)
     model = replace(reference, names=tuple(f"images/{name}" for name in reference.names))
@@ -311,9 +308,6 @@ def test_a_threshold_that_is_no_positive_number_is_refused(threshold):
     good = scene(19)
     with pytest.raises(InputError, match="a recall threshold must be a positive number"):
         evaluate(good, good, thresholds=[threshold])
-
-
-# --- output ------------------------------------------------------------------------------------------
 
 
 def test_the_dictionary_survives_json_and_has_stable_keys():

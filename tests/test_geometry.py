@@ -48,9 +48,6 @@ def assert_same_map(found: Similarity, expected: Similarity, rtol: float) -> Non
     np.testing.assert_allclose(found.translation, expected.translation, atol=rtol * size)
 
 
-# --- vectors -----------------------------------------------------------------------------------------
-
-
 def test_normalized_vectors_have_unit_length_and_keep_their_direction():
     v = np.array([[3.0, 0.0, 4.0], [-1e-150, 0.0, 0.0], [0.0, 1e150, 0.0]])
     np.testing.assert_allclose(normalized(v), [[0.6, 0, 0.8], [-1, 0, 0], [0, 1, 0]], atol=2 * EPS)
@@ -87,9 +84,6 @@ def test_a_tangent_basis_completes_its_direction_to_an_orthonormal_frame(seed, d
     frame = np.concatenate([v[:, :, None], tangent_bases(v)], axis=2)
     product = np.swapaxes(frame, 1, 2) @ frame
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(d), product.shape), atol=8 * EPS)
-
-
-# --- least squares -----------------------------------------------------------------------------------
 
 
 @given(seed=seeds, d=st.integers(2, 5), n=st.integers(6, 12))
@@ -170,9 +164,6 @@ def test_coincident_points_are_mapped_onto_each_other_with_scale_one(fit, n):
     found = fit(np.full((n, 3), 2.0), np.full((n, 3), -7.0))
     assert found.scale == 1.0
     np.testing.assert_allclose(found.apply(np.full((1, 3), 2.0)), -7.0, atol=1e-14)
-
-
-# --- L1 ----------------------------------------------------------------------------------------------
 
 
 @given(seed=seeds, n=st.integers(3, 30))
@@ -303,9 +294,6 @@ def test_the_l1_fit_is_the_same_on_every_call():
 )
 def test_the_median_spread_ignores_far_points_unless_the_rest_coincides(points, expected):
     assert median_spread(np.array(points)) == pytest.approx(expected, rel=1e-12)
-
-
-# --- rotations ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-3, 30.0, 90.0, 179.999, 180.0])

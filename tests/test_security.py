@@ -83,9 +83,6 @@ main()
     assert (done.returncode, done.stderr) == (0, "")
 
 
-# --- databases -----------------------------------------------------------------------------------------
-
-
 def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
     with open_database(RING / "database.db", read_model(RING / "sparse" / "0")) as database:
         connection = database._connection
@@ -135,9 +132,6 @@ def test_private_copies_of_a_database_are_private(tmp_path, monkeypatch):
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert list((tmp_path / "tmp").iterdir()) == []
     writer.close()
-
-
-# --- what is no file -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["pipe", "endless device"])
@@ -191,9 +185,6 @@ def test_no_command_waits_for_a_pipe(tmp_path, impatient, what):
     result = run(*arguments, code=3)
     assert "it is a pipe or a device" in result.output or "give the folder" in result.output
     assert sorted(tmp_path.iterdir()) == [pipe]
-
-
-# --- packaging -----------------------------------------------------------------------------------------
 
 
 def test_every_dependency_has_a_lower_and_an_upper_bound():

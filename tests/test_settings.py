@@ -108,9 +108,6 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
         merge_options(None, SolverOptions, {"colour": 3})
 
 
-# --- public names ------------------------------------------------------------------------------------------
-
-
 def test_completion_shows_public_names_only():
     public = {name for name in dir(sfm_shapefit) if not name.startswith("_")}
     assert public == set(sfm_shapefit.__all__)

@@ -237,25 +237,6 @@ def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
         assert not (tmp_path / "out").exists(), what
 
 
-def test_a_database_in_use_is_read_and_left_alone(tmp_path):
-    scene = copied(RING, tmp_path)
-    writer = sqlite3.connect(scene / "database.db")
-    writer.execute("PRAGMA journal_mode = WAL")
-    writer.execute("UPDATE images SET name = name")
-    writer.commit()
-    before = fingerprint(scene)
-    assert {"database.db-wal", "database.db-shm"} <= set(before)
-    run("locate", scene / "sparse" / "0", tmp_path / "out", "-q", code=0)
-    assert fingerprint(scene) == before
-    writer.close()
-
-
-def test_an_unwritable_place_is_refused_before_any_work(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    assert "not a folder" in run_refused("locate", RING_MODEL, tmp_path / "file" / "out")
-    assert "is a file" in run_refused("locate", RING_MODEL, tmp_path / "file")
-
-
 def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
     from sfm_shapefit.commands import write as files
 

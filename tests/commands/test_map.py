@@ -152,9 +152,6 @@ def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, mess
         sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
 
 
-# --- averaging ---------------------------------------------------------------------------------------
-
-
 def problem(num_false=0, seed=5, n=14):
     """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
     rng = np.random.default_rng(seed)

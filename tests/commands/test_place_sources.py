@@ -135,9 +135,6 @@ def test_options_that_do_not_fit_the_source_are_refused(tmp_path, arguments, wor
     assert not (tmp_path / "out").exists()
 
 
-# --- objectives and filters ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("objective", ["auto", "shapefit", "lud", "least-squares", "linf"])
 def test_every_objective_writes_the_same_files_and_only_shapefit_is_certified(tmp_path, objective):
     problem = random_graph_problem(14, 0.9, sigma=0.001, seed=5)

@@ -48,9 +48,6 @@ def centres(reconstruction):
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
 
 
-# --- the scene and its model ---------------------------------------------------------------------------
-
-
 def test_a_written_drive_has_its_rigs_and_its_true_poses(rigs, workspace):
     truth = pycolmap.Reconstruction(workspace / "truth")
     assert truth.num_rigs() == 2
@@ -104,9 +101,6 @@ def assert_rigs_equal(a, b, atol=0.0):
             other = b.rig(rig_id).sensor_from_rig(sensor)
             # Bundle adjustment normalises quaternions anew; nothing else changes a bit.
             np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
-
-
-# --- rigs in locate ------------------------------------------------------------------------------------
 
 
 def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
@@ -213,9 +207,6 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
 def write_and_return(rigs, folder):
     write_workspace(rigs.scene, folder, WorkspaceOptions(database=False), rigs)
     return folder
-
-
-# --- fixed cameras -------------------------------------------------------------------------------------
 
 
 @pytest.fixture

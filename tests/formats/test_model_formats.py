@@ -289,9 +289,6 @@ def test_a_file_that_is_no_model_is_refused(tmp_path):
         read_model(tmp_path / "other.json")
 
 
-# --- written formats ---------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def courtyard():
     return posed_model_of(pycolmap.Reconstruction(COURTYARD / "truth"))
@@ -348,9 +345,6 @@ def test_poses_come_back_from_text(courtyard, kind):
         rotations = Rotation.from_quat([[row[f"q{k}"] for k in "xyzw"] for row in rows]).as_matrix()
     np.testing.assert_array_equal(centers, courtyard.centers[order])
     np.testing.assert_allclose(rotations, courtyard.rotations[order], atol=1e-14)
-
-
-# --- relative poses ----------------------------------------------------------------------------------
 
 
 def test_a_relative_pose_has_its_second_camera_where_the_first_sees_it(tmp_path):
@@ -422,9 +416,6 @@ def test_a_malformed_relative_pose_is_refused_by_its_line(tmp_path, line, messag
     (tmp_path / "pairs.txt").write_text(f"c d 1 0 0 0 1 0 0\n{line}\n")
     with pytest.raises(InputError, match=message):
         read_relative_poses(tmp_path / "pairs.txt")
-
-
-# --- convert -----------------------------------------------------------------------------------------
 
 
 def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):

@@ -37,9 +37,6 @@ def priors_of(positions, sigma=np.nan, rows=None):
     )
 
 
-# --- the input's centres -----------------------------------------------------------------------------
-
-
 def test_the_input_gauge_is_recovered_without_turning_the_axes():
     t = cameras(8)
     gauge = input_gauge(t, 7.0 * t + [1.0, -2.0, 3.0])
@@ -75,9 +72,6 @@ def test_centres_that_contradict_the_answer_do_not_turn_it_inside_out():
     assert gauge.similarity.scale > 0.0
 
 
-# --- a known distance --------------------------------------------------------------------------------
-
-
 def test_a_known_distance_becomes_true():
     t = cameras(1)
     placed = distance_gauge(t, 3, 7, 12.5, "a and b").apply(t)
@@ -104,9 +98,6 @@ def test_locate_makes_a_known_distance_true_and_says_so(tmp_path):
 def test_a_known_distance_of_an_unknown_image_names_it(tmp_path):
     said = run_refused("locate", RING_MODEL, tmp_path / "out", "--known-distance", "0003.jpg", "x.jpg", "1")
     assert "no posed image x.jpg" in said
-
-
-# --- position priors ---------------------------------------------------------------------------------
 
 
 def test_exact_priors_give_back_scale_axes_and_origin():
@@ -304,9 +295,6 @@ def test_priors_without_effect_are_refused(ring, tmp_path):
         (("--refine-with-priors",), "needs priors"),
     ):
         assert sentence in run_refused("locate", RING_MODEL, tmp_path / "out", *flags)
-
-
-# --- priors that pull --------------------------------------------------------------------------------
 
 
 def test_priors_with_refinement_mend_what_directions_leave_open():

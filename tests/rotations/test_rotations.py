@@ -169,9 +169,6 @@ def test_the_sparse_system_has_the_dense_ones_answer(monkeypatch):
     np.testing.assert_array_equal(sparse.updated, dense.updated)
 
 
-# --- models and locate -----------------------------------------------------------------------------
-
-
 def random_turns(n, sigma_deg, seed):
     vectors = np.radians(sigma_deg) * np.random.default_rng(seed).standard_normal((n, 3))
     return Rotation.from_rotvec(vectors).as_matrix()

@@ -403,24 +403,6 @@ def test_a_perturbed_full_model_keeps_centres_and_points_and_has_the_truth_besid
     assert model.compute_mean_reprojection_error() > 3.0 * truth.compute_mean_reprojection_error()
 
 
-def test_an_existing_folder_is_refused_and_left_alone(tmp_path):
-    (tmp_path / "out").mkdir()
-    (tmp_path / "out/mine.txt").write_text("kept")
-    with pytest.raises(InputError, match="exists already; choose another folder"):
-        write_workspace(scene_of("ring"), tmp_path / "out")
-    assert [path.name for path in tmp_path.rglob("*")] == ["out", "mine.txt"]
-
-
-def test_a_workspace_that_fails_half_way_leaves_nothing(tmp_path, monkeypatch):
-    def broken(self, folder):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(pycolmap.Reconstruction, "write_binary", broken)
-    with pytest.raises(InputError, match="No space left on device"):
-        write_workspace(scene_of("ring"), tmp_path / "made/out")
-    assert list(tmp_path.iterdir()) == []
-
-
 # --- bundled scenes --------------------------------------------------------------------------------------
 
 
