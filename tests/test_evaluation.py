@@ -10,20 +10,7 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.evaluation import RELATIVE_THRESHOLDS, Evaluation, evaluate_poses
-
-
-def random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
-    q = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    q[:, :, 0] *= np.sign(np.linalg.det(q))[:, None]
-    return q
-
-
-def turn(axis: np.ndarray, angle_deg: float) -> np.ndarray:
-    """Rodrigues' formula."""
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(angle_deg)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+from tests.problems import random_rotations, turn
 
 
 @dataclass(frozen=True)

@@ -16,23 +16,14 @@ from sfm_shapefit.geometry import (
     rotation_angles_deg,
     tangent_bases,
 )
+from tests.problems import random_rotations, turn
 
 EPS = np.finfo(np.float64).eps
 seeds = st.integers(0, 2**32 - 1)
 
 
 def random_rotation(rng: np.random.Generator, d: int = 3) -> np.ndarray:
-    q = np.linalg.qr(rng.normal(size=(d, d)))[0]
-    q[:, 0] *= np.sign(np.linalg.det(q))
-    return q
-
-
-def turn(axis: np.ndarray, angle_deg: float) -> np.ndarray:
-    """Rodrigues' formula."""
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(angle_deg)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    return random_rotations(rng, 1, d)[0]
 
 
 def random_similarity(rng: np.random.Generator, d: int = 3) -> Similarity:
@@ -309,7 +300,7 @@ def test_a_majority_of_equal_rotations_is_the_mean_whatever_the_others_are(seed,
     rng = np.random.default_rng(seed)
     true = random_rotation(rng)
     bad = (n - 1) // 2
-    others = np.array([random_rotation(rng) for _ in range(bad)]).reshape(bad, 3, 3)
+    others = random_rotations(rng, bad)
     if seed % 2:
         others[:] = others[:1]  # all wrong in the same way
     rotations = np.concatenate([others, np.repeat(true[None], n - bad, axis=0)])[rng.permutation(n)]

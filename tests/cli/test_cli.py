@@ -14,7 +14,11 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.commands import write as files
+from sfm_shapefit.formats import graph_text
 from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
 from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, fingerprint
 
@@ -238,8 +242,6 @@ def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
 
 
 def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    from sfm_shapefit.commands import write as files
-
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
@@ -269,14 +271,11 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
 
 
 def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
-    from sfm_shapefit.formats import graph_text
-    from sfm_shapefit.viewgraph import ViewGraph
-
     t = np.random.default_rng(0).standard_normal((8, 3))
-    edges = [(i, j) for i in range(5) for j in range(i)] + [(5, 6), (5, 7), (6, 7)]
-    v = np.array([(t[i] - t[j]) / np.linalg.norm(t[i] - t[j]) for i, j in edges])
+    graph = exact_graph(t, [*all_pairs(5), *all_pairs((5, 6, 7))])
     names = [f"n{k}" for k in range(8)]
-    (tmp_path / "graph.txt").write_text(graph_text(ViewGraph(8, edges, v, names=names)))
+    named = ViewGraph(8, graph.edges, graph.directions, names=names)
+    (tmp_path / "graph.txt").write_text(graph_text(named))
     result = run("solve", tmp_path / "graph.txt", tmp_path / "out")
     assert "pieces/1: 3 of 3 cameras" in " ".join(result.stdout.split())
     lines = (tmp_path / "out" / "pieces" / "1" / "cameras.csv").read_text().splitlines()

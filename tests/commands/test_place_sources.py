@@ -7,10 +7,13 @@ import re
 import numpy as np
 import pytest
 
+from sfm_shapefit.baselines import linf
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results import pair_rows
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene
@@ -174,8 +177,6 @@ def test_a_filter_composes_with_least_squares(name):
 
 def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
     problem, graph = corrupted()
-    from sfm_shapefit.results import pair_rows
-
     placed = place(graph, PlacementOptions(filter="triangles"))
     rows = pair_rows(placed, np.zeros(graph.num_edges, dtype=np.int64))
     dropped = [k for k, row in enumerate(rows) if row.reason == "left out by the filter"]
@@ -192,9 +193,6 @@ def test_without_a_filter_nothing_is_dropped():
 
 
 def test_large_graphs_are_refused_by_l_inf():
-    from sfm_shapefit.baselines import linf
-    from sfm_shapefit.errors import UnsolvableError
-
     _, graph = corrupted()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(linf, "_MOST_PAIRS", 10)
