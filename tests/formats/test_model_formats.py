@@ -203,7 +203,7 @@ def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tm
             "openmvg",
             '"focal_length": 100.0',
             '"focal_length": NaN',
-            r"data/value0/focal_length is not finite",
+            r"value0/focal_length is not finite",
         ),
         ("openmvg", '"id_intrinsic": 0', '"id_intrinsic": 3', r"has the intrinsic 3, which is not among"),
         ("openmvg", "[[0.0, -1.0", "[[0.5, -1.0", r"extrinsics\[0\]/value/rotation is no rotation"),
