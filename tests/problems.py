@@ -19,6 +19,21 @@ def all_pairs(nodes: int | Iterable[int]) -> list[tuple[int, int]]:
     return list(combinations(range(nodes) if isinstance(nodes, int) else nodes, 2))
 
 
+def random_rotations(rng: np.random.Generator, n: int, d: int = 3) -> Floats:
+    """Return n random rotations, (n, d, d)."""
+    q = np.linalg.qr(rng.normal(size=(n, d, d)))[0]
+    q[:, :, 0] *= np.sign(np.linalg.det(q))[:, None]
+    return q
+
+
+def turn(axis: npt.ArrayLike, angle_deg: float) -> Floats:
+    """Return the rotation by an angle about an axis (3,), by Rodrigues' formula."""
+    x, y, z = axis / np.linalg.norm(axis)
+    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    angle = np.radians(angle_deg)
+    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+
+
 def exact_graph(locations: Floats, edges: npt.ArrayLike | None = None) -> ViewGraph:
     """Return the graph of the true directions between locations (n, d), along all pairs if none are given."""
     edges = np.array(all_pairs(len(locations)) if edges is None else edges)

@@ -1,9 +1,14 @@
-"""The program as users type it, run in this process."""
+"""The program as users type it, and Python, in this process or in one of their own."""
+
+import os
+import subprocess
+import sys
 
 from click.testing import Result
 from typer.testing import CliRunner
 
 from sfm_shapefit.cli import app
+from tests.scenes import ROOT
 
 
 def run(*arguments: object, code: int | None = None) -> Result:
@@ -11,3 +16,26 @@ def run(*arguments: object, code: int | None = None) -> Result:
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
     assert code in (None, result.exit_code), result.output
     return result
+
+
+def run_refused(*arguments: object, code: int = 3) -> str:
+    """Run a command that must end with an exit code and one sentence, and return the sentence."""
+    result = run(*arguments, code=code)
+    assert result.stdout == ""
+    assert result.stderr.startswith("sfm-shapefit: ")
+    assert result.stderr.count("\n") == 1
+    assert "Traceback" not in result.stderr
+    return result.stderr
+
+
+def run_python(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a Python that finds the package, in a process of its own; return how it ended and what it said."""
+    return subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )

@@ -10,12 +10,11 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import LocateOptions, UnsolvableError
+from sfm_shapefit import LocateOptions
 from sfm_shapefit.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.placement.diagnosis import diagnose
-from sfm_shapefit.placement.place import Placement, place, place_further
+from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.results import camera_rows, graph_warnings, quality_warnings
-from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
@@ -65,30 +64,6 @@ def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbour(noise):
     assert [row.reason for row in rows if not row.placed] == ["pendant: joined by a single pair to camera 0"]
     assert (placement.assessment.trust >= MIN_TRUST).all()
     assert list(graph_warnings(placement)) == list(quality_warnings(placement))
-
-
-@pytest.mark.parametrize("noise", NOISE)
-def test_groups_on_a_hinge_are_two_placements(noise):
-    edges = [(i, j) for i, j in ALL if j <= 6 or i >= 6]
-    graph = ViewGraph(N, edges, measured(CENTERS, edges, noise))
-    placement = place(graph)
-    (further,) = place_further(placement)
-    assert placement.cameras.tolist() == list(range(7))
-    assert further.cameras.tolist() == list(range(6, 12))
-    reasons = [row.reason for row in camera_rows(placement, placement.locations, 1.0, [further])]
-    assert reasons[7:] == ["another rigid piece, hinged at camera 6; see pieces/1"] * 5
-
-
-def test_a_five_cycle_is_refused_and_a_four_cycle_is_not():
-    for n, rigid in ((4, True), (5, False)):
-        cycle = np.array([(k, (k + 1) % n) for k in range(n)])
-        assert bool(parallel_rigid_pieces(n, cycle, 3).max() == 0) is rigid
-        graph = ViewGraph(n, cycle, measured(CENTERS[:n], cycle, 0.0))
-        if rigid:
-            assert np.isfinite(place(graph).locations).all()
-        else:
-            with pytest.raises(UnsolvableError, match="tie no three cameras"):
-                place(graph)
 
 
 @pytest.mark.parametrize("noise", NOISE)
@@ -155,9 +130,6 @@ def test_cameras_on_one_line_are_none_of_them_trusted(noise):
     assert np.isfinite(placement.locations).all()
     assert (placement.assessment.trust < MIN_TRUST).all()
     assert any("uncertain" in warning for warning in quality_warnings(placement))
-
-
-# --- from matches on -----------------------------------------------------------------------------
 
 
 def turned_model(scene, image_id, rotation):

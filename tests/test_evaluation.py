@@ -10,20 +10,7 @@ from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.evaluation import RELATIVE_THRESHOLDS, Evaluation, evaluate_poses
-
-
-def random_rotations(rng: np.random.Generator, n: int) -> np.ndarray:
-    q = np.linalg.qr(rng.normal(size=(n, 3, 3)))[0]
-    q[:, :, 0] *= np.sign(np.linalg.det(q))[:, None]
-    return q
-
-
-def turn(axis: np.ndarray, angle_deg: float) -> np.ndarray:
-    """Rodrigues' formula."""
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(angle_deg)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+from tests.problems import random_rotations, turn
 
 
 @dataclass(frozen=True)
@@ -227,9 +214,6 @@ def test_an_alignment_that_holds_for_a_minority_only_is_warned_about():
     assert not found.degenerate
 
 
-# --- refusals ----------------------------------------------------------------------------------------
-
-
 def test_too_few_common_names_are_explained_with_an_example_from_each_side():
     reference = scene(11)
     model = replace(reference, names=tuple(f"images/{name}" for name in reference.names))
@@ -311,9 +295,6 @@ def test_a_threshold_that_is_no_positive_number_is_refused(threshold):
     good = scene(19)
     with pytest.raises(InputError, match="a recall threshold must be a positive number"):
         evaluate(good, good, thresholds=[threshold])
-
-
-# --- output ------------------------------------------------------------------------------------------
 
 
 def test_the_dictionary_survives_json_and_has_stable_keys():

@@ -3,10 +3,7 @@
 import dataclasses
 import inspect
 import itertools
-import os
 import re
-import subprocess
-import sys
 import zipfile
 from pathlib import Path
 
@@ -15,41 +12,15 @@ import pycolmap
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.synthetic import make_rendered_scene
-from sfm_shapefit.synthetic.options import SceneOptions, WorkspaceOptions
-from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from tests.program import run_python
 from tests.scenes import ROOT
-
-FOCAL_LENGTH_PX = 350.0
 
 
 def run_example(name: str, *arguments) -> str:
     """Run an example as a program, in a process of its own; return what it prints."""
-    done = subprocess.run(
-        [sys.executable, str(ROOT / "examples" / name), *map(str, arguments)],
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python(ROOT / "examples" / name, *arguments)
     assert done.returncode == 0, done.stderr
     return done.stdout
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory) -> Path:
-    """Eight photographs of a row of houses, what COLMAP finds in them, and the true model."""
-    options = SceneOptions(
-        shape="facade",
-        num_images=8,
-        image_width=400,
-        image_height=300,
-        focal_length_px=FOCAL_LENGTH_PX,
-        max_keypoints_per_image=600,
-    )
-    folder = tmp_path_factory.mktemp("drawn") / "workspace"
-    write_rendered_workspace(make_rendered_scene(options), folder, WorkspaceOptions(relative_poses=True))
-    return folder
 
 
 def assert_near_truth(model: Path | pycolmap.Reconstruction, workspace: Path) -> None:
@@ -63,17 +34,20 @@ def assert_near_truth(model: Path | pycolmap.Reconstruction, workspace: Path) ->
 
 @pytest.mark.slow
 def test_the_pycolmap_pipeline_places_the_cameras_of_drawn_images(drawn, tmp_path):
-    said = run_example("pycolmap_pipeline.py", drawn / "images", tmp_path / "out", FOCAL_LENGTH_PX)
+    scene, folder = drawn
+    focal_px = scene.options.focal_length_px
+    said = run_example("pycolmap_pipeline.py", folder / "images", tmp_path / "out", focal_px)
     assert re.search(r"^8 cameras, \d{3,} points", said, flags=re.MULTILINE)
-    assert_near_truth(tmp_path / "out/sparse/0", drawn)
+    assert_near_truth(tmp_path / "out/sparse/0", folder)
     assert (tmp_path / "out/located/report.html").stat().st_size > 0
 
 
 @pytest.mark.slow
 def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
     h5py = pytest.importorskip("h5py")
+    scene, folder = drawn
     with (
-        pycolmap.Database.open(drawn / "database.db") as database,
+        pycolmap.Database.open(folder / "database.db") as database,
         h5py.File(tmp_path / "features.h5", "w") as features,
         h5py.File(tmp_path / "matches.h5", "w") as matches,
     ):
@@ -96,28 +70,19 @@ def test_hlocs_files_become_placed_cameras(drawn, tmp_path):
             lines.append(f"{names[i]} {names[j]}\n")
     (tmp_path / "pairs.txt").write_text("".join(lines))
     paths = [tmp_path / name for name in ("pairs.txt", "features.h5", "matches.h5", "out")]
-    said = run_example("hloc_outputs.py", drawn / "images", *paths, FOCAL_LENGTH_PX)
+    said = run_example("hloc_outputs.py", folder / "images", *paths, scene.options.focal_length_px)
     assert "8 of 8 cameras" in said
     keypoints = []
-    for path in (drawn, tmp_path / "out"):
+    for path in (folder, tmp_path / "out"):
         with pycolmap.Database.open(path / "database.db") as database:
             image_id = database.read_image_with_name("0001.jpg").image_id
             keypoints.append(database.read_keypoints(image_id)[:, :2])
     np.testing.assert_allclose(*keypoints, atol=1e-3)
-    assert_near_truth(tmp_path / "out/sparse/0", drawn)
-
-
-# --- what is shipped -------------------------------------------------------------------------------------
+    assert_near_truth(tmp_path / "out/sparse/0", folder)
 
 
 def test_the_wheel_holds_types_schema_and_the_pages_of_the_report(tmp_path):
-    done = subprocess.run(
-        [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path)
     assert done.returncode == 0, done.stderr
     (wheel,) = tmp_path.glob("*.whl")
     names = set(zipfile.ZipFile(wheel).namelist())
@@ -158,9 +123,7 @@ def user_seconds(code: str) -> float:
     times = []
     for _ in range(3):
         end = "import resource as r; print(r.getrusage(r.RUSAGE_SELF).ru_utime)"
-        done = subprocess.run(
-            [sys.executable, "-c", f"{code}\n{end}"], cwd=ROOT, capture_output=True, text=True, check=True
-        )
+        done = run_python("-c", f"{code}\n{end}")
         times.append(float(done.stdout.split()[-1]))
     return min(times)
 
@@ -177,14 +140,7 @@ def test_the_help_of_the_command_takes_less_than_three_tenths_of_a_second():
 @pytest.mark.slow
 def test_the_api_reference_builds_without_a_warning(tmp_path):
     pytest.importorskip("pdoc")
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "scripts/api_reference.py", str(tmp_path)],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_python("-W", "error", "scripts/api_reference.py", tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")

@@ -16,23 +16,14 @@ from sfm_shapefit.geometry import (
     rotation_angles_deg,
     tangent_bases,
 )
+from tests.problems import random_rotations, turn
 
 EPS = np.finfo(np.float64).eps
 seeds = st.integers(0, 2**32 - 1)
 
 
 def random_rotation(rng: np.random.Generator, d: int = 3) -> np.ndarray:
-    q = np.linalg.qr(rng.normal(size=(d, d)))[0]
-    q[:, 0] *= np.sign(np.linalg.det(q))
-    return q
-
-
-def turn(axis: np.ndarray, angle_deg: float) -> np.ndarray:
-    """Rodrigues' formula."""
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    angle = np.radians(angle_deg)
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    return random_rotations(rng, 1, d)[0]
 
 
 def random_similarity(rng: np.random.Generator, d: int = 3) -> Similarity:
@@ -46,9 +37,6 @@ def assert_same_map(found: Similarity, expected: Similarity, rtol: float) -> Non
     np.testing.assert_allclose(found.rotation, expected.rotation, atol=rtol)
     size = 1.0 + np.abs(expected.translation).max() + expected.scale
     np.testing.assert_allclose(found.translation, expected.translation, atol=rtol * size)
-
-
-# --- vectors -----------------------------------------------------------------------------------------
 
 
 def test_normalized_vectors_have_unit_length_and_keep_their_direction():
@@ -87,9 +75,6 @@ def test_a_tangent_basis_completes_its_direction_to_an_orthonormal_frame(seed, d
     frame = np.concatenate([v[:, :, None], tangent_bases(v)], axis=2)
     product = np.swapaxes(frame, 1, 2) @ frame
     np.testing.assert_allclose(product, np.broadcast_to(np.eye(d), product.shape), atol=8 * EPS)
-
-
-# --- least squares -----------------------------------------------------------------------------------
 
 
 @given(seed=seeds, d=st.integers(2, 5), n=st.integers(6, 12))
@@ -170,9 +155,6 @@ def test_coincident_points_are_mapped_onto_each_other_with_scale_one(fit, n):
     found = fit(np.full((n, 3), 2.0), np.full((n, 3), -7.0))
     assert found.scale == 1.0
     np.testing.assert_allclose(found.apply(np.full((1, 3), 2.0)), -7.0, atol=1e-14)
-
-
-# --- L1 ----------------------------------------------------------------------------------------------
 
 
 @given(seed=seeds, n=st.integers(3, 30))
@@ -305,9 +287,6 @@ def test_the_median_spread_ignores_far_points_unless_the_rest_coincides(points, 
     assert median_spread(np.array(points)) == pytest.approx(expected, rel=1e-12)
 
 
-# --- rotations ---------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-3, 30.0, 90.0, 179.999, 180.0])
 def test_rotation_angles_are_exact_at_0_and_at_180_degrees_too(angle):
     axis = np.array([1.0, -2.0, 0.5])
@@ -321,7 +300,7 @@ def test_a_majority_of_equal_rotations_is_the_mean_whatever_the_others_are(seed,
     rng = np.random.default_rng(seed)
     true = random_rotation(rng)
     bad = (n - 1) // 2
-    others = np.array([random_rotation(rng) for _ in range(bad)]).reshape(bad, 3, 3)
+    others = random_rotations(rng, bad)
     if seed % 2:
         others[:] = others[:1]  # all wrong in the same way
     rotations = np.concatenate([others, np.repeat(true[None], n - bad, axis=0)])[rng.permutation(n)]

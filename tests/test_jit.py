@@ -1,17 +1,13 @@
 """The door to numba: kernels compile with or without a place to cache them."""
 
 import ast
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numba
 import pytest
 
 from sfm_shapefit.jit import kernel, on_compilation
-
-ROOT = Path(__file__).parents[1]
+from tests.program import run_python
+from tests.scenes import ROOT
 
 
 def test_a_kernel_works_where_nothing_can_be_cached(monkeypatch):
@@ -82,14 +78,7 @@ print("compiled:", *compiled, file=sys.stderr)
 
 def test_a_second_process_compiles_nothing(tmp_path):
     for process in ("first", "second"):
-        done = subprocess.run(
-            [sys.executable, "-c", RUN_COMMANDS, str(tmp_path / process)],
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-            capture_output=True,
-            text=True,
-            check=False,
-            cwd=ROOT,
-        )
+        done = run_python("-c", RUN_COMMANDS, tmp_path / process)
         assert done.returncode == 0, done.stderr[-500:]
     assert done.stderr.splitlines()[-1] == "compiled:"
 
@@ -110,15 +99,7 @@ assert kernel()(plus_one)(1) == 2
 def test_memory_stays_sound_whichever_of_pycolmap_and_this_package_is_imported_first(program, tmp_path):
     """pycolmap exports a zlib of its own; the system's, loaded after it, corrupts memory."""
     (tmp_path / "program.py").write_text(program)
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "program.py")],
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = run_python(tmp_path / "program.py", NUMBA_CACHE_DIR=str(tmp_path))
     assert done.returncode == 0, done.stderr[-500:]
 
 
@@ -192,7 +173,5 @@ print(caught)
 
 
 def test_an_interrupt_during_a_solve_is_an_interrupt():
-    done = subprocess.run(
-        [sys.executable, "-c", INTERRUPTED], capture_output=True, text=True, check=False, cwd=ROOT
-    )
+    done = run_python("-c", INTERRUPTED)
     assert (done.returncode, done.stdout) == (0, "120\n"), done.stderr

@@ -38,9 +38,6 @@ def python(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
     )
 
 
-# --- Python ------------------------------------------------------------------------------------------------
-
-
 def test_the_readmes_python_example_runs():
     (example,) = BLOCK.findall(README.read_text(encoding="utf-8"))
     process = python("-W", "error", "-c", example)
@@ -73,9 +70,6 @@ def test_every_python_example_of_the_docs_runs(page, number):
     said, errors = process.communicate()
     assert process.returncode == 0, errors
     assert said
-
-
-# --- commands ----------------------------------------------------------------------------------------------
 
 
 def viewed(arguments: list[str], folder: Path) -> None:
@@ -116,9 +110,6 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
 def test_every_command_of_the_program_stands_in_the_readme():
     shown = {command.split()[0] for command in commands_of(README)}
     assert shown == {info.name for info in app.registered_commands if not info.hidden}
-
-
-# --- links -------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)

@@ -5,8 +5,6 @@ import os
 import signal
 import sqlite3
 import stat
-import subprocess
-import sys
 import tomllib
 
 import pytest
@@ -17,7 +15,7 @@ from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats import read_graph
-from tests.program import run
+from tests.program import run, run_python
 from tests.scenes import RING, ROOT, copied
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
@@ -81,13 +79,8 @@ from sfm_shapefit.cli import main
 sys.argv = ["sfm-shapefit", "locate", {str(RING / "sparse" / "0")!r}, {str(tmp_path / "out")!r}, "-q"]
 main()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", script)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-# --- databases -----------------------------------------------------------------------------------------
 
 
 def test_a_database_is_opened_for_reading_without_trust_and_with_limits():
@@ -141,9 +134,6 @@ def test_private_copies_of_a_database_are_private(tmp_path, monkeypatch):
     writer.close()
 
 
-# --- what is no file -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("kind", ["pipe", "endless device"])
 def test_a_pipe_or_a_device_in_the_place_of_a_file_is_refused_at_once(tmp_path, kind):
     scene = copied(RING, tmp_path)
@@ -195,9 +185,6 @@ def test_no_command_waits_for_a_pipe(tmp_path, impatient, what):
     result = run(*arguments, code=3)
     assert "it is a pipe or a device" in result.output or "give the folder" in result.output
     assert sorted(tmp_path.iterdir()) == [pipe]
-
-
-# --- packaging -----------------------------------------------------------------------------------------
 
 
 def test_every_dependency_has_a_lower_and_an_upper_bound():

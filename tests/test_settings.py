@@ -7,15 +7,17 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.colmap.adjustment import AdjustmentOptions
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.options import LocateOptions, MapOptions
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.settings import groups_of, merge_options
 from sfm_shapefit.solver.options import SolverOptions
-from sfm_shapefit.synthetic import random_graph_problem
+from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
 from tests.scenes import RING
 
+NAN = float("nan")
 ALL = (SolverOptions, PlacementOptions, DirectionOptions, StructureOptions, LocateOptions, MapOptions)
 
 
@@ -35,23 +37,59 @@ def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
     assert {name for name in own if own.count(name) > 1} == again
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"scale": "metric"}, "scale must be one of auto, input"),
-        ({"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
-        ({"min_inliers": True}, "min_inliers must be of type int"),
-        ({"refine": 1}, "refine must be of type bool"),
-        ({"max_iterations": 1.5}, "max_iterations must be of type int"),
-        ({"threads": 257}, r"threads must lie in \[0, 256\]"),
-        ({"min_trust": float("nan")}, "min_trust must lie in"),
-        ({"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
-        ({"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
+OUT_OF_RANGE = {
+    DirectionOptions: [(item.name, -1) for item in dataclasses.fields(DirectionOptions)],
+    SolverOptions: [("solver", "magic"), ("threads", -1), ("tol", 0.0), ("max_iterations", 0)],
+    StructureOptions: [
+        *(("max_reprojection_error_px", 0.0), ("max_reprojection_error_px", NAN)),
+        *(("min_triangulation_angle_deg", 90.0), ("min_track_length", 1)),
     ],
-)
-def test_a_wrong_value_is_refused_by_name(wrong, message):
+    AdjustmentOptions: [("max_iterations", 0), ("num_threads", 0)],
+    LocateOptions: [("min_inlier_ratio", 3.0), ("tol", 2.0), ("threads", -1)],
+    SceneOptions: [
+        *(("shape", "torus"), ("num_images", 1), ("pixel_noise_px", NAN), ("focal_length_px", 0.0)),
+        *(("wrong_match_fraction", 1.5), ("corrupted_pair_fraction", -0.1)),
+    ],
+    RenderOptions: [
+        *(("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0)),
+    ],
+}
+REFUSED = [
+    *(
+        (settings, {name: value}, rf"\b{name} must")
+        for settings in OUT_OF_RANGE
+        for name, value in OUT_OF_RANGE[settings]
+    ),
+    (PlacementOptions, {"objective": "l2"}, "least-squares"),
+    (LocateOptions, {"scale": "metric"}, "scale must be one of auto, input"),
+    (LocateOptions, {"min_inliers": "many"}, "min_inliers must be of type int, got 'many'"),
+    (LocateOptions, {"min_inliers": True}, "min_inliers must be of type int"),
+    (LocateOptions, {"refine": 1}, "refine must be of type bool"),
+    (LocateOptions, {"max_iterations": 1.5}, "max_iterations must be of type int"),
+    (LocateOptions, {"threads": 257}, r"threads must lie in \[0, 256\]"),
+    (LocateOptions, {"min_trust": NAN}, "min_trust must lie in"),
+    (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
+    (LocateOptions, {"filter": "mfas"}, "triangles"),
+    (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
+    (LocateOptions, {"refine_rotations": True, "directions": "relative-poses"}, "works on matches"),
+    (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
+    (LocateOptions, {"scale": "distance"}, "needs known_distance"),
+    (LocateOptions, {"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),
+    (LocateOptions, {"known_distance": ("a", "b", -1.0)}, "must be positive"),
+    (LocateOptions, {"known_distance": ("a", "a", 1.0)}, "two different images"),
+    (LocateOptions, {"known_distance": ("a", "b")}, "two image names and a number"),
+    (LocateOptions, {"known_distance": 3.0}, "known_distance must be of type tuple"),
+    (MapOptions, {"min_matches": 5}, "min_matches must be at least 15"),
+    (MapOptions, {"directions": "tracks"}, "a database has no tracks"),
+    (MapOptions, {"relative_rotations": "guessed"}, "relative_rotations must be one of"),
+    (WorkspaceOptions, {"model": "rotations", "database": False}, "model = 'rotations' needs database"),
+]
+
+
+@pytest.mark.parametrize(("settings", "wrong", "message"), REFUSED, ids=str)
+def test_a_wrong_value_is_refused_by_name(settings, wrong, message):
     with pytest.raises(ValueError, match=message):
-        LocateOptions(**wrong)
+        settings(**wrong)
 
 
 def test_integers_serve_as_floats_and_numpy_numbers_as_their_kind():
@@ -68,9 +106,6 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
         merge_options(given, LocateOptions, {"min_trus": 0.0})
     with pytest.raises(TypeError, match="known are"):
         merge_options(None, SolverOptions, {"colour": 3})
-
-
-# --- public names ------------------------------------------------------------------------------------------
 
 
 def test_completion_shows_public_names_only():

@@ -12,13 +12,20 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import random_graph_problem
-from sfm_shapefit.theory import graph_typicality, recovery_conditions, well_distributed
+from sfm_shapefit.theory import _least_sines, graph_typicality, recovery_conditions, well_distributed
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
 
 
 def complete(n):
     return np.array(all_pairs(n))
+
+
+def adjacency_of(problem):
+    n = len(problem.locations)
+    adjacency = np.zeros((n, n), dtype=bool)
+    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
+    return adjacency | adjacency.T
 
 
 def across(v, h):
@@ -83,8 +90,6 @@ def test_beta_is_the_least_sine_over_all_triples(d):
 def test_beta_with_exceptions_leaves_out_the_worst_cameras_of_each_pair():
     problem = random_graph_problem(8, 1.0, 3, seed=4)
     t = problem.locations
-    from sfm_shapefit.theory import _least_sines
-
     _, most, _ = _least_sines(t, 2, 0, len(t))
     brute = min(
         sorted(
@@ -116,9 +121,7 @@ def test_distance_constants_are_those_of_the_two_theorems():
 
 def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
     problem = random_graph_problem(7, 0.8, 3, seed=2)
-    adjacency = np.zeros((7, 7), dtype=bool)
-    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
-    adjacency |= adjacency.T
+    adjacency = adjacency_of(problem)
     exact, _ = well_distributed(problem.locations, adjacency)
     rng = np.random.default_rng(0)
     sampled = spread_along(problem.locations, adjacency, rng.standard_normal((400, 3)))
@@ -129,9 +132,7 @@ def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
 
 def test_the_bracket_of_other_dimensions_holds_the_exact_value_of_space():
     problem = random_graph_problem(9, 0.9, 3, seed=5)
-    adjacency = np.zeros((9, 9), dtype=bool)
-    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
-    adjacency |= adjacency.T
+    adjacency = adjacency_of(problem)
     exact, _ = well_distributed(problem.locations, adjacency)
     padded = np.pad(problem.locations, ((0, 0), (0, 1)))  # h along the new axis is in every complement
     low, high = well_distributed(padded, adjacency)
@@ -141,9 +142,7 @@ def test_the_bracket_of_other_dimensions_holds_the_exact_value_of_space():
 
 def test_in_ten_dimensions_the_bracket_holds_what_sampling_finds():
     problem = random_graph_problem(14, 0.9, 10, seed=6)
-    adjacency = np.zeros((14, 14), dtype=bool)
-    adjacency[problem.edges[:, 0], problem.edges[:, 1]] = True
-    adjacency |= adjacency.T
+    adjacency = adjacency_of(problem)
     low, high = well_distributed(problem.locations, adjacency)
     sampled = spread_along(problem.locations, adjacency, np.random.default_rng(1).standard_normal((60, 10)))
     assert 0.0 < low <= high <= sampled

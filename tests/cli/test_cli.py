@@ -2,13 +2,10 @@
 
 import dataclasses
 import json
-import os
 import re
 import shutil
 import signal
 import sqlite3
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -17,21 +14,15 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.commands import write as files
+from sfm_shapefit.formats import graph_text
 from sfm_shapefit.options import LocateOptions
-from tests.program import run
-from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, ROOT, copied, fingerprint
+from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import all_pairs, exact_graph
+from tests.program import run, run_python, run_refused
+from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, fingerprint
 
 RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
-
-
-def refused(result, code):
-    """Return the one sentence of a refusal after checking that it is one."""
-    assert result.exit_code == code, result.output
-    assert result.stdout == ""
-    assert result.stderr.startswith("sfm-shapefit: ")
-    assert result.stderr.count("\n") == 1
-    assert "Traceback" not in result.stderr
-    return result.stderr
 
 
 @pytest.fixture(scope="module")
@@ -145,11 +136,11 @@ def plain(tmp_path_factory):
 )
 def test_each_flag_matters(tmp_path, plain, flag, value, key):
     values = [] if value is None else [value]
-    result = run("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", flag, *values)
+    arguments = ("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", flag, *values)
     if flag == "--min-inliers":
-        assert "none of the" in refused(result, 4)
+        assert "none of the" in run_refused(*arguments, code=4)
     else:
-        assert json.loads(result.stdout)[key] != plain[key]
+        assert json.loads(run(*arguments).stdout)[key] != plain[key]
 
 
 def test_a_config_file_sets_options_and_flags_win(tmp_path):
@@ -163,8 +154,7 @@ def test_a_config_file_sets_options_and_flags_win(tmp_path):
 @pytest.mark.parametrize("text", ["scale = ", "colour = 3", "min_inliers = 'many'", "scale = 'metric'"])
 def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
-    result = run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml")
-    assert result.exit_code == 2
+    run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)
     assert not (tmp_path / "out").exists()
 
 
@@ -172,7 +162,7 @@ def test_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):
     out = tmp_path / "out"
     run("locate", RING_MODEL, out, "-q", code=0)
     before = fingerprint(out)
-    assert "exists already" in refused(run("locate", RING_MODEL, out), 3)
+    assert "exists already" in run_refused("locate", RING_MODEL, out)
     assert fingerprint(out) == before
     run("locate", RING_MODEL, out, "-q", "--overwrite", "--scale", "unit", code=0)
     assert fingerprint(out) != before
@@ -183,7 +173,7 @@ def test_the_input_is_never_overwritten(tmp_path):
     scene = copied(RING, tmp_path)
     before = fingerprint(scene)
     for target in (scene, scene / "sparse", scene / "sparse" / "0"):
-        refused(run("locate", scene / "sparse" / "0", target, "--overwrite"), 3)
+        run_refused("locate", scene / "sparse" / "0", target, "--overwrite")
     assert fingerprint(scene) == before
 
 
@@ -246,39 +236,17 @@ def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
     for what, arguments, code, word in broken_scenes(tmp_path / "scenes"):
         before = fingerprint(tmp_path)
         model, *rest = arguments
-        result = run("locate", model, tmp_path / "out", *rest)
-        assert word in refused(result, code), what
+        assert word in run_refused("locate", model, tmp_path / "out", *rest, code=code), what
         assert fingerprint(tmp_path) == before, what
         assert not (tmp_path / "out").exists(), what
 
 
-def test_a_database_in_use_is_read_and_left_alone(tmp_path):
-    scene = copied(RING, tmp_path)
-    writer = sqlite3.connect(scene / "database.db")
-    writer.execute("PRAGMA journal_mode = WAL")
-    writer.execute("UPDATE images SET name = name")
-    writer.commit()
-    before = fingerprint(scene)
-    assert {"database.db-wal", "database.db-shm"} <= set(before)
-    run("locate", scene / "sparse" / "0", tmp_path / "out", "-q", code=0)
-    assert fingerprint(scene) == before
-    writer.close()
-
-
-def test_an_unwritable_place_is_refused_before_any_work(tmp_path):
-    (tmp_path / "file").write_text("in the way")
-    assert "not a folder" in refused(run("locate", RING_MODEL, tmp_path / "file" / "out"), 3)
-    assert "is a file" in refused(run("locate", RING_MODEL, tmp_path / "file"), 3)
-
-
 def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    from sfm_shapefit.commands import write as files
-
     def interrupted(*_arguments):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(files, "write_rows", interrupted)
-    assert "interrupted" in refused(run("locate", RING_MODEL, tmp_path / "out"), 130)
+    assert "interrupted" in run_refused("locate", RING_MODEL, tmp_path / "out", code=130)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -294,23 +262,20 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
 
     monkeypatch.setattr(output, "_move_into_place", interrupted)
     for extra in ((), ("--overwrite",)):
-        said = refused(run("locate", RING_MODEL, tmp_path / "out", "--no-report", *extra), 130)
+        said = run_refused("locate", RING_MODEL, tmp_path / "out", "--no-report", *extra, code=130)
         assert "interrupted; the output is complete" in said
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
     monkeypatch.setattr(output, "_move_into_place", stopped)
-    said = refused(run("locate", RING_MODEL, tmp_path / "out", "--no-report", "--overwrite"), 130)
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--no-report", "--overwrite", code=130)
     assert "the output" not in said  # what stands there is the earlier one
 
 
 def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
-    from sfm_shapefit.formats import graph_text
-    from sfm_shapefit.viewgraph import ViewGraph
-
     t = np.random.default_rng(0).standard_normal((8, 3))
-    edges = [(i, j) for i in range(5) for j in range(i)] + [(5, 6), (5, 7), (6, 7)]
-    v = np.array([(t[i] - t[j]) / np.linalg.norm(t[i] - t[j]) for i, j in edges])
+    graph = exact_graph(t, [*all_pairs(5), *all_pairs((5, 6, 7))])
     names = [f"n{k}" for k in range(8)]
-    (tmp_path / "graph.txt").write_text(graph_text(ViewGraph(8, edges, v, names=names)))
+    named = ViewGraph(8, graph.edges, graph.directions, names=names)
+    (tmp_path / "graph.txt").write_text(graph_text(named))
     result = run("solve", tmp_path / "graph.txt", tmp_path / "out")
     assert "pieces/1: 3 of 3 cameras" in " ".join(result.stdout.split())
     lines = (tmp_path / "out" / "pieces" / "1" / "cameras.csv").read_text().splitlines()
@@ -321,10 +286,10 @@ def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
 
 
 def test_evaluate_prints_a_table_json_and_csv(ring_out, tmp_path):
-    table = run("evaluate", ring_out, RING_MODEL, "--threshold", "0.5", "--csv", tmp_path / "errors.csv")
-    assert table.exit_code == 0
+    arguments = ("evaluate", ring_out, RING_MODEL, "--threshold", "0.5")
+    table = run(*arguments, "--csv", tmp_path / "errors.csv", code=0)
     assert "8 in common of 8" in table.stdout
-    errors = json.loads(run("evaluate", ring_out, RING_MODEL, "--json", "--threshold", "0.5").stdout)
+    errors = json.loads(run(*arguments, "--json").stdout)
     assert errors["position_error"]["max"] < 1e-5
     assert errors["recall"][-1] == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0}
     lines = (tmp_path / "errors.csv").read_text().splitlines()
@@ -337,15 +302,14 @@ def test_evaluate_refuses_models_without_common_cameras(tmp_path):
     for image_id in list(other.images):
         other.image(image_id).name = f"other{image_id}.jpg"
     other.write(tmp_path)
-    assert "share 0 image names" in refused(run("evaluate", RING_MODEL, tmp_path), 3)
+    assert "share 0 image names" in run_refused("evaluate", RING_MODEL, tmp_path)
 
 
 def test_synth_makes_a_workspace_that_locate_takes(tmp_path):
-    made = run("synth", tmp_path / "scene", "--shape", "ring", "--num-images", "12", "--seed", "3")
-    assert made.exit_code == 0
+    made = run("synth", tmp_path / "scene", "--shape", "ring", "--num-images", "12", "--seed", "3", code=0)
     assert "12" in made.stdout
     run("locate", tmp_path / "scene" / "sparse" / "0", tmp_path / "out", "-q", code=0)
-    refused(run("synth", tmp_path / "scene"), 3)
+    run_refused("synth", tmp_path / "scene")
     run("synth", tmp_path / "other", "--num-images", "1", code=2)
 
 
@@ -353,8 +317,7 @@ def test_names_cannot_play_with_the_terminal(tmp_path):
     model = pycolmap.Reconstruction(RING_MODEL)
     model.image(8).name = "[red]\x1b[2Jgone.jpg"
     model.write(tmp_path)
-    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db")
-    assert result.exit_code == 0
+    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db", code=0)
     assert "\x1b[2J" not in result.output
     assert "[red]" in result.stdout
 
@@ -363,15 +326,14 @@ def test_brackets_in_a_path_are_only_brackets(tmp_path):
     folder = tmp_path / "a[b]:star:[red]"
     folder.mkdir()
     scene = copied(RING, folder)
-    result = run("locate", scene / "sparse" / "0", folder / "out")
-    assert result.exit_code == 0, result.output
+    result = run("locate", scene / "sparse" / "0", folder / "out", code=0)
     assert "[b]:star:[red]" in "".join(result.stdout.split())
     run("evaluate", folder / "out", scene / "sparse" / "0", code=0)
 
 
 def test_evaluate_does_not_write_over_other_files(ring_out, tmp_path):
     (tmp_path / "images.bin").write_bytes(b"precious")
-    refused(run("evaluate", ring_out, RING_MODEL, "--csv", tmp_path / "images.bin"), 3)
+    run_refused("evaluate", ring_out, RING_MODEL, "--csv", tmp_path / "images.bin")
     assert (tmp_path / "images.bin").read_bytes() == b"precious"
 
 
@@ -403,18 +365,14 @@ files.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", script)
     assert done.returncode == 130
     assert done.stderr == "sfm-shapefit: interrupted; nothing was written\n"
     assert list(tmp_path.iterdir()) == []
 
 
 def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):
-    command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", "nowhere", str(tmp_path / "out")]
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    done = run_python("-m", "sfm_shapefit.cli", "locate", "nowhere", tmp_path / "out")
     assert done.returncode == 3
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1

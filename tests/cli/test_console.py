@@ -14,6 +14,7 @@ import pytest
 from sfm_shapefit import LocateOptions, MapOptions, locate, map_database
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
+from tests.program import run_python
 from tests.scenes import BUNDLED, FACADE, RING, ROOT
 
 
@@ -107,13 +108,8 @@ def test_nothing_is_shown_where_there_is_no_terminal(capfd):
 @pytest.mark.parametrize("verbose", [False, True])
 def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, verbose):
     command = ["locate", RING / "sparse/0", tmp_path / "out", "--bundle-adjust", "--no-report"]
-    done = subprocess.run(
-        [sys.executable, "-m", "sfm_shapefit.cli", *map(str, command), *["--verbose"] * verbose],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = run_python("-m", "sfm_shapefit.cli", *command, *["--verbose"] * verbose)
+    assert done.returncode == 0
     if not verbose:
         assert done.stderr == ""
         assert re.search(r"time +│ \d+\.\d s +│", done.stdout)

@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from sfm_shapefit.cli import console
+from tests.program import run_python
 from tests.scenes import RING, ROOT
 
 
@@ -35,9 +36,7 @@ try:
 except KeyboardInterrupt:
     sys.exit(130)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False
-    )
+    done = run_python("-c", script)
     assert (done.returncode, done.stderr) == (130, "")
 
 

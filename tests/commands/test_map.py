@@ -3,6 +3,7 @@
 import json
 import sqlite3
 from contextlib import closing
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -152,9 +153,6 @@ def test_a_damaged_database_is_refused_in_one_sentence(tmp_path, statement, mess
         sfm_shapefit.map_database(changed(RING, tmp_path, "PRAGMA foreign_keys = OFF", *statement.split(";")))
 
 
-# --- averaging ---------------------------------------------------------------------------------------
-
-
 def problem(num_false=0, seed=5, n=14):
     """Pairs of 100 matches; false ones of 16 agree on a turn of the second half of the cameras by 90 deg."""
     rng = np.random.default_rng(seed)
@@ -194,15 +192,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement():
     bad = (relative.pairs == 3).any(axis=1)
     rotations = relative.rotations.copy()
     rotations[bad] = Rotation.random(int(bad.sum()), random_state=np.random.default_rng(1)).as_matrix()
-    answer = averaged(
-        14,
-        RelativeRotations(
-            pairs=relative.pairs,
-            rotations=rotations,
-            num_matches=relative.num_matches,
-            sound=relative.sound,
-        ),
-    )
+    answer = averaged(14, replace(relative, rotations=rotations))
     others = np.delete(np.arange(14), 3)
     assert answer.agreements[3] < 0.25
     assert answer.agreements[others].min() > 0.8
@@ -214,21 +204,7 @@ def test_pairs_that_contradict_known_focal_lengths_are_left_out_where_they_can_b
     sound = np.random.default_rng(3).permutation(len(relative.pairs)) >= 30
     rotations = relative.rotations.copy()
     rotations[~sound] = Rotation.random(30, random_state=np.random.default_rng(2)).as_matrix()
-    answer = averaged(
-        14,
-        RelativeRotations(
-            pairs=relative.pairs, rotations=rotations, num_matches=relative.num_matches, sound=sound
-        ),
-    )
+    answer = averaged(14, replace(relative, rotations=rotations, sound=sound))
     assert answer.sound_only
     assert answer.share > 0.99
     assert worst_error_deg(answer, truth) < 0.5
-
-
-def test_options_are_checked():
-    with pytest.raises(ValueError, match="min_matches must be at least 15"):
-        sfm_shapefit.MapOptions(min_matches=5)
-    with pytest.raises(ValueError, match="a database has no tracks"):
-        sfm_shapefit.MapOptions(directions="tracks")
-    with pytest.raises(ValueError, match="relative_rotations must be one of"):
-        sfm_shapefit.MapOptions(relative_rotations="guessed")

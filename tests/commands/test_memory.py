@@ -121,9 +121,6 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
     assert keep_within_memory(work, measured, LocateOptions(), ECONOMIES[0])[1] is measured
 
 
-# --- in locate -----------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def workspaces(tmp_path_factory):
     """Models with a database: plain, and of rigs."""

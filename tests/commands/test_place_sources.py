@@ -7,11 +7,13 @@ import re
 import numpy as np
 import pytest
 
+from sfm_shapefit.baselines import linf
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
-from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results import pair_rows
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene
@@ -136,9 +138,6 @@ def test_options_that_do_not_fit_the_source_are_refused(tmp_path, arguments, wor
     assert not (tmp_path / "out").exists()
 
 
-# --- objectives and filters ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("objective", ["auto", "shapefit", "lud", "least-squares", "linf"])
 def test_every_objective_writes_the_same_files_and_only_shapefit_is_certified(tmp_path, objective):
     problem = random_graph_problem(14, 0.9, sigma=0.001, seed=5)
@@ -178,8 +177,6 @@ def test_a_filter_composes_with_least_squares(name):
 
 def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
     problem, graph = corrupted()
-    from sfm_shapefit.results import pair_rows
-
     placed = place(graph, PlacementOptions(filter="triangles"))
     rows = pair_rows(placed, np.zeros(graph.num_edges, dtype=np.int64))
     dropped = [k for k, row in enumerate(rows) if row.reason == "left out by the filter"]
@@ -195,17 +192,7 @@ def test_without_a_filter_nothing_is_dropped():
     assert place(graph, PlacementOptions(objective="shapefit")).dropped.tolist() == []
 
 
-def test_wrong_names_are_refused_with_the_choices():
-    with pytest.raises(ValueError, match="least-squares"):
-        PlacementOptions(objective="l2")
-    with pytest.raises(ValueError, match="triangles"):
-        LocateOptions(filter="mfas")
-
-
 def test_large_graphs_are_refused_by_l_inf():
-    from sfm_shapefit.baselines import linf
-    from sfm_shapefit.errors import UnsolvableError
-
     _, graph = corrupted()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(linf, "_MOST_PAIRS", 10)

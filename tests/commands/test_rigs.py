@@ -1,6 +1,7 @@
 """Rigs and fixed cameras in `locate`: metric scale, poses that stay, and what is refused."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -46,9 +47,6 @@ def centres(reconstruction):
     """Ids and centres of the posed images, ascending."""
     ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
-
-
-# --- the scene and its model ---------------------------------------------------------------------------
 
 
 def test_a_written_drive_has_its_rigs_and_its_true_poses(rigs, workspace):
@@ -106,9 +104,6 @@ def assert_rigs_equal(a, b, atol=0.0):
             np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
 
 
-# --- rigs in locate ------------------------------------------------------------------------------------
-
-
 def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
     ids, centers = centres(found.reconstruction)
     assert ids == list(range(1, 37))
@@ -149,18 +144,10 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     kept = ~(images.pairs == 4).any(axis=1)
     counts = np.diff(images.match_offsets)
     rows = np.repeat(kept, counts)
-    lonely = type(images)(
-        **{name: getattr(images, name) for name in images.__slots__}
-        | {
-            "pairs": images.pairs[kept],
-            "match_offsets": np.append(0, np.cumsum(counts[kept])),
-            "matches": images.matches[rows],
-            "match_is_wrong": images.match_is_wrong[rows],
-            "pair_is_corrupted": images.pair_is_corrupted[kept],
-            "relative_rotations": images.relative_rotations[kept],
-            "relative_translations": images.relative_translations[kept],
-        }
-    )
+    per_pair = ("pairs", "pair_is_corrupted", "relative_rotations", "relative_translations")
+    parts = {name: getattr(images, name)[kept] for name in per_pair}
+    parts |= {name: getattr(images, name)[rows] for name in ("matches", "match_is_wrong")}
+    lonely = replace(images, **parts, match_offsets=np.append(0, np.cumsum(counts[kept])))
     out = workspace.parent / "lonely"
     write_workspace(lonely, out, WorkspaceOptions(model="rotations"), rigs)
     located = sfm_shapefit.locate(out / "sparse" / "0", options=LocateOptions(points="never"))
@@ -183,16 +170,15 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
 
 def test_what_rigs_rule_out_is_said(workspace):
     model = workspace / "sparse" / "0"
-    with pytest.raises(InputError, match="the scale is that of the rigs; leave out"):
-        sfm_shapefit.locate(model, options=LocateOptions(scale="unit"))
-    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
-        sfm_shapefit.locate(model, options=LocateOptions(objective="linf"))
-    with pytest.raises(InputError, match="go with the objectives auto, shapefit and lud"):
-        sfm_shapefit.locate(model, options=LocateOptions(filter="1dsfm"))
-    with pytest.raises(InputError, match="turn as one"):
-        sfm_shapefit.locate(model, options=LocateOptions(refine_rotations=True))
-    with pytest.raises(InputError, match="no rig of several cameras"):
-        sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(scale="rig"))
+    for source, option, sentence in (
+        (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
+        (model, {"objective": "linf"}, "go with the objectives auto, shapefit and lud"),
+        (model, {"filter": "1dsfm"}, "go with the objectives auto, shapefit and lud"),
+        (model, {"refine_rotations": True}, "turn as one"),
+        (RING / "sparse" / "0", {"scale": "rig"}, "no rig of several cameras"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            sfm_shapefit.locate(source, **option)
 
 
 def test_inspecting_says_how_many_frames_hang_together(workspace):
@@ -213,9 +199,6 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
 def write_and_return(rigs, folder):
     write_workspace(rigs.scene, folder, WorkspaceOptions(database=False), rigs)
     return folder
-
-
-# --- fixed cameras -------------------------------------------------------------------------------------
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from sfm_shapefit.evaluation import evaluate_poses
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
+from sfm_shapefit.viewgraph import ViewGraph
 
 PIXEL = 1e-3  # rad
 NUM_POINTS = 60
@@ -168,8 +169,6 @@ def test_two_views_are_no_track():
 def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     centers, points, batch = scene()
     directions = measured(batch)
-    from sfm_shapefit.viewgraph import ViewGraph
-
     graph = ViewGraph(6, batch.pairs, directions.directions, names=[f"{k}.jpg" for k in range(6)])
     joint = join_points(graph, directions.covariance, tracks_of(batch), np.full(6, PIXEL), noise_px=2.0)
     assert joint.num_points == NUM_POINTS
@@ -199,8 +198,6 @@ def street(cameras=12, seed=0):
 
 
 def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_cannot():
-    from sfm_shapefit.viewgraph import ViewGraph
-
     centers, pairs, directions, tracks = street()
     graph = ViewGraph(len(centers), pairs, directions)
     covariance = np.broadcast_to(1e-6 * np.eye(2), (len(pairs), 2, 2))
@@ -220,8 +217,6 @@ def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_can
 
 
 def test_a_camera_that_the_points_do_not_determine_is_left_out():
-    from sfm_shapefit.viewgraph import ViewGraph
-
     centers, pairs, directions, tracks = street()
     alone = tracks.cameras == len(centers) - 1
     keep = (pairs != len(centers) - 1).all(axis=1) | (pairs == len(centers) - 2).any(

@@ -21,8 +21,9 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import read_relative_poses, relative_poses_text
+from sfm_shapefit.formats import EpipolarGeometries, read_relative_poses, relative_poses_text
 from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
 from sfm_shapefit.formats.tum import poses_csv, tum_text
@@ -54,75 +55,38 @@ BUNDLER = """# Bundle file v0.3
 2 0 7 10 20 1 8 -10 20
 """
 
+
+def listed(values, first=0):
+    """Values with their keys from a first one on, as OpenMVG writes its tables."""
+    return [{"key": key, "value": value} for key, value in enumerate(values, start=first)]
+
+
+def wrapped(**data):
+    return {"ptr_wrapper": {"data": data}}
+
+
+SIZE = {"width": 100, "height": 80}
+PINHOLE = {"value0": SIZE, "focal_length": 100.0, "principal_point": [50.0, 40.0]}
 OPENMVG = {
     "sfm_data_version": "0.3",
     "root_path": "/somewhere",
-    "views": [
-        {
-            "key": k,
-            "value": {
-                "ptr_wrapper": {
-                    "data": {
-                        "local_path": "/",
-                        "filename": name,
-                        "width": 100,
-                        "height": 80,
-                        "id_view": k,
-                        "id_intrinsic": 0,
-                        "id_pose": k,
-                    }
-                }
-            },
-        }
+    "views": listed(
+        wrapped(local_path="/", filename=name, id_intrinsic=0, id_view=k, id_pose=k, **SIZE)
         for k, name in enumerate([*NAMES, "unposed.jpg"])
-    ],
-    "intrinsics": [
-        {
-            "key": 0,
-            "value": {
-                "polymorphic_name": "pinhole_radial_k3",
-                "ptr_wrapper": {
-                    "data": {
-                        "value0": {
-                            "value0": {"width": 100, "height": 80},
-                            "focal_length": 100.0,
-                            "principal_point": [50.0, 40.0],
-                        },
-                        "disto_k3": [0.0, 0.0, 0.0],
-                    }
-                },
-            },
-        }
-    ],
-    "extrinsics": [
-        {"key": k, "value": {"rotation": R.tolist(), "center": center.tolist()}}
-        for k, center in enumerate(CENTERS)
-    ],
-    "structure": [
-        {
-            "key": 5,
-            "value": {
-                "X": POINT.tolist(),
-                "observations": [
-                    {"key": k, "value": {"id_feat": 0, "x": PIXELS[k].tolist()}} for k in range(2)
-                ],
-            },
-        }
-    ],
+    ),
+    "intrinsics": listed(
+        [{"polymorphic_name": "pinhole_radial_k3", **wrapped(value0=PINHOLE, disto_k3=[0.0, 0.0, 0.0])}]
+    ),
+    "extrinsics": listed({"rotation": R.tolist(), "center": center.tolist()} for center in CENTERS),
+    "structure": listed(
+        [{"X": POINT.tolist(), "observations": listed({"id_feat": 0, "x": xy.tolist()} for xy in PIXELS)}],
+        first=5,
+    ),
 }
 
 OPENSFM = [
     {
-        "cameras": {
-            "c": {
-                "projection_type": "perspective",
-                "width": 100,
-                "height": 80,
-                "focal": 1.0,
-                "k1": 0,
-                "k2": 0,
-            }
-        },
+        "cameras": {"c": {"projection_type": "perspective", **SIZE, "focal": 1.0, "k1": 0, "k2": 0}},
         "shots": {
             name: {"rotation": TURN, "translation": (-R @ center).tolist(), "camera": "c"}
             for name, center in zip(NAMES, CENTERS, strict=True)
@@ -137,9 +101,9 @@ TRACKS = (
 )
 
 
-def bundler_file(folder, text=BUNDLER):
+def bundler_file(folder):
     (folder / "list.txt").write_text("a.jpg\nb.jpg 0 100\n")
-    (folder / "bundle.out").write_text(text)
+    (folder / "bundle.out").write_text(BUNDLER)
     return folder / "bundle.out"
 
 
@@ -227,53 +191,34 @@ def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tm
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("kind", "old", "new", "message"),
     [
-        (("100 0 0\n0 -1 0", "100 0 nil\n0 -1 0"), r"line 3: 'nil' is no finite number"),
-        (("v0.3", "v0.9"), r"line 1: expected '# Bundle file v0\.3'"),
-        (("0 0 1\n-1 0 0\n2", "0 0 2\n-1 0 0\n2"), r"camera 0 has no rotation"),
-        (("1 8 -10 20", "9 8 -10 20"), r"point 0 is seen by camera 9 of 2"),
-        (("1 8 -10 20", "1 8 -10"), r"ends early, in line 15"),
+        ("bundler", "100 0 0\n0 -1 0", "100 0 nil\n0 -1 0", r"line 3: 'nil' is no finite number"),
+        ("bundler", "v0.3", "v0.9", r"line 1: expected '# Bundle file v0\.3'"),
+        ("bundler", "0 0 1\n-1 0 0\n2", "0 0 2\n-1 0 0\n2", r"camera 0 has no rotation"),
+        ("bundler", "1 8 -10 20", "9 8 -10 20", r"point 0 is seen by camera 9 of 2"),
+        ("bundler", "1 8 -10 20", "1 8 -10", r"ends early, in line 15"),
+        ("openmvg", '"center": [1.0, 2.0, 3.0]', '"centre": 0', r"extrinsics\[0\]/value has no key 'center'"),
+        (
+            "openmvg",
+            '"focal_length": 100.0',
+            '"focal_length": NaN',
+            r"value0/focal_length is not finite",
+        ),
+        ("openmvg", '"id_intrinsic": 0', '"id_intrinsic": 3', r"has the intrinsic 3, which is not among"),
+        ("openmvg", "[[0.0, -1.0", "[[0.5, -1.0", r"extrinsics\[0\]/value/rotation is no rotation"),
+        ("openmvg", '"root_path"', "root_path", r"line 1, column \d+: no JSON"),
+        ("opensfm", '"focal": 1.0', '"fokal": 1.0', r"\[0\]/cameras/c has no key 'focal'"),
+        ("opensfm", '"perspective"', '"spherical"', r"projection type 'spherical'; perspective, brown"),
+        ("opensfm", '"camera": "c"', '"camera": "d"', r"shots/a\.jpg has the camera 'd'"),
+        ("opensfm", '"width": 100', '"width": "wide"', r"cameras/c/width is no number"),
     ],
 )
-def test_a_malformed_bundler_file_is_refused_by_its_line(tmp_path, change, message):
-    with pytest.raises(InputError, match=message):
-        read_model_file(bundler_file(tmp_path, BUNDLER.replace(*change, 1)))
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('"center": [1.0, 2.0, 3.0]', '"centre": 0'), r"extrinsics\[0\]/value has no key 'center'"),
-        (('"focal_length": 100.0', '"focal_length": NaN'), r"data/value0/focal_length is not finite"),
-        (('"id_intrinsic": 0', '"id_intrinsic": 3'), r"has the intrinsic 3, which is not among"),
-        (("[[0.0, -1.0", "[[0.5, -1.0"), r"extrinsics\[0\]/value/rotation is no rotation"),
-        (('"root_path"', "root_path"), r"line 1, column \d+: no JSON"),
-    ],
-)
-def test_a_malformed_openmvg_file_is_refused_by_its_key(tmp_path, change, message):
-    file = openmvg_file(tmp_path)
+def test_a_malformed_file_is_refused_by_its_line_or_key(tmp_path, kind, old, new, message):
+    file = WRITERS[kind](tmp_path)
     text = file.read_text()
-    assert change[0] in text
-    file.write_text(text.replace(*change, 1))
-    with pytest.raises(InputError, match=message):
-        read_model_file(file)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (('"focal": 1.0', '"fokal": 1.0'), r"\[0\]/cameras/c has no key 'focal'"),
-        (('"perspective"', '"spherical"'), r"projection type 'spherical'; perspective, brown"),
-        (('"camera": "c"', '"camera": "d"'), r"shots/a\.jpg has the camera 'd'"),
-        (('"width": 100', '"width": "wide"'), r"cameras/c/width is no number"),
-    ],
-)
-def test_a_malformed_opensfm_file_is_refused_by_its_key(tmp_path, change, message):
-    file = opensfm_file(tmp_path)
-    text = file.read_text()
-    assert change[0] in text
-    file.write_text(text.replace(*change, 1))
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
     with pytest.raises(InputError, match=message):
         read_model_file(file)
 
@@ -287,9 +232,6 @@ def test_a_file_that_is_no_model_is_refused(tmp_path):
     (tmp_path / "other.json").write_text('{"frames": []}')
     with pytest.raises(InputError, match="is no model: give a COLMAP folder"):
         read_model(tmp_path / "other.json")
-
-
-# --- written formats ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -350,9 +292,6 @@ def test_poses_come_back_from_text(courtyard, kind):
     np.testing.assert_allclose(rotations, courtyard.rotations[order], atol=1e-14)
 
 
-# --- relative poses ----------------------------------------------------------------------------------
-
-
 def test_a_relative_pose_has_its_second_camera_where_the_first_sees_it(tmp_path):
     # x_2 = x_1 + t: camera 2 stands at -t in the axes of camera 1.
     (tmp_path / "pairs.txt").write_text("# comment\nb.jpg a.jpg 1 0 0 0 -2 0 0\n")
@@ -372,9 +311,6 @@ def relative_poses_of_ring():
 
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
-    from sfm_shapefit.commands.place import place_graph_file
-    from sfm_shapefit.formats import EpipolarGeometries
-
     model, pairs, rotations, units = relative_poses_of_ring()
     poses = EpipolarGeometries(names=model.names, pairs=pairs, rotations=rotations, to_second=units)
     (tmp_path / "relpose.txt").write_text(relative_poses_text(poses))
@@ -424,18 +360,10 @@ def test_a_malformed_relative_pose_is_refused_by_its_line(tmp_path, line, messag
         read_relative_poses(tmp_path / "pairs.txt")
 
 
-# --- convert -----------------------------------------------------------------------------------------
-
-
 def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
     source = RING / "sparse" / "0"
-    for name, extra in {
-        "bin": [],
-        "text": ["--format", "colmap-txt"],
-        "t.json": [],
-        "t.tum": [],
-        "t.csv": [],
-    }.items():
+    for name in ("bin", "text", "t.json", "t.tum", "t.csv"):
+        extra = ["--format", "colmap-txt"] if name == "text" else []
         run("convert", source, tmp_path / name, *extra, code=0)
         again = run("convert", source, tmp_path / name, *extra, code=3)
         assert "exists already" in again.output

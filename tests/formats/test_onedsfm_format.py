@@ -168,9 +168,6 @@ def test_the_published_scene_has_the_conventions_of_its_manual():
     assert angle_between_deg(found.to_second[rows], to_second).max() < 1e-3
 
 
-# --- g2o -------------------------------------------------------------------------------------------
-
-
 def test_g2o_has_the_camera_in_the_world(tmp_path):
     turn = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
     (line,) = g2o_text(["12"], np.array([[1.0, 2.0, 3.0]]), turn[None]).splitlines()

@@ -1,9 +1,6 @@
 """Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
 
 import json
-import os
-import subprocess
-import sys
 import tracemalloc
 
 import numpy as np
@@ -28,7 +25,7 @@ from sfm_shapefit.laplacian.operators import (
 )
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
 from tests.graph_families import FAMILIES, random_blocks, random_weights
-from tests.scenes import ROOT
+from tests.program import run_python
 
 Array = npt.NDArray[np.float64]
 EPS = np.finfo(np.float64).eps
@@ -575,9 +572,7 @@ print(json.dumps({"seconds": time.process_time() - begin, "answer": answer}))
 
 
 def run_child(dtype: str, blas_threads: int, **environment: str) -> dict:
-    environment |= {"OPENBLAS_NUM_THREADS": str(blas_threads), "PYTHONPATH": str(ROOT)}
-    command = [sys.executable, "-c", CHILD, dtype]
-    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, check=True)
+    done = run_python("-c", CHILD, dtype, OPENBLAS_NUM_THREADS=str(blas_threads), **environment)
     return json.loads(done.stdout)
 
 

@@ -157,9 +157,6 @@ def test_theory_is_given_in_words_or_left_out_with_the_reason():
     assert "p-typical for no p" in theory_of(chain, problem.locations).statement
 
 
-# --- the command ---------------------------------------------------------------------------------
-
-
 def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
     scene = copied(COURTYARD, tmp_path)
     before = fingerprint(tmp_path)

@@ -144,9 +144,6 @@ def test_rejected_pairs_that_agree_on_another_placement_are_warned_of(usual):
     assert any("agree with one another" in sentence for sentence in quality_warnings(found))
 
 
-# --- priors --------------------------------------------------------------------------------------------
-
-
 def priors_for(rows, positions):
     """Exact positions of some cameras, of a standard deviation of 0.01."""
     return PositionPriors(

@@ -150,9 +150,6 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     assert (unrefined.num_turned_pairs, len(unrefined.reset_nodes)) == (0, 0)
 
 
-# --- what nothing holds at its distance ------------------------------------------------------------
-
-
 def test_openness_is_the_error_that_triangulation_makes():
     """Two rays a either side of their middle and s of noise: s / (sqrt 2 sin a) of their length."""
     for half_angle in (np.pi / 4, 0.1, 1e-3):

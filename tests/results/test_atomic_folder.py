@@ -3,7 +3,6 @@
 import os
 import signal
 import stat
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,7 +11,7 @@ import pytest
 from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.atomic_folder import atomic_folder, claimed_output
 from sfm_shapefit.errors import InputError
-from tests.scenes import ROOT
+from tests.program import run_python
 
 
 def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_path):
@@ -23,10 +22,7 @@ def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_p
             "import sys\nfrom sfm_shapefit.atomic_folder import claimed_output\n"
             f"with claimed_output({str(out)!r}): pass"
         )
-        second = subprocess.run(
-            [sys.executable, "-c", script], capture_output=True, text=True, check=False, cwd=ROOT
-        )
-        assert "another run is writing" in second.stderr
+        assert "another run is writing" in run_python("-c", script).stderr
     assert (out / "locate.json").read_text() == "first"
     assert list(tmp_path.iterdir()) == [out]
 
@@ -39,8 +35,7 @@ with atomic_folder({str(tmp_path / "a")!r}) as partial:
     (partial / "file").write_text("x")
     os.kill(os.getpid(), signal.SIGKILL)
 """
-    done = subprocess.run([sys.executable, "-c", script], check=False, cwd=ROOT)
-    assert done.returncode == -signal.SIGKILL
+    assert run_python("-c", script).returncode == -signal.SIGKILL
     (left,) = tmp_path.iterdir()
     assert stat.S_IMODE(left.stat().st_mode) == 0o700
     with atomic_folder(tmp_path / "b"):

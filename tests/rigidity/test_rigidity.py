@@ -20,9 +20,6 @@ from tests.problems import all_pairs
 DIMENSIONS = (2, 3, 4)
 
 
-# --- graphs -------------------------------------------------------------------------------------
-
-
 def cycle(n):
     return [(k, (k + 1) % n) for k in range(n)]
 
@@ -72,9 +69,6 @@ NAMED_3D = [
 def random_graph(rng, n, num_edges):
     pairs = np.array(all_pairs(n))
     return pairs[rng.permutation(len(pairs))[: min(num_edges, len(pairs))]]
-
-
-# --- an independent oracle: ranks at random positions -------------------------------------------
 
 
 def null_space(equations, size):
@@ -128,9 +122,6 @@ def graph_of(n, edges, names=None, dimension=3):
     """A view graph with arbitrary directions: generic rigidity does not look at them."""
     directions = np.tile(np.eye(dimension)[0], (len(edges), 1))
     return ViewGraph(n, np.array(edges, dtype=np.int64).reshape(-1, 2), directions, names=names)
-
-
-# --- verdicts -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("name", "n", "edges", "sizes"), NAMED_3D, ids=[row[0] for row in NAMED_3D])
@@ -274,9 +265,6 @@ def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():
     assert len(np.unique(parallel_rigid_pieces(side * side, edges, 2))) == len(edges)
 
 
-# --- invariance ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("flaw", "verdict"), [("none", True), ("pendant", False), ("hinge", False)])
 def test_many_pairs_without_triangles_are_judged_by_a_few_of_each_camera_first(flaw, verdict, monkeypatch):
     rng = np.random.default_rng(7)
@@ -338,9 +326,6 @@ def test_pieces_are_ordered_by_cameras_then_edges_then_first_cameras():
 def test_a_pair_given_twice_counts_once():
     edges = np.array([(0, 1), (1, 0), (1, 2), (2, 3), (3, 4), (4, 0)])
     np.testing.assert_array_equal(parallel_rigid_pieces(5, edges, 3), [0, 0, 2, 3, 4, 1])
-
-
-# --- summaries ----------------------------------------------------------------------------------
 
 
 def test_pieces_list_their_cameras_edges_and_hinges():
@@ -422,9 +407,6 @@ def test_a_rigid_graph_leaves_nobody_out_and_an_empty_one_everybody():
 def test_impossible_edges_and_dimensions_are_refused(edges, dimension, message):
     with pytest.raises(InputError, match=message):
         parallel_rigid_pieces(3, np.array(edges), dimension)
-
-
-# --- size ---------------------------------------------------------------------------------------
 
 
 def test_a_hundred_thousand_pairs_and_a_late_pendant_are_sorted_out_exactly():

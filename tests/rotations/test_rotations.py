@@ -169,9 +169,6 @@ def test_the_sparse_system_has_the_dense_ones_answer(monkeypatch):
     np.testing.assert_array_equal(sparse.updated, dense.updated)
 
 
-# --- models and locate -----------------------------------------------------------------------------
-
-
 def random_turns(n, sigma_deg, seed):
     vectors = np.radians(sigma_deg) * np.random.default_rng(seed).standard_normal((n, 3))
     return Rotation.from_rotvec(vectors).as_matrix()
@@ -249,11 +246,6 @@ def test_the_models_own_tracks_serve_as_well():
         sfm_shapefit.evaluate(one.reconstruction, RING / "sparse" / "0") for one in (plain, refined)
     )
     assert after.rotation_deg.median < 0.25 * before.rotation_deg.median
-
-
-def test_relative_poses_are_no_matches_to_refine_on():
-    with pytest.raises(ValueError, match="refine_rotations works on matches"):
-        LocateOptions(refine_rotations=True, directions="relative-poses")
 
 
 def test_averaged_rotations_of_a_real_scene_get_better():

@@ -1,6 +1,5 @@
 """The certificate: what it makes of approximate duals, of spoilt ones, and of graphs it cannot serve."""
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -12,12 +11,11 @@ from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.newton import solve_newton_sparse
-from sfm_shapefit.solver.options import IterationInfo
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import Stop, solve_admm
+from sfm_shapefit.solver.splitting import solve_admm
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
-from sfm_shapefit.solver.splitting.split_then_newton import HybridResult, HybridStop, solve_hybrid
+from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
 from tests.problems import exact_graph, measure_graph
@@ -62,17 +60,29 @@ def unit_bound(graph, t, dual):
     return multiplier / max(1.0, np.max(np.linalg.norm(y, axis=1) / graph.weights))
 
 
-@pytest.mark.parametrize(("family", "degree"), [("geo", 24), ("comm", 40), ("er", 24)])
-@pytest.mark.parametrize("sigma", [0.0, 0.01])
-def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(family, degree, sigma):
-    graph = draw_family(family, 400, degree, sigma=sigma)
-    for iterations in (25, 50):
-        split = solve_admm(graph, 1e-12, iterations)
-        certificate = certify(graph, split.locations, split.dual)
-        assert_feasible(graph, certificate)
-        gap_by_unit = certificate.objective - unit_bound(graph, split.locations, split.dual)
-        # Measured: closer by 1.4 to 1000 times.
-        assert 0.0 <= certificate.gap <= gap_by_unit
+@pytest.mark.parametrize(
+    ("family", "n", "degree", "sigma", "iterations", "share"),
+    [
+        *(
+            (family, 400, degree, sigma, iterations, 1.0)  # measured: closer by 1.4 to 1000 times
+            for family, degree in (("geo", 24), ("comm", 40), ("er", 24))
+            for sigma in (0.0, 0.01)
+            for iterations in (25, 50)
+        ),
+        ("geo", 1000, 40, 0.01, 200, 0.01),
+        ("seq", 400, 24, 0.01, 50, np.inf),  # a collapsing chain: little is proven
+    ],
+)
+def test_the_repaired_dual_is_feasible_and_closer_than_by_the_unit_metric(
+    family, n, degree, sigma, iterations, share
+):
+    graph = draw_family(family, n, degree, sigma=sigma)
+    split = solve_admm(graph, 1e-5 if share < 1.0 else 1e-12, iterations)
+    certificate = certify(graph, split.locations, split.dual)
+    assert_feasible(graph, certificate)
+    gap_by_unit = certificate.objective - unit_bound(graph, split.locations, split.dual)
+    assert 0.0 <= certificate.gap <= share * gap_by_unit
+    assert certificate.dual_bound > 0.0 or sigma == 0.0
 
 
 def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(monkeypatch):
@@ -121,22 +131,6 @@ def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
     assert gap == pytest.approx(1e-5 + (0.2 * excess[rounds - 1] if hopeless > 1.0 else 0.0), rel=1e-2)
 
 
-def test_on_a_collapsing_chain_the_repaired_dual_is_feasible_though_it_proves_little():
-    graph = draw_family("seq", 400, 24)
-    split = solve_admm(graph, 1e-12, 50)
-    certificate = certify(graph, split.locations, split.dual)
-    assert_feasible(graph, certificate)
-    assert 0.0 < certificate.dual_bound < certificate.objective
-
-
-def test_on_a_noisy_area_the_gap_is_a_hundredth_of_that_by_the_unit_metric():
-    graph = draw_family("geo", 1000, 40)
-    split = solve_admm(graph, 1e-5, 200)
-    certificate = certify(graph, split.locations, split.dual)
-    gap_by_unit = certificate.objective - unit_bound(graph, split.locations, split.dual)
-    assert certificate.gap <= 0.01 * gap_by_unit
-
-
 def test_no_spoilt_dual_proves_more_than_the_optimum():
     graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
@@ -146,6 +140,12 @@ def test_no_spoilt_dual_proves_more_than_the_optimum():
         certificate = certify(graph, t, y + size * rng.normal(size=y.shape))
         assert_feasible(graph, certificate)
         assert certificate.dual_bound <= optimum
+    for spoilt in (np.roll(y, 1, axis=0), y + 0.3 * np.roll(y, 1, axis=0), -y, 0.0 * y):
+        certificate = certify(graph, t, spoilt)
+        assert_feasible(graph, certificate)
+        assert certificate.dual_bound < optimum - 1e-3
+    assert certify(graph, t, 5.0 * y).gap < 1e-8  # scaling is repaired
+    assert certify(graph, t, -y).dual_bound == 0.0  # the zero dual is the floor
     one_wrong = y.copy()
     one_wrong[7] = 1e6
     certificate = certify(graph, t, one_wrong)
@@ -163,13 +163,6 @@ def test_a_dual_whose_sums_overflow_proves_nothing(size):
     assert_feasible(graph, certificate)
     assert np.isfinite(certificate.dual_bound)
     assert certificate.dual_bound <= objective(graph, t) + 1e-12
-
-
-@pytest.mark.parametrize("row", [0, 1])
-def test_a_violation_that_is_not_a_number_is_the_largest(row):
-    total = np.ones((2, 3))
-    total[row, 1] = np.nan
-    assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
 
 
 def test_the_metric_of_wrong_locations_still_proves_a_bound():
@@ -320,16 +313,13 @@ def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
-def test_the_hybrid_leaves_a_collapsing_chain_to_newton(monkeypatch):
+def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
     graph = draw_family("seq", 300, 36, q=0.1)
     result = solve_hybrid(graph, 1e-8, 2000)
     assert result.stop is HybridStop.NEWTON
     assert result.factorizations > 0
     assert result.certificate.gap <= 1e-8
     assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).stop is HybridStop.TOO_LARGE
-    flops = laplacian_factor(graph).symbolic.flops  # of one scalar factor; blocks of 3 take 27 times as many
-    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 20.0 * flops)
-    assert solve_hybrid(graph, 1e-8, 2000).stop is HybridStop.TOO_LARGE
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
@@ -343,19 +333,14 @@ def test_the_hybrid_ends_where_it_is_told_to():
     assert cancelled.iterations == 20
 
 
-def test_the_splitting_is_asked_again_for_what_the_certificate_missed(monkeypatch):
-    asked = []
-
-    def run(_absolute, target, *_):
-        asked.append(target)
-        return SimpleNamespace(locations=None, dual=None, iterations=7, stop=Stop.ACCURATE)
-
-    within = iter((None, None, None))
-    monkeypatch.setattr(hybrid, "certify_within", lambda *_, **__: next(within))
-    monkeypatch.setattr(hybrid, "certify", lambda *_, **__: SimpleNamespace(gap=2e-8))
-    result = hybrid._split(SimpleNamespace(run=run), None, None, 1e-8, 2000, 1, None)
-    np.testing.assert_allclose(asked, [0.3e-8, 0.3e-9, 0.3e-10, 0.3e-11], rtol=1e-12)
-    assert result.stop is HybridStop.INACCURATE
+def test_the_splitting_goes_on_for_what_the_certificate_missed(monkeypatch):
+    graph = draw_family("geo", 400, 24)
+    monkeypatch.setattr(hybrid, "_FIRST_TARGET_PER_TOL", 300.0)  # so that the first certificate misses
+    again = solve_hybrid(graph, 1e-6, 2000)
+    assert (again.stop, again.factorizations) == (HybridStop.CERTIFIED, 0)
+    monkeypatch.setattr(hybrid, "_CERTIFICATES", 1)
+    once = solve_hybrid(graph, 1e-6, 2000)
+    assert (once.stop, once.iterations < again.iterations) == (HybridStop.NEWTON, True)
 
 
 def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_given_up(monkeypatch):
@@ -369,61 +354,27 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
     assert certificate.certify_within(graph, split.locations, split.dual.copy(), 0.3 * whole.gap) is None
 
 
-@pytest.mark.parametrize(
-    ("gaps", "cheap", "stops", "begins", "stop"),
-    [
-        ((1e-9,), True, False, ["there"], HybridStop.NEWTON),
-        ((1e-3, 1e-9), True, False, ["there", "anew"], HybridStop.NEWTON),
-        ((1e-3, 1e-4), True, False, ["there", "anew"], HybridStop.INACCURATE),
-        ((1e-3,), False, False, ["there"], HybridStop.INACCURATE),
-        ((1e-3,), True, True, ["there"], HybridStop.CANCELLED),
-        ((1e-9,), True, True, ["there"], HybridStop.NEWTON),
-    ],
-)
-def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(
-    gaps, cheap, stops, begins, stop, monkeypatch
-):
-    graph = draw_family("geo", 60, 12)
-    factor = laplacian_factor(graph)
-    monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", (27.0 if cheap else 26.9) * factor.symbolic.flops)
-    begun, left = [], iter(gaps)
-
-    def newton(_graph, _tol, _limit, report, *, start, plan):
-        assert plan is factor.symbolic
-        begun.append("anew" if start is None else "there")
-        report(IterationInfo(3, 0.5, 0.25))
-        return None, None, 10
-
-    monkeypatch.setattr(hybrid, "solve_newton_sparse", newton)
-    monkeypatch.setattr(
-        hybrid,
-        "_better",
-        lambda _graph, result, *_: replace(result, certificate=SimpleNamespace(gap=next(left))),
-    )
-    seen = []
-    split = HybridResult(
-        locations=None,
-        certificate=SimpleNamespace(gap=1e-2, dual=None),
-        iterations=40,
-        factorizations=0,
-        stop=HybridStop.INACCURATE,
-    )
-    result = hybrid._newton(
-        graph, factor, split, 1e-8, 10**9, lambda info: seen.append(info) or (False if stops else None)
-    )
-    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 26.9 * factor.symbolic.flops)
-    assert hybrid._newton(graph, factor, split, 1e-8, 10**9, None).stop is HybridStop.TOO_LARGE
-    assert begun == begins
-    assert result.stop is stop
-    assert result.factorizations == 10 * len(begins)
-    assert [(i.iteration, i.objective, i.dual_bound) for i in seen] == [(43, 0.5, 0.25)] * len(begins)
+def test_newton_steps_are_counted_on_and_can_be_cancelled():
+    graph, seen = draw_family("seq", 300, 36, q=0.1), []
+    result = solve_hybrid(graph, 1e-8, 2000, on_iteration=seen.append)
+    assert result.stop is HybridStop.NEWTON
+    assert len(seen) == result.iterations + result.factorizations
+    assert [info.iteration for info in seen[: result.iterations + 1]] == list(range(1, result.iterations + 2))
+    last = result.iterations + 2
+    cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < last)
+    assert (cancelled.stop, cancelled.factorizations) == (HybridStop.CANCELLED, 2)
 
 
-def test_the_hybrid_gives_the_same_bits_for_one_and_two_threads():
-    graph = draw_family("geo", 1200, 45)  # enough edges that a pass is cut into chunks
-    one, two = (solve_hybrid(graph, 1e-6, 500, threads=k) for k in (1, 2))
-    np.testing.assert_array_equal(one.locations, two.locations)
-    np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)
+@pytest.mark.parametrize("cheap", [True, False])
+def test_newton_begins_at_the_split_point_and_then_anew_where_that_is_cheap(cheap, monkeypatch):
+    graph = draw_family("seq", 300, 36, q=0.1)
+    flops = 27.0 * laplacian_factor(graph).symbolic.flops
+    monkeypatch.setattr(hybrid, "_CHEAP_FLOPS", flops if cheap else 0.99 * flops)
+    monkeypatch.setattr(hybrid, "_NEWTON_STEPS", 1)  # too few from either point
+    result = solve_hybrid(graph, 1e-8, 2000)
+    assert (result.stop, result.factorizations) == (HybridStop.INACCURATE, 1 + cheap)
+    monkeypatch.setattr(hybrid, "_NEWTON_FLOPS", 0.99 * flops)
+    assert solve_hybrid(graph, 1e-8, 2000).stop is HybridStop.TOO_LARGE
 
 
 @pytest.mark.parametrize("slides", [False, True])
@@ -435,6 +386,7 @@ def test_uniqueness_is_judged_alike_by_a_dense_and_by_a_sparse_factor(n, slides,
         graph = ViewGraph(n + 1, edges, np.vstack([graph.directions, [[0.0, 0.0, 1.0]]]))
         t = np.vstack([t, t[0] - [0.0, 0.0, 1.0]])
     dual = np.zeros(graph.directions.shape)
+    assert certify(graph, t, dual).unique is None
     by_dense = certify(graph, t, dual, uniqueness=True).unique
     monkeypatch.setattr(certificate, "prefers_dense_factor", lambda *_: False)
     assert certify(graph, t, dual, uniqueness=True).unique is by_dense

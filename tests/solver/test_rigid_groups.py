@@ -27,9 +27,6 @@ def centred(t):
     return t - t.mean(axis=0)
 
 
-# --- the value ---------------------------------------------------------------------------------------
-
-
 def test_reducing_is_the_adjoint_of_expanding():
     groups = rig_problem(0)[1]
     rng = np.random.default_rng(1)
@@ -130,9 +127,6 @@ def test_a_scale_that_nothing_holds_is_refused():
         factor.refactor(np.eye(3) - v[:, :, None] * v[:, None, :])
     factor.refactor(np.broadcast_to(np.eye(3), (len(edges), 3, 3)).copy())
     assert 0.0 < factor.smallest_pivot <= 1.0
-
-
-# --- the program -------------------------------------------------------------------------------------
 
 
 def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
@@ -292,9 +286,6 @@ def test_the_same_problem_gives_the_same_bits():
     np.testing.assert_array_equal(first.dual, second.dual)
 
 
-# --- what hangs free -----------------------------------------------------------------------------------
-
-
 def test_a_group_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
     graph, groups, _ = rig_problem(9, frames=6, share=1.0)
     ends = groups.group_of[graph.edges]
@@ -337,9 +328,6 @@ def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_on
     sizes = np.array([2, 2])
     assert len(largest_tied(edges, groups, sizes)) == 2
     assert len(largest_tied(edges, groups, sizes, t)) == 1
-
-
-# --- starts, refinement, judgement -----------------------------------------------------------------------
 
 
 def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():

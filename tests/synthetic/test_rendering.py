@@ -1,7 +1,6 @@
 """Rendered scenes show what they say, where they say it, and COLMAP's own tools work on them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pycolmap
@@ -39,9 +38,6 @@ def colmap_camera(scene: RenderedScene) -> pycolmap.Camera:
     params = [f, k[0, 2], k[1, 2], scene.render.radial_k1, scene.render.radial_k2]
     size = (scene.options.image_width, scene.options.image_height)
     return pycolmap.Camera(model="RADIAL", width=size[0], height=size[1], params=params)
-
-
-# --- drawing ---------------------------------------------------------------------------------------------
 
 
 def board_scene(spots: np.ndarray) -> RenderedScene:
@@ -156,9 +152,6 @@ def test_noise_and_exposure_are_as_asked_for():
     assert 0.01 < np.ptp(factors) < 0.5
 
 
-# --- refusals --------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("scene", "render", "message"),
     [
@@ -171,35 +164,6 @@ def test_noise_and_exposure_are_as_asked_for():
 def test_what_cannot_be_drawn_is_refused_in_a_sentence(scene, render, message):
     with pytest.raises(InputError, match=message):
         make_rendered_scene(replace(SMALL, **scene), RenderOptions(**render))
-
-
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0)],
-)
-def test_an_option_of_drawing_out_of_range_is_refused_by_name(field, value):
-    with pytest.raises(ValueError, match=rf"RenderOptions\.{field} must"):
-        RenderOptions(**{field: value})
-
-
-# --- COLMAP on the images --------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def drawn(tmp_path_factory) -> tuple[RenderedScene, Path]:
-    """Eight photographs of a row of houses, with what COLMAP finds in them."""
-    options = SceneOptions(
-        shape="facade",
-        num_images=8,
-        image_width=400,
-        image_height=300,
-        focal_length_px=350.0,
-        max_keypoints_per_image=600,
-    )
-    scene = make_rendered_scene(options)
-    folder = tmp_path_factory.mktemp("drawn") / "workspace"
-    write_rendered_workspace(scene, folder, WorkspaceOptions(relative_poses=True))
-    return scene, folder
 
 
 def test_the_workspace_holds_images_a_database_and_the_exact_model(drawn):
@@ -303,9 +267,6 @@ def test_without_a_database_there_are_images_and_poses_only(tmp_path):
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "sparse"]
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     assert (model.num_reg_images(), model.num_points3D()) == (2, 0)
-
-
-# --- the command -----------------------------------------------------------------------------------------
 
 
 def test_synth_draws_images_on_request_and_says_how_many_pairs_are_wrong(tmp_path):
