@@ -326,12 +326,14 @@ class MatchDatabase:
         counts = np.bincount(pair_of[keep], minlength=len(chosen))
         keep &= (counts >= min_matches)[pair_of]
         kept = counts >= min_matches
+        pairs = self._pairs.pairs[chosen[kept]]
         return MatchBatch(
-            pairs=self._pairs.pairs[chosen[kept]],
+            pairs=pairs,
             offsets=np.append(0, np.cumsum(counts[kept])),
             keypoints=keypoints[keep],
             rays_i=rays[0, keep],
             rays_j=rays[1, keep],
+            pixel_angles=1.0 / self._model.focal_lengths_px[pairs].min(axis=1),
         )
 
     def _read_match_rows(self, chosen: IntArray) -> tuple[IntArray, IntArray]:

@@ -248,9 +248,7 @@ def track_matches(
         np.bincount(tracks.images, tracks.num_following(), model.num_images), dtype=np.float64
     )
     for first, last in _batches(num_matches, max_matches_per_batch):
-        batch = _track_batch(
-            tracks, first, last, num_images=model.num_images, min_matches=max(min_matches, 1)
-        )
+        batch = _track_batch(tracks, slice(first, last), model.focal_lengths_px, max(min_matches, 1))
         if len(batch.pairs):
             yield batch
 
@@ -486,10 +484,11 @@ def _batches(sizes: FloatArray, limit: int) -> Iterator[tuple[int, int]]:
 
 
 def _track_batch(
-    tracks: _Observations, first: int, last: int, *, num_images: int, min_matches: int
+    tracks: _Observations, images: slice, focal_lengths_px: FloatArray, min_matches: int
 ) -> MatchBatch:
-    """Return the matches of all pairs (i, j > i) with first <= i < last that have enough of them."""
-    own = tracks.by_image[tracks.image_starts[first] : tracks.image_starts[last]]
+    """Return the matches of all pairs (i, j > i) with i among the images that have enough of them."""
+    num_images = len(focal_lengths_px)
+    own = tracks.by_image[tracks.image_starts[images.start] : tracks.image_starts[images.stop]]
     follows = tracks.num_following()[own]
     left = np.repeat(own, follows)
     right = left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)
@@ -501,10 +500,12 @@ def _track_batch(
     keep: BoolArray = np.repeat(counts >= min_matches, counts)
     left, right = left[keep], right[keep]
     kept = counts >= min_matches
+    pairs = np.stack(np.divmod(keys[kept], num_images), axis=1)
     return MatchBatch(
-        pairs=np.stack(np.divmod(keys[kept], num_images), axis=1),
+        pairs=pairs,
         offsets=np.append(0, np.cumsum(counts[kept])),
         keypoints=np.stack([tracks.keypoints[left], tracks.keypoints[right]], axis=1),
         rays_i=tracks.rays[left],
         rays_j=tracks.rays[right],
+        pixel_angles=1.0 / focal_lengths_px[pairs].min(axis=1),
     )

@@ -94,7 +94,14 @@ def batch_of(pairs, num_points):
     keypoints = np.tile(np.stack([np.arange(num_points)] * 2, axis=1), (len(pairs), 1))
     no_rays = np.zeros((len(keypoints), 3))
     offsets = num_points * np.arange(len(pairs) + 1)
-    return MatchBatch(pairs=pairs, offsets=offsets, keypoints=keypoints, rays_i=no_rays, rays_j=no_rays)
+    return MatchBatch(
+        pairs=pairs,
+        offsets=offsets,
+        keypoints=keypoints,
+        rays_i=no_rays,
+        rays_j=no_rays,
+        pixel_angles=np.zeros(len(pairs)),
+    )
 
 
 def seeded(reconstruction, centers=None, placed=None):
