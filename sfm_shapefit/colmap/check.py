@@ -31,7 +31,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.jit import kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")

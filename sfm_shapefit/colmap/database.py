@@ -36,7 +36,7 @@ from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
 from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
 from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
 
 MAX_NUM_IMAGES = 2147483647

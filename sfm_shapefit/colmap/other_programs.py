@@ -7,7 +7,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import EpipolarGeometries
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
 

@@ -18,7 +18,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1

@@ -303,7 +303,7 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
 
 
 def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
-    from sfm_shapefit.formats import graph_text
+    from sfm_shapefit.formats.graph_text import graph_text
     from sfm_shapefit.viewgraph import ViewGraph
 
     t = np.random.default_rng(0).standard_normal((8, 3))

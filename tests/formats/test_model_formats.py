@@ -22,7 +22,7 @@ import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import read_relative_poses, relative_poses_text
+from sfm_shapefit.formats.glomap_text import read_relative_poses, relative_poses_text
 from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
 from sfm_shapefit.formats.tum import poses_csv, tum_text
@@ -373,7 +373,7 @@ def relative_poses_of_ring():
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
     from sfm_shapefit.commands.place import place_graph_file
-    from sfm_shapefit.formats import EpipolarGeometries
+    from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 
     model, pairs, rotations, units = relative_poses_of_ring()
     poses = EpipolarGeometries(names=model.names, pairs=pairs, rotations=rotations, to_second=units)
