@@ -10,7 +10,7 @@ import sqlite3
 from dataclasses import dataclass, fields
 from pathlib import Path
 
-from sfm_shapefit.formats import graph_text
+from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.synthetic import (
     RenderOptions,
     SceneOptions,

@@ -11,8 +11,8 @@ a camera that the model misses counts as a failure.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,6 +44,17 @@ _CAP_OF_SPREAD = 0.5
 _COLLINEAR_RATIO = 1e-3
 # Published references printed with 6 digits are off by 2e-6 in R R^T - I.
 _ORTHOGONALITY_TOLERANCE = 1e-4
+
+
+class CameraPoses(NamedTuple):
+    """n cameras, known by their names."""
+
+    names: Sequence[str]
+    """Each distinct."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(n, 3) in world axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,12 +132,9 @@ class Evaluation(Displayed):
             "missing": list(self.missing),
             "extra": list(self.extra),
             "extent": self.extent,
-            "position_error": _summary_dict(self.position),
-            "rotation_error_deg": _summary_dict(self.rotation_deg),
-            "recall": [
-                {"threshold": r.threshold, "fraction_of_extent": r.fraction_of_extent, "recall": r.recall}
-                for r in self.recalls
-            ],
+            "position_error": asdict(self.position),
+            "rotation_error_deg": asdict(self.rotation_deg),
+            "recall": [asdict(recall) for recall in self.recalls],
             "ref_from_model": {
                 "scale": self.ref_from_model.scale,
                 "rotation": self.ref_from_model.rotation.tolist(),
@@ -143,35 +151,21 @@ class Evaluation(Displayed):
 
     def rows(self) -> list[dict[str, str | float]]:
         """Return one row per common camera, for a table: errors and the aligned center."""
-        columns = zip(
-            self.names,
-            self.position_errors.tolist(),
-            self.rotation_errors_deg.tolist(),
-            self.aligned_centers.tolist(),
-            strict=True,
-        )
+        keys = ("name", "position_error", "rotation_error_deg", "x", "y", "z")
+        errors = np.column_stack([self.position_errors, self.rotation_errors_deg, self.aligned_centers])
         return [
-            {"name": name, "position_error": error, "rotation_error_deg": angle, "x": x, "y": y, "z": z}
-            for name, error, angle, (x, y, z) in columns
+            dict(zip(keys, (name, *row), strict=True))
+            for name, row in zip(self.names, errors.tolist(), strict=True)
         ]
 
 
 def evaluate_poses(
-    names: Sequence[str],
-    rotations: FloatArray,
-    centers: FloatArray,
-    ref_names: Sequence[str],
-    ref_rotations: FloatArray,
-    ref_centers: FloatArray,
-    *,
-    thresholds: Sequence[float] = (),
+    model: CameraPoses, reference: CameraPoses, thresholds: Sequence[float] = ()
 ) -> Evaluation:
     """Compare a model's camera poses with a reference's; cameras correspond by name.
 
     Args:
-        names, ref_names: n and m names, each distinct.
-        rotations, ref_rotations: (n, 3, 3) and (m, 3, 3) cam_from_world.
-        centers, ref_centers: (n, 3) and (m, 3) camera centers in world axes.
+        model, reference: the two.
         thresholds: position errors in the reference's units at which recall is given too.
 
     Raises:
@@ -179,11 +173,13 @@ def evaluate_poses(
             stands twice, a threshold is not positive, fewer than 3 cameras are common, or all common
             centers of either side coincide.
     """
-    _check_poses("the model", names, rotations, centers)
-    _check_poses("the reference", ref_names, ref_rotations, ref_centers)
-    _check_thresholds(thresholds)
-    in_model, in_ref = _common_cameras(names, ref_names)
-    x, y = centers[in_model], ref_centers[in_ref]
+    _check_poses("the model", model)
+    _check_poses("the reference", reference)
+    for threshold in thresholds:
+        if not (np.isfinite(threshold) and threshold > 0.0):
+            raise InputError(f"a recall threshold must be a positive number, got {threshold}")
+    in_model, in_ref = _common_cameras(model.names, reference.names)
+    x, y = model.centers[in_model], reference.centers[in_ref]
     _refuse_coincident("the model", x)
     _refuse_coincident("the reference", y)
 
@@ -191,40 +187,39 @@ def evaluate_poses(
     ref_from_model = fit_similarity_l1(x, y, cap=cap)
     aligned = ref_from_model.apply(x)
     errors = np.linalg.norm(aligned - y, axis=1)
-    global_rotation, angles = _compare_rotations(rotations[in_model], ref_rotations[in_ref])
+    turns = np.swapaxes(reference.rotations[in_ref], 1, 2) @ model.rotations[in_model]
+    global_rotation = mean_rotation_l1(turns)
 
     close = errors < cap
     degenerate = _on_a_line(x, close) or _on_a_line(y, close)
-    extent = float(np.linalg.norm(np.ptp(ref_centers, axis=0)))
-    common, known = {ref_names[k] for k in in_ref}, set(ref_names)
+    extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
     return Evaluation(
-        names=tuple(ref_names[k] for k in in_ref),
-        missing=tuple(name for name in ref_names if name not in common),
-        extra=tuple(name for name in names if name not in known),
+        names=tuple(reference.names[k] for k in in_ref),
+        missing=_only_in(reference.names, model.names),
+        extra=_only_in(model.names, reference.names),
         position_errors=frozen(errors),
-        rotation_errors_deg=frozen(angles),
+        rotation_errors_deg=frozen(rotation_angles_deg(turns @ global_rotation.T)),
         aligned_centers=frozen(aligned),
         ref_from_model=ref_from_model,
         rotation_ref_from_model=frozen(global_rotation),
         extent=extent,
-        recalls=_recalls(errors, len(ref_names), extent, thresholds),
+        recalls=_recalls(errors, len(reference.names), extent, thresholds),
         warnings=_warnings(degenerate, close, cap),
     )
 
 
-def _check_poses(owner: str, names: Sequence[str], rotations: FloatArray, centers: FloatArray) -> None:
+def _check_poses(owner: str, poses: CameraPoses) -> None:
     """Raise InputError unless names, rotations and centers are distinct, matching, finite and orthogonal."""
+    names, rotations, centers = poses.names, poses.rotations, poses.centers
     count = len(names)
     if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
         raise InputError(
             f"{owner} has {count} names, rotations of shape {rotations.shape} and centres of shape"
             f" {centers.shape}; give ({count}, 3, 3) and ({count}, 3)"
         )
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            raise InputError(f"{owner} has two cameras named '{name}'; names must be distinct")
-        seen.add(name)
+    if len(set(names)) < count:
+        repeated = next(name for k, name in enumerate(names) if name in names[:k])
+        raise InputError(f"{owner} has two cameras named '{repeated}'; names must be distinct")
     finite = np.isfinite(centers).all(axis=1) & np.isfinite(rotations).all(axis=(1, 2))
     _refuse(np.asarray(~finite), owner, names, "has a pose that is not finite; repair or remove it")
     product = rotations @ np.swapaxes(rotations, 1, 2)
@@ -239,11 +234,10 @@ def _refuse(bad: BoolArray, owner: str, names: Sequence[str], reason: str) -> No
         raise InputError(f"camera '{names[int(np.argmax(bad))]}' of {owner} {reason}")
 
 
-def _check_thresholds(thresholds: Sequence[float]) -> None:
-    """Raise InputError unless every threshold is a positive number."""
-    for threshold in thresholds:
-        if not (np.isfinite(threshold) and threshold > 0.0):
-            raise InputError(f"a recall threshold must be a positive number, got {threshold}")
+def _only_in(names: Sequence[str], others: Sequence[str]) -> tuple[str, ...]:
+    """Return the names that are not among others."""
+    known = set(others)
+    return tuple(name for name in names if name not in known)
 
 
 def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[IntArray, IntArray]:
@@ -251,27 +245,15 @@ def _common_cameras(names: Sequence[str], ref_names: Sequence[str]) -> tuple[Int
     position = {name: k for k, name in enumerate(names)}
     in_ref = [k for k, name in enumerate(ref_names) if name in position]
     if len(in_ref) < _MIN_COMMON:
-        raise InputError(_too_few_common(names, ref_names, len(in_ref)))
+        only = {"model": _only_in(names, ref_names), "reference": _only_in(ref_names, names)}
+        examples = [f"only the {owner} has '{missed[0]}'" for owner, missed in only.items() if missed]
+        shown = f": {', '.join(examples)}" if examples else ""
+        raise InputError(
+            f"the model ({len(names)} cameras) and the reference ({len(ref_names)}) share {len(in_ref)} image"
+            f" names{shown}; at least {_MIN_COMMON} must be equal"
+        )
     in_model = [position[ref_names[k]] for k in in_ref]
     return np.array(in_model, dtype=np.int64), np.array(in_ref, dtype=np.int64)
-
-
-def _too_few_common(names: Sequence[str], ref_names: Sequence[str], count: int) -> str:
-    """Return the sentence that says how the names of the two sides differ."""
-    known, ref_known = set(names), set(ref_names)
-    examples = [
-        f"{owner} has '{name}'"
-        for owner, name in (
-            ("only the model", next((n for n in names if n not in ref_known), None)),
-            ("only the reference", next((n for n in ref_names if n not in known), None)),
-        )
-        if name is not None
-    ]
-    shown = f": {', '.join(examples)}" if examples else ""
-    return (
-        f"the model ({len(names)} cameras) and the reference ({len(ref_names)}) share {count} image"
-        f" names{shown}; at least {_MIN_COMMON} must be equal"
-    )
 
 
 def _refuse_coincident(owner: str, centers: FloatArray) -> None:
@@ -281,13 +263,6 @@ def _refuse_coincident(owner: str, centers: FloatArray) -> None:
         raise InputError(
             f"all common cameras of {owner} stand at one point, so nothing can be aligned; place them first"
         )
-
-
-def _compare_rotations(rotations: FloatArray, ref_rotations: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the robust mean of ref_from_model, (3, 3), and each camera's angle from it, (k,) degrees."""
-    ref_from_model = np.swapaxes(ref_rotations, 1, 2) @ rotations
-    mean = mean_rotation_l1(ref_from_model)
-    return mean, rotation_angles_deg(ref_from_model @ mean.T)
 
 
 def _on_a_line(centers: FloatArray, close: BoolArray) -> bool:
@@ -303,14 +278,11 @@ def _recalls(
     """Return the recall at the relative thresholds and at the given absolute ones."""
     relative = [(fraction * extent, fraction) for fraction in RELATIVE_THRESHOLDS]
     absolute = [(float(threshold), None) for threshold in thresholds]
-    return tuple(
-        Recall(
-            threshold=threshold,
-            fraction_of_extent=fraction,
-            recall=float(np.count_nonzero(errors <= threshold)) / num_reference,
-        )
-        for threshold, fraction in [*relative, *absolute]
-    )
+    found = []
+    for threshold, fraction in [*relative, *absolute]:
+        share = float(np.count_nonzero(errors <= threshold)) / num_reference
+        found.append(Recall(threshold=threshold, fraction_of_extent=fraction, recall=share))
+    return tuple(found)
 
 
 def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]:
@@ -334,8 +306,3 @@ def _summary(errors: FloatArray) -> ErrorSummary:
         rms=float(np.sqrt(np.mean(errors**2))),
         max=float(errors.max()),
     )
-
-
-def _summary_dict(summary: ErrorSummary) -> dict[str, float]:
-    """Return the statistics under their JSON keys."""
-    return {"median": summary.median, "mean": summary.mean, "rms": summary.rms, "max": summary.max}

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.evaluation import RELATIVE_THRESHOLDS, Evaluation, evaluate_poses
+from sfm_shapefit.evaluation import RELATIVE_THRESHOLDS, evaluate_poses
 from tests.problems import random_rotations, turn
 
 
@@ -38,23 +38,11 @@ def in_another_world(poses: Poses, seed: int) -> Poses:
     return poses.moved(float(np.exp(rng.normal())), random_rotations(rng, 1)[0], rng.normal(size=3))
 
 
-def evaluate(model: Poses, reference: Poses, **options) -> Evaluation:
-    return evaluate_poses(
-        model.names,
-        model.rotations,
-        model.centers,
-        reference.names,
-        reference.rotations,
-        reference.centers,
-        **options,
-    )
-
-
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(3, 25))
 @settings(max_examples=25, deadline=None)
 def test_the_same_cameras_in_another_world_have_no_error(seed, n):
     reference = scene(seed, n)
-    found = evaluate(in_another_world(reference, seed + 1), reference)
+    found = evaluate_poses(in_another_world(reference, seed + 1), reference)
     # Coordinates of about 130 and their products carry some roundings of 3e-14 each.
     assert found.position.max < 1e-10
     assert found.rotation_deg.max < 1e-11
@@ -68,7 +56,7 @@ def test_one_moved_camera_has_exactly_its_own_error_in_the_references_units():
     reference = scene(1)
     moved = reference.centers.copy()
     moved[4] += [0.0, 3.0, 4.0]
-    found = evaluate(in_another_world(replace(reference, centers=moved), 2), reference)
+    found = evaluate_poses(in_another_world(replace(reference, centers=moved), 2), reference)
     # One of 20 pulls with weight 1 against 19 of weight up to 1e9: bias 1e-9 of the spread, 10.
     assert found.position_errors[4] == pytest.approx(5.0, abs=1e-6)
     assert np.delete(found.position_errors, 4).max() < 1e-6
@@ -82,7 +70,7 @@ def test_one_turned_camera_has_exactly_its_own_rotation_error_and_no_position_er
     reference = scene(2)
     turned = reference.rotations.copy()
     turned[7] = turn(np.array([1.0, 2.0, 3.0]), 12.5) @ turned[7]
-    found = evaluate(in_another_world(replace(reference, rotations=turned), 3), reference)
+    found = evaluate_poses(in_another_world(replace(reference, rotations=turned), 3), reference)
     assert found.rotation_errors_deg[7] == pytest.approx(12.5, abs=1e-6)
     assert np.delete(found.rotation_errors_deg, 7).max() < 1e-6
     assert found.position.max < 1e-10
@@ -92,7 +80,7 @@ def test_rotations_are_compared_independently_of_the_centres():
     """All rotations turned in the world by 30 degrees: no error, though the centres were not turned."""
     reference = scene(3)
     world_turn = turn(np.array([0.0, 1.0, 1.0]), 30.0)
-    found = evaluate(replace(reference, rotations=reference.rotations @ world_turn), reference)
+    found = evaluate_poses(replace(reference, rotations=reference.rotations @ world_turn), reference)
     assert found.rotation_deg.max < 1e-11
     # R_ref = R_model Q^T with R_model = R_ref W gives Q = W.
     np.testing.assert_allclose(found.rotation_ref_from_model, world_turn, atol=1e-13)
@@ -114,7 +102,7 @@ def test_half_minus_one_wrong_cameras_do_not_disturb_the_others(kind, n):
         centers[bad] = 0.0
     else:
         centers[bad] = 0.5 * centers[bad] @ wrong
-    found = evaluate(in_another_world(Poses(reference.names, rotations, centers), 5), reference)
+    found = evaluate_poses(in_another_world(Poses(reference.names, rotations, centers), 5), reference)
     good = np.setdiff1d(np.arange(n), bad)
     # The far cameras are 1e5 extents away: rounding there is 1e-9 of the others' coordinates.
     assert found.position_errors[good].max() < 1e-6
@@ -127,7 +115,7 @@ def test_noise_comes_out_at_its_size():
     rng = np.random.default_rng(4)
     reference = scene(4, 200)
     noisy = replace(reference, centers=reference.centers + 0.01 * rng.normal(size=(200, 3)))
-    found = evaluate(in_another_world(noisy, 6), reference)
+    found = evaluate_poses(in_another_world(noisy, 6), reference)
     # 0.01 * sqrt(3) rms, less the 7 of 600 degrees of freedom; its own spread is 1 / sqrt(1200) = 3 %.
     assert found.position.rms == pytest.approx(0.01 * np.sqrt(3), rel=0.12)
 
@@ -135,7 +123,7 @@ def test_noise_comes_out_at_its_size():
 def test_cameras_are_matched_by_name_whatever_their_order():
     reference = scene(5)
     order = np.random.default_rng(5).permutation(20)
-    found = evaluate(reference.taken(order), reference)
+    found = evaluate_poses(reference.taken(order), reference)
     assert found.names == reference.names
     assert found.position.max < 1e-10
     assert found.rotation_deg.max < 1e-11
@@ -150,7 +138,7 @@ def test_missing_cameras_count_as_failures_and_extra_ones_do_not_count():
         np.concatenate([kept.rotations, stranger.rotations]),
         np.concatenate([kept.centers, stranger.centers]),
     )
-    found = evaluate(model, reference)
+    found = evaluate_poses(model, reference)
     assert found.missing == reference.names[:5]
     assert found.extra == ("zebra.jpg",)
     assert len(found.names) == 15
@@ -167,7 +155,7 @@ def test_recall_is_given_at_fractions_of_the_extent_and_at_the_thresholds_asked_
     reference = Poses(names, np.repeat(np.eye(3)[None], 12, axis=0), centers)
     moved = centers.copy()
     moved[8:, 0] += [0.2, 0.5, 2.0, 5.0]
-    found = evaluate(replace(reference, centers=moved), reference, thresholds=[0.3, 4])
+    found = evaluate_poses(replace(reference, centers=moved), reference, thresholds=[0.3, 4])
     assert found.extent == pytest.approx(np.sqrt(48.0**2 + 60**2 + 64**2))
     assert found.extent == pytest.approx(100.0)
     assert [r.fraction_of_extent for r in found.recalls] == [*RELATIVE_THRESHOLDS, None, None]
@@ -180,7 +168,7 @@ def test_the_extent_counts_reference_cameras_that_the_model_misses():
     far = reference.centers.copy()
     far[0] = [1000.0, 0.0, 0.0]
     reference = replace(reference, centers=far)
-    assert evaluate(reference.taken(np.arange(1, 20)), reference).extent > 800
+    assert evaluate_poses(reference.taken(np.arange(1, 20)), reference).extent > 800
 
 
 @pytest.mark.parametrize("side", ["model", "reference", "both"])
@@ -190,11 +178,11 @@ def test_centres_on_a_line_are_flagged_and_explained(side):
     line = replace(straight, centers=np.linspace(0, 30, 20)[:, None] * direction + 5)
     bent = replace(line, centers=line.centers + np.sin(np.arange(20))[:, None] * [0.0, 3.0, 0.0])
     model, reference = {"model": (line, bent), "reference": (bent, line), "both": (line, line)}[side]
-    found = evaluate(model, reference)
+    found = evaluate_poses(model, reference)
     assert found.degenerate
     assert len(found.warnings) == 1
     assert "line" in found.warnings[0]
-    assert not evaluate(bent, bent).degenerate
+    assert not evaluate_poses(bent, bent).degenerate
 
 
 def test_a_line_is_recognised_although_one_lost_camera_stands_beside_it():
@@ -203,13 +191,13 @@ def test_a_line_is_recognised_although_one_lost_camera_stands_beside_it():
     flown, beside = line.centers.copy(), line.centers.copy()
     flown[3] += [500.0, 0.0, 300.0]
     beside[3] += [0.0, 9.0, 0.0]
-    assert evaluate(replace(line, centers=flown), replace(line, centers=beside)).degenerate
+    assert evaluate_poses(replace(line, centers=flown), replace(line, centers=beside)).degenerate
 
 
 def test_an_alignment_that_holds_for_a_minority_only_is_warned_about():
     reference = scene(10)
     model = replace(reference, centers=np.random.default_rng(10).normal(size=(20, 3)))
-    found = evaluate(model, reference)
+    found = evaluate_poses(model, reference)
     assert any("common cameras lie within" in w for w in found.warnings)
     assert not found.degenerate
 
@@ -218,7 +206,7 @@ def test_too_few_common_names_are_explained_with_an_example_from_each_side():
     reference = scene(11)
     model = replace(reference, names=tuple(f"images/{name}" for name in reference.names))
     with pytest.raises(InputError) as caught:
-        evaluate(model, reference)
+        evaluate_poses(model, reference)
     text = str(caught.value)
     assert "share 0 image names" in text
     assert "only the model has 'images/img000.jpg'" in text
@@ -228,14 +216,14 @@ def test_too_few_common_names_are_explained_with_an_example_from_each_side():
 def test_two_common_cameras_are_too_few_and_three_are_enough():
     reference = scene(12)
     with pytest.raises(InputError, match=r"share 2 image names: only the reference has 'img002\.jpg'"):
-        evaluate(reference.taken(np.arange(2)), reference)
-    assert evaluate(reference.taken(np.arange(3)), reference).position.max < 1e-10
+        evaluate_poses(reference.taken(np.arange(2)), reference)
+    assert evaluate_poses(reference.taken(np.arange(3)), reference).position.max < 1e-10
 
 
 def test_a_model_without_cameras_is_refused():
     empty = Poses((), np.zeros((0, 3, 3)), np.zeros((0, 3)))
     with pytest.raises(InputError, match=r"the model \(0 cameras\)"):
-        evaluate(empty, scene(13))
+        evaluate_poses(empty, scene(13))
 
 
 @pytest.mark.parametrize("side", ["model", "reference"])
@@ -257,27 +245,27 @@ def test_a_bad_pose_is_refused_by_the_name_of_its_camera(side, field, value, rea
     bad = replace(good, **{field: array})
     model, reference = (bad, good) if side == "model" else (good, bad)
     with pytest.raises(InputError, match=rf"camera 'img006\.jpg' of the {side} has .*{reason}"):
-        evaluate(model, reference)
+        evaluate_poses(model, reference)
 
 
 def test_rotations_printed_with_six_digits_are_accepted():
     reference = scene(15)
     printed = replace(reference, rotations=np.round(reference.rotations, 6))
     # Each entry is off by up to 5e-7, together by at most sqrt(9 / 2) * 5e-7 rad = 6e-5 degrees.
-    assert evaluate(printed, reference).rotation_deg.max < 1.3e-4
+    assert evaluate_poses(printed, reference).rotation_deg.max < 1.3e-4
 
 
 def test_a_name_that_stands_twice_is_refused():
     good = scene(16)
     twice = replace(good, names=(*good.names[:-1], "img003.jpg"))
     with pytest.raises(InputError, match=r"the model has two cameras named 'img003\.jpg'"):
-        evaluate(twice, good)
+        evaluate_poses(twice, good)
 
 
 def test_arrays_that_do_not_fit_the_names_are_refused():
     good = scene(17)
     with pytest.raises(InputError, match=r"the model has 20 names, .* give \(20, 3, 3\) and \(20, 3\)"):
-        evaluate(replace(good, centers=good.centers[:-1]), good)
+        evaluate_poses(replace(good, centers=good.centers[:-1]), good)
 
 
 @pytest.mark.parametrize("point", [0.0, 1 / 3])
@@ -285,21 +273,21 @@ def test_cameras_that_all_stand_at_one_point_are_refused(point):
     good = scene(18)
     collapsed = replace(good, centers=np.full((20, 3), point))
     with pytest.raises(InputError, match="all common cameras of the model stand at one point"):
-        evaluate(collapsed, good)
+        evaluate_poses(collapsed, good)
     with pytest.raises(InputError, match="all common cameras of the reference stand at one point"):
-        evaluate(good, collapsed)
+        evaluate_poses(good, collapsed)
 
 
 @pytest.mark.parametrize("threshold", [0.0, -1.0, np.nan, np.inf])
 def test_a_threshold_that_is_no_positive_number_is_refused(threshold):
     good = scene(19)
     with pytest.raises(InputError, match="a recall threshold must be a positive number"):
-        evaluate(good, good, thresholds=[threshold])
+        evaluate_poses(good, good, thresholds=[threshold])
 
 
 def test_the_dictionary_survives_json_and_has_stable_keys():
     reference = scene(20)
-    found = evaluate(reference.taken(np.arange(2, 20)), reference, thresholds=[1.0])
+    found = evaluate_poses(reference.taken(np.arange(2, 20)), reference, thresholds=[1.0])
     text = json.dumps(found.summary(), allow_nan=False)
     parsed = json.loads(text)
     assert list(parsed) == [
@@ -328,7 +316,7 @@ def test_there_is_one_row_per_common_camera_with_plain_values():
     reference = scene(21)
     moved = reference.centers.copy()
     moved[2] += [1.0, 0.0, 0.0]
-    found = evaluate(replace(reference, centers=moved), reference)
+    found = evaluate_poses(replace(reference, centers=moved), reference)
     rows = found.rows()
     assert [row["name"] for row in rows] == list(reference.names)
     assert list(rows[2]) == ["name", "position_error", "rotation_error_deg", "x", "y", "z"]
@@ -338,7 +326,7 @@ def test_there_is_one_row_per_common_camera_with_plain_values():
 
 
 def test_the_result_cannot_be_changed():
-    found = evaluate(scene(22), scene(22))
+    found = evaluate_poses(scene(22), scene(22))
     with pytest.raises(ValueError, match="read-only"):
         found.position_errors[0] = 1.0
 
@@ -348,7 +336,7 @@ def test_the_inputs_are_not_changed_and_the_answer_is_the_same_on_every_call():
     rng = np.random.default_rng(23)
     model = replace(reference, centers=reference.centers + rng.normal(size=(20, 3)))
     before = [a.copy() for a in (model.rotations, model.centers, reference.rotations, reference.centers)]
-    first, second = evaluate(model, reference), evaluate(model, reference)
+    first, second = evaluate_poses(model, reference), evaluate_poses(model, reference)
     assert first.summary() == second.summary()
     for old, new in zip(
         before, (model.rotations, model.centers, reference.rotations, reference.centers), strict=True

@@ -14,7 +14,7 @@ from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import read_graph
+from sfm_shapefit.formats.graph_text import read_graph
 from tests.program import run, run_python
 from tests.scenes import RING, ROOT, copied
 

@@ -29,6 +29,7 @@ from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit.arrays import FloatArray
+    from sfm_shapefit.directions.matches import RayMatches
 
 FOCAL_PX, WIDTH_PX, HEIGHT_PX, DEPTH = 1000.0, 1000.0, 750.0, 6.0
 MATCHES = 100
@@ -137,10 +138,11 @@ def cases(args: argparse.Namespace) -> dict[str, AnyCase]:
 # --- measuring -------------------------------------------------------------------------------------
 
 
-def make_pairs(case: Case, count: int, seed: int) -> "tuple[FloatArray, FloatArray, FloatArray]":
-    """Return rays_i and rays_j (count, matches, 3) and the true directions (count, 3) of random pairs."""
+def make_pairs(case: Case, count: int, seed: int) -> "tuple[RayMatches, FloatArray]":
+    """Return the matches of random pairs and their true directions (count, 3)."""
     import numpy as np
 
+    from sfm_shapefit.directions.matches import RayMatches
     from sfm_shapefit.geometry import normalized
 
     rng = np.random.default_rng(seed)
@@ -163,8 +165,18 @@ def make_pairs(case: Case, count: int, seed: int) -> "tuple[FloatArray, FloatArr
     is_wrong = rng.random(shape) < case.wrong
     pixels_j[is_wrong] = rng.uniform(-half, half, (int(is_wrong.sum()), 2))
     ones = np.ones((*shape, 1))
-    rays_i = normalized(np.concatenate([pixels_i / FOCAL_PX, ones], axis=2))
-    return rays_i, normalized(np.concatenate([pixels_j / FOCAL_PX, ones], axis=2)), directions
+    rays_i, rays_j = (
+        normalized(np.concatenate([xy / FOCAL_PX, ones], axis=2)).reshape(-1, 3)
+        for xy in (pixels_i, pixels_j)
+    )
+    matches = RayMatches(
+        pairs=np.column_stack([np.arange(count), np.arange(count) + 1]),
+        offsets=np.arange(count + 1) * case.matches,
+        rays_i=rays_i,
+        rays_j=rays_j,
+        pixel_angles=np.full(count, 1.0 / FOCAL_PX),
+    )
+    return matches, directions
 
 
 def measure_case(case: Case, count: int) -> Calibration:
@@ -176,17 +188,10 @@ def measure_case(case: Case, count: int) -> Calibration:
     from sfm_shapefit.directions.pair_directions import DirectionStatus
     from sfm_shapefit.geometry import angle_between_deg, tangent_bases
 
-    rays_i, rays_j, truth = make_pairs(case, count, seed=1)
+    matches, truth = make_pairs(case, count, seed=1)
     # Wrong matches are the case, not a reason for refusal; lists of 15 may lose some to the threshold.
     options = DirectionOptions(min_inlier_ratio=0.1, min_inliers=8)
-    found = estimate_directions(
-        np.column_stack([np.arange(count), np.arange(count) + 1]),
-        np.arange(count + 1) * case.matches,
-        rays_i.reshape(-1, 3),
-        rays_j.reshape(-1, 3),
-        np.full(count, 1.0 / FOCAL_PX),
-        options,
-    )
+    found = estimate_directions(matches, options)
     usable = found.usable()
     missing = found.counts().get(DirectionStatus.NO_PARALLAX, 0) / count
     if len(usable) == 0:
@@ -210,23 +215,14 @@ def measure_case(case: Case, count: int) -> Calibration:
 
 def measure_batches(pairs: int, threads: int) -> Speed:
     """Estimate one batch, a tenth of whose matches is wrong, again and again; drawing it is not timed."""
-    import numpy as np
-
     from sfm_shapefit.directions.estimate import estimate_directions
 
-    rays_i, rays_j, _ = make_pairs(Case(name="speed", wrong=0.1), BATCH, seed=2)
-    rays_i, rays_j = rays_i.reshape(-1, 3), rays_j.reshape(-1, 3)
-    ids = np.column_stack([np.arange(BATCH), np.arange(BATCH) + 1])
-    offsets, angles = np.arange(BATCH + 1) * MATCHES, np.full(BATCH, 1.0 / FOCAL_PX)
-
-    def estimate() -> None:
-        estimate_directions(ids, offsets, rays_i, rays_j, angles, threads=threads)
-
-    estimate()
+    matches, _ = make_pairs(Case(name="speed", wrong=0.1), BATCH, seed=2)
+    estimate_directions(matches, threads=threads)
     before_mb, start, cpu = resident_memory_mb(), time.perf_counter(), time.process_time()
     batches = math.ceil(pairs / BATCH)
     for _ in range(batches):
-        estimate()
+        estimate_directions(matches, threads=threads)
     return Speed(
         label=f"{threads} thread{'s' * (threads > 1)}",
         pairs=batches * BATCH,

@@ -105,6 +105,7 @@ def compare_made(shape: str, seed: int) -> Comparison:
     import numpy as np
 
     from sfm_shapefit.directions.estimate import estimate_directions
+    from sfm_shapefit.directions.matches import RayMatches
     from sfm_shapefit.geometry import normalized
     from sfm_shapefit.synthetic import SceneOptions, make_scene
 
@@ -131,8 +132,14 @@ def compare_made(shape: str, seed: int) -> Comparison:
         )
         for side in (0, 1)
     )
-    angles = np.full(scene.num_pairs, 1.0 / scene.calibration[0, 0])
-    directions = estimate_directions(scene.pairs, scene.match_offsets, rays_i, rays_j, angles)
+    matches = RayMatches(
+        pairs=scene.pairs,
+        offsets=scene.match_offsets,
+        rays_i=rays_i,
+        rays_j=rays_j,
+        pixel_angles=np.full(scene.num_pairs, 1.0 / scene.calibration[0, 0]),
+    )
+    directions = estimate_directions(matches)
     return compare(f"{shape}, made {seed}", directions, scene.centers)
 
 

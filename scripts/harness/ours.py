@@ -115,13 +115,13 @@ def directions_of_set(folder: Path) -> Any:
     from sfm_shapefit import LocateOptions
     from sfm_shapefit.colmap.database import open_database
     from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.commands.stages.execution import measure_batch
+    from sfm_shapefit.directions.estimate import estimate_directions
     from sfm_shapefit.directions.pair_directions import concatenate
 
     model = read_model(folder / "sparse" / "0")
     wanted = LocateOptions()
     with open_database(folder / "database.db", model) as database:
-        parts = [measure_batch(b, model.focal_lengths_px, wanted, 1) for b in database.iter_matches(1)]
+        parts = [estimate_directions(batch, wanted) for batch in database.iter_matches(1)]
     return model.names, concatenate(parts)
 
 

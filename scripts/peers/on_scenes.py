@@ -200,14 +200,17 @@ def _errors(found: Located, folder: Path, scene: Scene) -> Errors:
     import numpy as np
 
     from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.evaluation import evaluate_poses
+    from sfm_shapefit.evaluation import CameraPoses, evaluate_poses
 
     truth = read_model(folder / scene.truth)
     if len(set(found.names) & set(truth.names)) < 3:
         raise RuntimeError("fewer than three cameras of the truth are placed")
     # Rotations are not compared.
     nowhere = np.tile(np.eye(3), (len(found.names), 1, 1))
-    errors = evaluate_poses(found.names, nowhere, found.centers, truth.names, truth.rotations, truth.centers)
+    errors = evaluate_poses(
+        CameraPoses(found.names, nowhere, found.centers),
+        CameraPoses(truth.names, truth.rotations, truth.centers),
+    )
     given = set(read_model(folder / "sparse" / "0").names) & set(truth.names)
     position = errors.position
     missing = len(given - set(found.names))

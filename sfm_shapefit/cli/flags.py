@@ -154,7 +154,7 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
 
 def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str, Any]:
     """Return the values of a TOML file whose keys are options."""
-    from sfm_shapefit.formats import refuse_irregular_file
+    from sfm_shapefit.formats.lines import refuse_irregular_file
 
     refuse_irregular_file(path)
     try:

@@ -32,16 +32,8 @@ from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulat
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.errors import UnsolvableError
 
-
-@dataclass(frozen=True, slots=True)
-class _Round:
-    """One round: how much looser than asked the filter is, and the scale of the Cauchy loss."""
-
-    widening: float
-    loss_scale_px: float
-
-
-_ROUNDS = (_Round(4.0, 2.0), _Round(1.0, 1.0), _Round(1.0, 1.0))
+# Of each round, how much looser than asked the filter is, and the scale of the Cauchy loss in px.
+_ROUNDS = ((4.0, 2.0), (1.0, 1.0), (1.0, 1.0))
 # Steps end at this relative fall of the cost; 0, pycolmap's default, doubles the time for equal errors.
 _FUNCTION_TOLERANCE = 1e-6
 
@@ -113,19 +105,21 @@ def bundle_adjust(
     options = options or AdjustmentOptions()
     start = triangulate(seed, tracks, structure_options)
     current, iterations, converged = start, 0, False
-    for stage in _ROUNDS[: options.rounds]:
-        loose = replace(
-            structure_options,
-            max_reprojection_error_px=stage.widening * structure_options.max_reprojection_error_px,
-        )
-        current = triangulate(current, tracks, loose)
+    for widening, loss_scale_px in _ROUNDS[: options.rounds]:
+        limit_px = widening * structure_options.max_reprojection_error_px
+        current = triangulate(current, tracks, replace(structure_options, max_reprojection_error_px=limit_px))
         if not current.num_points3D():
             raise UnsolvableError(
                 "no 3D point can be triangulated at these camera positions, so there is nothing to adjust; "
                 "run without bundle adjustment"
             )
-        steps, converged = _solve(current, stage.loss_scale_px, options, fixed_frames)
-        _refuse_diverged(current)
+        steps, converged = _solve(current, loss_scale_px, options, fixed_frames)
+        for image in map(current.image, sorted(current.reg_image_ids())):
+            if not np.isfinite(image.cam_from_world().matrix()).all():  # such points are filtered later
+                raise UnsolvableError(
+                    f"the bundle adjustment drove image {image.name} to infinity; run without bundle "
+                    "adjustment"
+                )
         iterations += steps
     answer = filter_points(current, structure_options)
     return Adjusted(
@@ -178,13 +172,3 @@ def _settings(loss_scale_px: float, options: AdjustmentOptions) -> pycolmap.Bund
     settings.ceres.solver_options.max_num_iterations = options.max_iterations
     settings.ceres.solver_options.num_threads = options.num_threads
     return settings
-
-
-def _refuse_diverged(reconstruction: pycolmap.Reconstruction) -> None:
-    """Raise UnsolvableError if a pose is not finite; such points are filtered later."""
-    for image_id in sorted(reconstruction.reg_image_ids()):
-        image = reconstruction.image(image_id)
-        if not np.isfinite(image.cam_from_world().matrix()).all():
-            raise UnsolvableError(
-                f"the bundle adjustment drove image {image.name} to infinity; run without bundle adjustment"
-            )

@@ -13,17 +13,20 @@ refers to. Binary layouts, all little-endian, counts uint64 unless noted:
                            sensor  type i32, id u32, has_pose u8, and then qw .. tz f64 if it has
     frames    count, then  id u32, rig u32, qw .. tz f64, count u32, then  type i32, sensor u32, data u64
 
-Text models are checked line by line for what pycolmap overlooks; it refuses the rest itself.
+Text models are checked line by line for what pycolmap overlooks (NaN, lines cut short, names it would cut);
+it refuses the rest itself.
 
 Source: https://colmap.github.io/format.html, "Sparse reconstruction".
 """
 
+import itertools
 import math
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -31,13 +34,14 @@ import pycolmap
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.jit import kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
 
-# A quaternion printed with 4 digits still passes; a wrong one does not.
-_UNIT_QUATERNION_TOLERANCE = 1e-3
+UNIT_QUATERNION_TOLERANCE = 1e-3
+"""A quaternion printed with 4 digits still passes; a wrong one does not."""
+
 _NO_POINT = np.uint64(2**64 - 1)
 _CAMERA_SENSOR = int(pycolmap.SensorType.CAMERA)
 
@@ -82,7 +86,9 @@ def check_model_files(folder: Path) -> None:
     if suffix == ".bin":
         _check_binary_model(folder, with_rigs=has_rigs)
     else:
-        _check_text_model(folder)
+        _check_camera_lines(folder / "cameras.txt")
+        _check_image_lines(folder / "images.txt")
+        _check_point_lines(folder / "points3D.txt")
 
 
 def model_suffix(folder: Path) -> str:
@@ -115,10 +121,9 @@ def _missing_files_message(folder: Path, present: set[str]) -> str:
                 f"{folder} lacks {' and '.join(missing)}; a COLMAP model needs cameras, images and points3D, "
                 "all .bin or all .txt"
             )
-    for inner in ("0", "sparse/0", "sparse"):
-        for suffix in (".bin", ".txt"):
-            if all((folder / inner / (name + suffix)).is_file() for name in REQUIRED_FILES):
-                return f"{folder} holds no COLMAP model, but {folder / inner} does; give that folder"
+    for inner, suffix in itertools.product(("0", "sparse/0", "sparse"), (".bin", ".txt")):
+        if all((folder / inner / (name + suffix)).is_file() for name in REQUIRED_FILES):
+            return f"{folder} holds no COLMAP model, but {folder / inner} does; give that folder"
     return f"{folder} holds no COLMAP model; give the folder with cameras, images and points3D (.bin or .txt)"
 
 
@@ -133,14 +138,13 @@ def _num_params_of_model() -> dict[int, tuple[str, int]]:
     return table
 
 
-def _pose_fault(pose: Sequence[float]) -> str | None:
-    """Return what is wrong with (qw, qx, qy, qz, tx, ty, tz), or None."""
+def _refuse_pose(source: "_BinaryFile | _Line", label: str, pose: Sequence[float]) -> None:
+    """Refuse a bad pose (qw, qx, qy, qz, tx, ty, tz) of what `label` names."""
     if not all(map(math.isfinite, pose)):
-        return "has a pose that is not finite"
+        raise source.fault(f"{label} has a pose that is not finite")
     norm = math.hypot(*pose[:4])
-    if abs(norm - 1.0) > _UNIT_QUATERNION_TOLERANCE:
-        return f"has a rotation quaternion of norm {norm:.4g} instead of 1"
-    return None
+    if abs(norm - 1.0) > UNIT_QUATERNION_TOLERANCE:
+        raise source.fault(f"{label} has a rotation quaternion of norm {norm:.4g} instead of 1")
 
 
 # --- binary models ---------------------------------------------------------------------------------
@@ -200,18 +204,13 @@ class _BinaryFile:
             raise self.fault(f"{len(self.data) - self.offset} bytes follow the last record; write it again")
 
 
-@dataclass(frozen=True, slots=True)
-class _Images:
-    """What other files refer to in images.bin; the arrays per image are sorted by id."""
+class _Images(NamedTuple):
+    """What other files refer to in images.bin: of each image (n,), by id, and of each observation (O,)."""
 
     ids: IntArray
-    """(n,)"""
     camera_ids: IntArray
-    """(n,)"""
     num_points2d: IntArray
-    """(n,)"""
-    observed: UInt64Array
-    """(O,) id of the 3D point of each observation, image by image."""
+    observed_points: UInt64Array
 
 
 def _check_binary_model(folder: Path, *, with_rigs: bool) -> None:
@@ -220,10 +219,9 @@ def _check_binary_model(folder: Path, *, with_rigs: bool) -> None:
     image_file = _BinaryFile(folder / "images.bin")
     images = _check_images(image_file, camera_ids)
     point_ids = _check_points(_BinaryFile(folder / "points3D.bin"), images)
-    unknown = ~np.isin(images.observed, point_ids)
-    if unknown.any():
-        point_id = images.observed[int(np.argmax(unknown))]
-        raise image_file.fault(f"an image observes 3D point {point_id}, which points3D.bin does not have")
+    unknown = images.observed_points[~np.isin(images.observed_points, point_ids)]
+    if len(unknown):
+        raise image_file.fault(f"an image observes 3D point {unknown[0]}, which points3D.bin does not have")
     if with_rigs:
         rigs = _check_rigs(_BinaryFile(folder / "rigs.bin"), camera_ids)
         frame_file = _BinaryFile(folder / "frames.bin")
@@ -265,12 +263,7 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
         observed.append(points["point3d_id"][points["point3d_id"] != _NO_POINT])
     file.finish()
     table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
-    return _Images(
-        ids=table[:, 0],
-        camera_ids=table[:, 1],
-        num_points2d=table[:, 2],
-        observed=np.concatenate(observed),
-    )
+    return _Images(table[:, 0], table[:, 1], table[:, 2], np.concatenate(observed))
 
 
 def _take_image_header(file: _BinaryFile, camera_ids: set[int]) -> tuple[int, int, bytes]:
@@ -278,8 +271,7 @@ def _take_image_header(file: _BinaryFile, camera_ids: set[int]) -> tuple[int, in
     image_id, *pose, camera_id = file.take(_IMAGE, "an image")
     label = f"image {image_id}"
     name = file.take_name(f"the name of {label}")
-    if fault := _pose_fault(pose):
-        raise file.fault(f"{label} {fault}")
+    _refuse_pose(file, label, pose)
     if camera_id not in camera_ids:
         raise file.fault(f"{label} refers to camera {camera_id}, which cameras.bin does not have")
     if not name:
@@ -324,15 +316,11 @@ def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
 
 def _check_track_elements(file: _BinaryFile, elements: IntArray, images: _Images) -> None:
     """Refuse track elements (E, 2) whose image, or whose point of that image, does not exist."""
-    if not len(elements):
-        return
     position = np.searchsorted(images.ids, elements[:, 0])
-    padded_ids = np.append(images.ids, -1)
-    padded_counts = np.append(images.num_points2d, 0)
-    unknown = padded_ids[position] != elements[:, 0]
-    bad = unknown | (elements[:, 1] >= padded_counts[position])
-    if bad.any():
-        image_id, point = elements[int(np.argmax(bad))]
+    is_known = np.append(images.ids, -1)[position] == elements[:, 0]
+    bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
+    if len(bad):
+        image_id, point = bad[0]
         raise file.fault(
             f"a track refers to point {point} of image {image_id}, which images.bin does not have"
         )
@@ -412,10 +400,8 @@ def _take_sensor(
     sensor_type, sensor_id = map(int, file.take(_SENSOR, label))
     if sensor_type == _CAMERA_SENSOR and sensor_id not in camera_ids:
         raise file.fault(f"{label} refers to camera {sensor_id}, which cameras.bin does not have")
-    has_pose = not is_reference and file.take(_HAS_POSE, label)[0] != 0
-    fault = _pose_fault(file.take(_POSE, label)) if has_pose else None
-    if fault:
-        raise file.fault(f"{label} has a sensor that {fault}")
+    if not is_reference and file.take(_HAS_POSE, label)[0]:
+        _refuse_pose(file, f"{label} has a sensor that", file.take(_POSE, label))
     return sensor_type, sensor_id
 
 
@@ -431,8 +417,7 @@ def _check_frames(file: _BinaryFile, rigs: dict[int, set[tuple[int, int]]]) -> d
         frame_ids.add(int(frame_id))
         if rig_id not in rigs:
             raise file.fault(f"{label} refers to rig {rig_id}, which rigs.bin does not have")
-        if fault := _pose_fault(pose):
-            raise file.fault(f"{label} {fault}")
+        _refuse_pose(file, label, pose)
         file.require_room(int(num_data), _FRAME_DATA.size, f"images of {label}")
         for _ in range(int(num_data)):
             sensor_type, sensor_id, data_id = map(int, file.take(_FRAME_DATA, label))
@@ -490,31 +475,25 @@ class _Line:
     @property
     def is_record(self) -> bool:
         """Whether this is neither blank nor a comment."""
-        stripped = self.text.strip()
-        return bool(stripped) and not stripped.startswith("#")
+        return not self.text.strip().startswith("#") and not self.text.isspace()
 
 
-def _lines(path: Path) -> Iterator[_Line]:
-    """Yield every line of a text file."""
+def _lines(path: Path, *, records_only: bool = True) -> Iterator[_Line]:
+    """Yield the lines of a text file that are records, or all."""
     try:
         with path.open(encoding="utf-8", errors="surrogateescape") as stream:
             for number, text in enumerate(stream, start=1):
-                yield _Line(path, number, text)
+                line = _Line(path, number, text)
+                if line.is_record or not records_only:
+                    yield line
     except OSError as error:
         raise InputError(f"{path} cannot be read: {error.strerror}") from None
-
-
-def _check_text_model(folder: Path) -> None:
-    """Check what pycolmap overlooks in text files: NaN, lines cut short, names it would cut."""
-    _check_camera_lines(folder / "cameras.txt")
-    _check_image_lines(folder / "images.txt")
-    _check_point_lines(folder / "points3D.txt")
 
 
 def _check_camera_lines(path: Path) -> None:
     """Each line: CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]."""
     num_params = dict(_num_params_of_model().values())
-    for line in filter(lambda line: line.is_record, _lines(path)):
+    for line in _lines(path):
         tokens = line.text.split()
         if len(tokens) < 4 or tokens[1] not in num_params:
             raise line.fault("expected CAMERA_ID, a known camera MODEL, WIDTH, HEIGHT, PARAMS[]")
@@ -528,7 +507,7 @@ def _check_camera_lines(path: Path) -> None:
 def _check_image_lines(path: Path) -> None:
     """Two lines per image: IMAGE_ID, QW .. TZ, CAMERA_ID, NAME and then (X, Y, POINT3D_ID)[]."""
     names: dict[str, int] = {}
-    lines = _lines(path)
+    lines = _lines(path, records_only=False)
     for line in lines:
         if not line.is_record:
             continue
@@ -538,33 +517,22 @@ def _check_image_lines(path: Path) -> None:
                 "expected IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME "
                 "(a name with spaces needs the .bin format)"
             )
-        if fault := _pose_fault(line.finite(tokens[1:8], "the pose")):
-            raise line.fault(f"image {tokens[0]} {fault}")
+        _refuse_pose(line, f"image {tokens[0]}", line.finite(tokens[1:8], "the pose"))
         if tokens[9] in names:
             raise line.fault(f"the name {tokens[9]} stands in line {names[tokens[9]]} already")
         names[tokens[9]] = line.number
         points = next(lines, None)
         if points is None:
             raise line.fault("the line of its points is missing; add one, empty if the image has none")
-        _check_points2d_line(points)
-
-
-def _check_points2d_line(line: _Line) -> None:
-    """Refuse a line of points that is not a list of finite triples."""
-    tokens = line.text.split()
-    if len(tokens) % 3:
-        raise line.fault("expected triples X, Y, POINT3D_ID")
-    try:
-        finite = np.isfinite(np.array(tokens, dtype=np.float64)).all()
-    except ValueError:
-        raise line.fault("a point holds something that is not a number") from None
-    if not finite:
-        raise line.fault("a point holds a number that is not finite")
+        tokens = points.text.split()
+        if len(tokens) % 3:
+            raise points.fault("expected triples X, Y, POINT3D_ID")
+        points.finite(tokens, "a point")
 
 
 def _check_point_lines(path: Path) -> None:
     """Each line: POINT3D_ID, X, Y, Z, R, G, B, ERROR, (IMAGE_ID, POINT2D_IDX)[]."""
-    for line in filter(lambda line: line.is_record, _lines(path)):
+    for line in _lines(path):
         tokens = line.text.split()
         if len(tokens) < 8 or len(tokens) % 2:
             raise line.fault("expected POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as pairs")

@@ -22,21 +22,20 @@ import sqlite3
 import struct
 import tempfile
 from collections import OrderedDict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
-from sfm_shapefit.colmap.model import PosedModel, rotation_matrices, world_rays
+from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, world_rays
 from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.geometry import normalized
 
 MAX_NUM_IMAGES = 2147483647
@@ -209,11 +208,9 @@ class MatchDatabase:
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
         with np.errstate(invalid="ignore"):  # a signalling NaN
             xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
-        if not np.isfinite(xy).all():
-            raise InputError(
-                f"{self.path}: image {name} has a keypoint that is not finite; extract them again"
-            )
-        return xy
+        if np.isfinite(xy).all():
+            return xy
+        raise InputError(f"{self.path}: image {name} has a keypoint that is not finite; extract them again")
 
     def parts(self, max_matches: int) -> list[tuple[int, int]]:
         """Return the ranges (first, stop) of pairs, in their order, of about so many matches each."""
@@ -250,13 +247,8 @@ class MatchDatabase:
         if among is not None:
             enough &= np.isin(self._pairs.pairs, among).all(axis=1)
         chosen = np.flatnonzero(enough)
-        limit = max(max_matches_per_batch, 1)
-        first = 0
-        while first < len(chosen):
-            total = np.cumsum(self._pairs.num_inliers[chosen[first : first + limit]])
-            count = max(int(np.searchsorted(total, limit, side="right")), 1)
-            batch = self._match_batch(chosen[first : first + count], max(min_matches, 1))
-            first += count
+        for first, last in batch_ranges(self._pairs.num_inliers[chosen], max_matches_per_batch):
+            batch = self._match_batch(chosen[first:last], max(min_matches, 1))
             if len(batch.pairs):
                 yield batch
 
@@ -271,18 +263,14 @@ class MatchDatabase:
         Raises:
             InputError: naming the pair whose pose is damaged.
         """
-        columns = _columns(self._connection, "two_view_geometries")
         keep = np.flatnonzero(~np.isin(self._pairs.configs, _CONFIGS_WITHOUT_POSE))
         poses = np.full((len(keep), 7), np.nan)
-        if {"qvec", "tvec"} <= columns:
+        if {"qvec", "tvec"} <= _columns(self._connection, "two_view_geometries"):
             for k, pair in enumerate(keep.tolist()):
                 poses[k] = self._stored_pose(pair)
-        sound = np.isfinite(poses).all(axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):
-            rotation_norm = np.linalg.norm(poses[:, :4], axis=1)
-            translation_norm = np.linalg.norm(poses[:, 4:], axis=1)
-        sound &= (rotation_norm > 0.0) & (rotation_norm < np.inf)
-        sound &= (translation_norm > _MIN_TRANSLATION) & (translation_norm < np.inf)
+        with np.errstate(over="ignore", invalid="ignore"):  # neither NaN nor infinity passes
+            lengths = np.stack([np.linalg.norm(part, axis=1) for part in (poses[:, :4], poses[:, 4:])])
+            sound = ((lengths > [[0.0], [_MIN_TRANSLATION]]) & (lengths < np.inf)).all(axis=0)
         keep, poses = keep[sound], poses[sound]
 
         rotations, translations = rotation_matrices(poses[:, :4]), normalized(poses[:, 4:])
@@ -296,12 +284,18 @@ class MatchDatabase:
             num_inliers=self._pairs.num_inliers[keep],
         )
 
+    def _stored(self, pair: int, columns: str) -> tuple[Any, ...]:
+        """Return columns of a pair's two-view geometry."""
+        query = f"SELECT {columns} FROM two_view_geometries WHERE rowid = ?"
+        with _sqlite_errors(self.path):
+            row: tuple[Any, ...] = self._connection.execute(
+                query, (int(self._pairs.rowids[pair]),)
+            ).fetchone()
+        return row
+
     def _stored_pose(self, pair: int) -> FloatArray:
         """Return (qw, qx, qy, qz, tx, ty, tz) of a pair as stored, NaN if it has none."""
-        with _sqlite_errors(self.path):
-            qvec, tvec = self._connection.execute(
-                "SELECT qvec, tvec FROM two_view_geometries WHERE rowid = ?", (int(self._pairs.rowids[pair]),)
-            ).fetchone()
+        qvec, tvec = self._stored(pair, "qvec, tvec")
         if qvec is None or tvec is None:
             return np.full(7, np.nan)
         if not (_is_blob(qvec, 4, 1, itemsize=8) and _is_blob(tvec, 3, 1, itemsize=8)):
@@ -310,8 +304,7 @@ class MatchDatabase:
 
     def _match_batch(self, chosen: IntArray, min_matches: int) -> MatchBatch:
         """Return the matches of the chosen pairs, sorted, without repetitions and those without ray."""
-        keypoints, pair_of = self._read_match_rows(chosen)
-        keypoints, pair_of = _in_order(keypoints, pair_of)
+        keypoints, pair_of = _in_order(*self._read_match_rows(chosen))
         bounds = np.searchsorted(pair_of, np.arange(len(chosen) + 1))
         rays = np.empty((2, len(keypoints), 3))
         for k, pair in enumerate(chosen.tolist()):
@@ -324,25 +317,23 @@ class MatchDatabase:
 
         keep = np.asarray(np.isfinite(rays).all(axis=(0, 2)), dtype=np.bool_)
         counts = np.bincount(pair_of[keep], minlength=len(chosen))
-        keep &= (counts >= min_matches)[pair_of]
         kept = counts >= min_matches
+        keep &= kept[pair_of]
+        pairs = self._pairs.pairs[chosen[kept]]
         return MatchBatch(
-            pairs=self._pairs.pairs[chosen[kept]],
+            pairs=pairs,
             offsets=np.append(0, np.cumsum(counts[kept])),
             keypoints=keypoints[keep],
             rays_i=rays[0, keep],
             rays_j=rays[1, keep],
+            pixel_angles=1.0 / self._model.focal_lengths_px[pairs].min(axis=1),
         )
 
     def _read_match_rows(self, chosen: IntArray) -> tuple[IntArray, IntArray]:
         """Return the stored matches (M, 2), image i first, and for each the position of its pair."""
         blobs = []
         for pair in chosen.tolist():
-            with _sqlite_errors(self.path):
-                cols, data = self._connection.execute(
-                    "SELECT cols, data FROM two_view_geometries WHERE rowid = ?",
-                    (int(self._pairs.rowids[pair]),),
-                ).fetchone()
+            cols, data = self._stored(pair, "cols, data")
             if cols != 2 or not _is_blob(data, int(self._pairs.num_inliers[pair]), 2, itemsize=4):
                 raise self._damaged_pair(pair, "matches of wrong length")
             blobs.append(data)
@@ -390,7 +381,7 @@ def _readonly_connection(path: Path) -> Iterator[sqlite3.Connection]:
     """Connect to a database so that no file of it changes and none appears; see the module's header."""
     header = _read_header(path)
     with ExitStack() as stack:
-        if any(_size(_sidecar(path, suffix)) for suffix in _SIDECARS):
+        if any(_fingerprint(sidecar)[0] for sidecar in _sidecars(path)):
             target, mode = _private_copy(path, stack), "mode=rw"
         else:
             _refuse_truncated(path, header)
@@ -437,32 +428,32 @@ def _refuse_truncated(path: Path, header: bytes) -> None:
     page_size, change_counter, num_pages = struct.unpack_from(">H6xII", header, 16)
     (size_valid_for,) = struct.unpack_from(">I", header, 92)
     size = num_pages * (65536 if page_size == 1 else page_size)
-    if change_counter == size_valid_for and _size(path) < size:
-        raise InputError(
-            f"the database {path} is truncated: it has {_size(path)} of {size} bytes; copy it again"
-        )
+    there, _ = _fingerprint(path)
+    if change_counter == size_valid_for and there < size:
+        raise InputError(f"the database {path} is truncated: it has {there} of {size} bytes; copy it again")
 
 
-def _sidecar(path: Path, suffix: str) -> Path:
-    """Return the path of a database's -wal or -journal file."""
-    return path.with_name(path.name + suffix)
+def _sidecars(path: Path) -> list[Path]:
+    """Return the paths of a database's -wal and -journal files."""
+    return [path.with_name(path.name + suffix) for suffix in _SIDECARS]
 
 
-def _size(path: Path) -> int:
-    """Return the size of a file, 0 if it does not exist."""
+def _fingerprint(path: Path) -> tuple[int, int]:
+    """Return size and modification time of a file, zeros if it does not exist."""
     try:
-        return path.stat().st_size
+        stat = path.stat()
     except FileNotFoundError:
-        return 0
+        return 0, 0
+    return stat.st_size, stat.st_mtime_ns
 
 
 def _private_copy(path: Path, stack: ExitStack) -> Path:
     """Copy a database with its -wal or -journal, and try again if a writer changed them meanwhile."""
-    files = [path, *(_sidecar(path, suffix) for suffix in _SIDECARS)]
+    files = [path, *_sidecars(path)]
     parent = Path(tempfile.gettempdir())
     remove_abandoned(parent, ".shapefit-*.copy")
     for _ in range(_COPY_ATTEMPTS):
-        before = _fingerprints(files)
+        before = [_fingerprint(file) for file in files]
         try:
             name = f".shapefit-{secrets.token_hex(8)}.copy"
             folder = stack.enter_context(locked_folder(parent / name))
@@ -473,40 +464,25 @@ def _private_copy(path: Path, stack: ExitStack) -> Path:
                 f"the database {path} has unfinished changes and cannot be copied to a temporary folder "
                 f"({error.strerror}); close the program that uses it, or make room"
             ) from None
-        if before == _fingerprints(files):
+        if before == [_fingerprint(file) for file in files]:
             return folder / path.name
     raise InputError(f"the database {path} is being written by another program; wait until it is done")
-
-
-def _fingerprints(files: Sequence[Path]) -> list[tuple[int, int] | None]:
-    """Return size and modification time of each file that exists."""
-    found: list[tuple[int, int] | None] = []
-    for file in files:
-        try:
-            stat = file.stat()
-            found.append((stat.st_size, stat.st_mtime_ns))
-        except FileNotFoundError:
-            found.append(None)
-    return found
 
 
 # --- tables ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pairs:
+class _Pairs(NamedTuple):
     """The pairs of posed images that have inlier matches, sorted by (i, j)."""
 
     pairs: IntArray
-    """(k, 2) model indices, i < j."""
+    """(k, 2) model indices, i < j; all else is (k,)."""
     rowids: IntArray
-    """(k,) rows of two_view_geometries."""
+    """Rows of two_view_geometries."""
     swapped: BoolArray
-    """(k,) whether the database has image j first."""
+    """Whether the database has image j first."""
     configs: IntArray
-    """(k,)"""
     num_inliers: IntArray
-    """(k,)"""
 
     @property
     def has_matches(self) -> BoolArray:
@@ -570,18 +546,13 @@ def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) 
     if not index_of_id:
         raise InputError(f"{path} has no images; run COLMAP's feature extraction and matching first")
     if len(matched) < 2:
-        raise InputError(_other_scene_message(path, model, matched, example))
+        unmatched = next(name for index, name in enumerate(model.names) if index not in matched)
+        there = f", and the database's {example} is not in the model" if example is not None else ""
+        raise InputError(
+            f"{path} has {len(matched)} of the model's {model.num_images} images: the model's {unmatched} is "
+            f"not in the database{there}; give the database this model was made from"
+        )
     return index_of_id
-
-
-def _other_scene_message(path: Path, model: PosedModel, matched: set[int], example: str | None) -> str:
-    """Return the sentence about a database whose images are not those of the model."""
-    unmatched = next(name for index, name in enumerate(model.names) if index not in matched)
-    there = f", and the database's {example} is not in the model" if example is not None else ""
-    return (
-        f"{path} has {len(matched)} of the model's {model.num_images} images: the model's {unmatched} is not "
-        f"in the database{there}; give the database this model was made from"
-    )
 
 
 def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[int, int]) -> _Pairs:
@@ -607,13 +578,7 @@ def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[in
     if repeated.any():
         pair_id = pair_ids[order][int(np.argmax(repeated))]
         raise InputError(f"{path}: the two-view geometry of pair {pair_id} stands twice")
-    return _Pairs(
-        pairs=pairs,
-        rowids=rowids[order],
-        swapped=swapped[order],
-        configs=configs[order],
-        num_inliers=num_inliers[order],
-    )
+    return _Pairs(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
 
 
 def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int]) -> IntArray:

@@ -11,23 +11,23 @@ unknowns.
 Source of the conventions: https://colmap.github.io/format.html and `colmap/scene/reconstruction.h`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
-from sfm_shapefit.colmap.check import check_model_files, model_suffix
-from sfm_shapefit.colmap.other_programs import reconstruction_of
+from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
+from sfm_shapefit.colmap.other_programs import camera_of, intrinsics_of, reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.models import is_model_file, read_model_file
+from sfm_shapefit.formats.posed_model import Intrinsics
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -36,8 +36,6 @@ UInt64Array = npt.NDArray[np.uint64]
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
-# This is the tolerance of `check.py`.
-_UNIT_QUATERNION_TOLERANCE = 1e-3
 # Sums of squares of larger coordinates overflow; these count as not finite.
 _LARGEST_COORDINATE = 1e100
 _POINT3D_ID = attrgetter("point3D_id")
@@ -49,8 +47,7 @@ _IDENTITY_CAMERA = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=[1
 class PosedModel:
     """The posed images of a COLMAP model, in the order of their names. Arrays are read-only.
 
-    Ids are what a program happened to count; names are the user's. So the answer, whose sums depend on the
-    order of images, does not depend on the order in which they were once added.
+    The answer's sums depend on the order of images, so it is that of the user's names, not of ids.
     """
 
     reconstruction: pycolmap.Reconstruction
@@ -86,14 +83,9 @@ class PosedModel:
         """Number of posed images, n."""
         return len(self.image_ids)
 
-
-class CameraTable(NamedTuple):
-    """An intrinsic camera as plain values."""
-
-    model: str
-    width: int
-    height: int
-    params: tuple[float, ...]
+    def camera(self, index: int) -> pycolmap.Camera:
+        """Return the camera of an image by its index."""
+        return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,7 +98,7 @@ class PosedCameras:
     """(n, 3, 3) cam_from_world."""
     focal_lengths_px: FloatArray
     """(n,)"""
-    cameras: tuple[CameraTable, ...]
+    cameras: tuple[Intrinsics, ...]
     """The different cameras."""
     camera_of: IntArray
     """(n,) index into `cameras`."""
@@ -122,7 +114,7 @@ def posed_cameras(model: PosedModel) -> PosedCameras:
         names=model.names,
         rotations=np.array(model.rotations),
         focal_lengths_px=np.array(model.focal_lengths_px),
-        cameras=tuple(CameraTable(c.model.name, c.width, c.height, tuple(c.params)) for c in cameras),
+        cameras=tuple(intrinsics_of(camera) for camera in cameras),
         camera_of=camera_of.astype(np.int64),
     )
 
@@ -130,15 +122,8 @@ def posed_cameras(model: PosedModel) -> PosedCameras:
 def from_posed_cameras(table: PosedCameras) -> PosedModel:
     """Return a model of these images: the same rotations to the bit, centers at the origin, no points."""
     reconstruction = pycolmap.Reconstruction()
-    for k, camera in enumerate(table.cameras):
-        made = pycolmap.Camera(
-            camera_id=k + 1,
-            model=camera.model,
-            width=camera.width,
-            height=camera.height,
-            params=list(camera.params),
-        )
-        reconstruction.add_camera_with_trivial_rig(made)
+    for camera_id, camera in enumerate(table.cameras, start=1):
+        reconstruction.add_camera_with_trivial_rig(camera_of(camera, camera_id))
     n = len(table.names)
     for k, (name, camera) in enumerate(zip(table.names, table.camera_of.tolist(), strict=True)):
         image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=k + 1)
@@ -168,16 +153,14 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
             refuses them, if the pose of a sensor in its rig is not known, or if fewer than two images have a
             pose.
     """
+    is_checked = False
     if isinstance(source, pycolmap.Reconstruction):
         label, reconstruction = "the reconstruction", source
-        is_checked = False
     elif is_model_file(source):
         label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
-        is_checked = False
     else:
-        folder = Path(source)
-        label, reconstruction = str(folder), _load(folder)
-        is_checked = model_suffix(folder) == ".bin"
+        label, reconstruction = str(source), _load(Path(source))
+        is_checked = model_suffix(Path(source)) == ".bin"
     try:
         with quiet_log():
             _refuse_inconsistent(label, reconstruction, is_checked=is_checked)
@@ -203,8 +186,7 @@ def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
     for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
         image = copy.image(int(model.image_ids[index]))
         rotation = pycolmap.Rotation3d(model.rotations[index] @ turns[index].T)
-        translation = -(rotation.matrix() @ model.centers[index])
-        pose = pycolmap.Rigid3d(rotation, translation)
+        pose = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ model.centers[index]))
         copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
     return read_model(copy)
 
@@ -220,8 +202,7 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     Returns:
         (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
     """
-    reconstruction = model.reconstruction
-    camera = reconstruction.camera(reconstruction.image(int(model.image_ids[image])).camera_id)
+    camera = model.camera(image)
     rays = np.asarray(camera.cam_ray_from_img(np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2)))
     return normalized(rays @ model.rotations[image])
 
@@ -244,13 +225,9 @@ def track_matches(
         InputError: if an observed point of an image is not finite.
     """
     tracks = _Observations.of(model)
-    num_matches = np.asarray(
-        np.bincount(tracks.images, tracks.num_following(), model.num_images), dtype=np.float64
-    )
-    for first, last in _batches(num_matches, max_matches_per_batch):
-        batch = _track_batch(
-            tracks, first, last, num_images=model.num_images, min_matches=max(min_matches, 1)
-        )
+    num_matches = np.bincount(tracks.images, tracks.num_following(), model.num_images)
+    for first, last in batch_ranges(num_matches, max_matches_per_batch):
+        batch = _track_batch(tracks, slice(first, last), model.focal_lengths_px, max(min_matches, 1))
         if len(batch.pairs):
             yield batch
 
@@ -311,8 +288,7 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
         few = "only one image" if image_ids else "no image"
         raise InputError(f"{label} has {few} with a pose, but two or more are needed; register more")
     images = [reconstruction.image(i) for i in image_ids]
-    for image in images:
-        _refuse_uncalibrated(label, image, reconstruction)
+    frame_offsets = [_frame_offset(label, image, reconstruction) for image in images]
     names = tuple(image.name for image in images)
     if len(set(names)) < len(names):
         repeated = next(name for k, name in enumerate(names) if name in names[:k])
@@ -332,27 +308,24 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
         centers=frozen(-np.einsum("nji,nj->ni", rotations, translations)),
         focal_lengths_px=frozen(_focal_lengths_px(label, cameras)),
         frame_ids=frozen(np.array([image.frame_id for image in images], dtype=np.int64)),
-        frame_offsets=frozen(np.array([_frame_offset(image, reconstruction) for image in images])),
+        frame_offsets=frozen(np.array(frame_offsets)),
     )
 
 
-def _refuse_uncalibrated(label: str, image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> None:
-    """Refuse an image whose sensor has no pose in its rig: nothing says where it stands in its frame."""
-    rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
-    sensor = reconstruction.camera(image.camera_id).sensor_id
-    if not rig.is_ref_sensor(sensor) and not rig.has_sensor_from_rig(sensor):
-        raise InputError(
-            f"{label}: camera {image.camera_id} has no pose in rig {rig.rig_id} (sensor_from_rig), so that "
-            f"image {image.name} has none; calibrate the rig, or give a trivial rig to each camera"
-        )
+def _frame_offset(label: str, image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> FloatArray:
+    """Return C - C_frame of a posed image in world axes, exactly 0 for the reference sensor.
 
-
-def _frame_offset(image: pycolmap.Image, reconstruction: pycolmap.Reconstruction) -> FloatArray:
-    """Return C - C_frame of a posed image in world axes, exactly 0 for the reference sensor."""
+    Nothing says where a sensor without a pose in its rig stands: its image is refused.
+    """
     frame = reconstruction.frame(image.frame_id)
     sensor, rig = reconstruction.camera(image.camera_id).sensor_id, reconstruction.rig(frame.rig_id)
     if rig.is_ref_sensor(sensor):
         return np.zeros(3)
+    if not rig.has_sensor_from_rig(sensor):
+        raise InputError(
+            f"{label}: camera {image.camera_id} has no pose in rig {rig.rig_id} (sensor_from_rig), so that "
+            f"image {image.name} has none; calibrate the rig, or give a trivial rig to each camera"
+        )
     sensor_from_rig, rig_from_world = rig.sensor_from_rig(sensor), frame.rig_from_world
     assert sensor_from_rig is not None
     assert rig_from_world is not None
@@ -364,7 +337,7 @@ def _check_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[Fl
     """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
     quaternions = np.array(quaternions_xyzw, dtype=np.float64)
     with np.errstate(invalid="ignore", over="ignore"):
-        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= _UNIT_QUATERNION_TOLERANCE
+        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
     if not sound.all():
         raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
     return rotation_matrices(quaternions[:, [3, 0, 1, 2]])
@@ -438,12 +411,9 @@ class _Observations:
     @classmethod
     def of(cls, model: PosedModel) -> "_Observations":
         """Collect the observations of a model."""
-        parts = [_image_observations(model, image) for image in range(model.num_images)]
-        images = np.repeat(np.arange(model.num_images), [len(ids) for ids, _, _ in parts])
-        ids, keypoints, rays = (np.concatenate(column) for column in zip(*parts, strict=True))
-        order = np.argsort(ids, kind="stable")  # keeps images, and keypoints in an image, ascending
-        ids, images, keypoints, rays = ids[order], images[order], keypoints[order], rays[order]
-
+        ids, images, keypoints, rays = sort_observations(
+            [_image_observations(model, image) for image in range(model.num_images)]
+        )
         same_as_next = (ids[1:] == ids[:-1]) & (images[1:] == images[:-1])
         ambiguous = np.append(same_as_next, False) | np.insert(same_as_next, 0, False)
         keep = ~ambiguous & np.isfinite(rays).all(axis=1)
@@ -463,6 +433,23 @@ class _Observations:
         return self.track_ends - np.arange(len(self.track_ends)) - 1
 
 
+def sort_observations(
+    parts: Sequence[tuple[UInt64Array, IntArray, FloatArray]],
+) -> tuple[UInt64Array, IntArray, IntArray, FloatArray]:
+    """Join what images observe, sorted by point; a point's images, and keypoints in an image, stay ascending.
+
+    Args:
+        parts: for each image the ids of its points, ascending keypoints, and a value (., d) for each.
+
+    Returns:
+        Ids of points, positions of images in `parts`, keypoints and values of all observations.
+    """
+    images = np.repeat(np.arange(len(parts)), [len(ids) for ids, _, _ in parts])
+    ids, keypoints, values = (np.concatenate(column) for column in zip(*parts, strict=True))
+    order = np.argsort(ids, kind="stable")
+    return ids[order], images[order], keypoints[order], values[order]
+
+
 def _image_observations(model: PosedModel, index: int) -> tuple[UInt64Array, IntArray, FloatArray]:
     """Return point ids, keypoint indices and rays of the observed points of one image."""
     image = model.reconstruction.image(int(model.image_ids[index]))
@@ -473,7 +460,7 @@ def _image_observations(model: PosedModel, index: int) -> tuple[UInt64Array, Int
     return ids, keypoints, world_rays(model, index, xy)
 
 
-def _batches(sizes: FloatArray, limit: int) -> Iterator[tuple[int, int]]:
+def batch_ranges(sizes: FloatArray | IntArray, limit: int) -> Iterator[tuple[int, int]]:
     """Yield ranges [first, last) of consecutive items whose sizes sum to at most `limit`, or of one item."""
     first, total = 0, 0.0
     for item, size in enumerate(sizes.tolist()):
@@ -486,10 +473,11 @@ def _batches(sizes: FloatArray, limit: int) -> Iterator[tuple[int, int]]:
 
 
 def _track_batch(
-    tracks: _Observations, first: int, last: int, *, num_images: int, min_matches: int
+    tracks: _Observations, images: slice, focal_lengths_px: FloatArray, min_matches: int
 ) -> MatchBatch:
-    """Return the matches of all pairs (i, j > i) with first <= i < last that have enough of them."""
-    own = tracks.by_image[tracks.image_starts[first] : tracks.image_starts[last]]
+    """Return the matches of all pairs (i, j > i) with i among the images that have enough of them."""
+    num_images = len(focal_lengths_px)
+    own = tracks.by_image[tracks.image_starts[images.start] : tracks.image_starts[images.stop]]
     follows = tracks.num_following()[own]
     left = np.repeat(own, follows)
     right = left + 1 + np.arange(len(left)) - np.repeat(np.cumsum(follows) - follows, follows)
@@ -501,10 +489,12 @@ def _track_batch(
     keep: BoolArray = np.repeat(counts >= min_matches, counts)
     left, right = left[keep], right[keep]
     kept = counts >= min_matches
+    pairs = np.stack(np.divmod(keys[kept], num_images), axis=1)
     return MatchBatch(
-        pairs=np.stack(np.divmod(keys[kept], num_images), axis=1),
+        pairs=pairs,
         offsets=np.append(0, np.cumsum(counts[kept])),
         keypoints=np.stack([tracks.keypoints[left], tracks.keypoints[right]], axis=1),
         rays_i=tracks.rays[left],
         rays_j=tracks.rays[right],
+        pixel_angles=1.0 / focal_lengths_px[pairs].min(axis=1),
     )

@@ -7,7 +7,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import EpipolarGeometries
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 
 
@@ -25,7 +25,10 @@ def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reco
         raise InputError(f"{label} has two images of the name {min(repeated)}; rename one")
     model = pycolmap.Reconstruction()
     for k, camera in enumerate(scene.cameras, start=1):
-        model.add_camera_with_trivial_rig(_camera(camera, k, label))
+        made = camera_of(camera, k)
+        if not made.verify_params():
+            raise InputError(f"{label}: camera {k - 1} has parameters that do not fit {camera.model}")
+        model.add_camera_with_trivial_rig(made)
     observed, pixels = _unambiguous(scene)
     order = np.argsort(observed[:, 1], kind="stable")
     observed, pixels = observed[order], pixels[order]
@@ -48,17 +51,8 @@ def posed_model_of(model: pycolmap.Reconstruction) -> PosedModelFile:
     """Return the posed images of a reconstruction, by id, without points."""
     images = [model.image(i) for i in sorted(i for i, image in model.images.items() if image.has_pose)]
     camera_ids = sorted({image.camera_id for image in images})
-    cameras = [model.camera(camera_id) for camera_id in camera_ids]
     return PosedModelFile(
-        cameras=tuple(
-            Intrinsics(
-                model=camera.model.name,
-                width=int(camera.width),
-                height=int(camera.height),
-                params=tuple(np.asarray(camera.params).tolist()),
-            )
-            for camera in cameras
-        ),
+        cameras=tuple(intrinsics_of(model.camera(camera_id)) for camera_id in camera_ids),
         names=tuple(image.name for image in images),
         camera_of=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
         rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3),
@@ -92,19 +86,14 @@ def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
     )
 
 
-def _camera(camera: Intrinsics, camera_id: int, label: Path | str) -> pycolmap.Camera:
-    """Return a camera of pycolmap's."""
-    made = pycolmap.Camera(
-        camera_id=camera_id,
-        model=camera.model,
-        width=camera.width,
-        height=camera.height,
-        params=list(camera.params),
-        has_prior_focal_length=True,
-    )
-    if not made.verify_params():
-        raise InputError(f"{label}: camera {camera_id - 1} has parameters that do not fit {camera.model}")
-    return made
+def intrinsics_of(camera: pycolmap.Camera) -> Intrinsics:
+    """Return a camera of pycolmap's as plain values."""
+    return Intrinsics(camera.model.name, int(camera.width), int(camera.height), tuple(camera.params.tolist()))
+
+
+def camera_of(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
+    """Return a camera of pycolmap's whose focal length is known."""
+    return pycolmap.Camera(**intrinsics._asdict(), camera_id=camera_id, has_prior_focal_length=True)
 
 
 def _unambiguous(scene: PosedModelFile) -> tuple[IntArray, FloatArray]:
@@ -130,13 +119,8 @@ def _add_points(
             pycolmap.TrackElement(image + 1, keypoint)
             for image, keypoint in zip(observed[rows, 1].tolist(), keypoints[rows].tolist(), strict=True)
         ]
-        model.add_point3D_with_id(
-            point + 1,
-            pycolmap.Point3D(
-                xyz=scene.points[point],
-                color=scene.colors[point].astype(np.uint8),
-                track=pycolmap.Track(elements),
-            ),
-        )
+        xyz, color = scene.points[point], scene.colors[point].astype(np.uint8)
+        made = pycolmap.Point3D(xyz=xyz, color=color, track=pycolmap.Track(elements))
+        model.add_point3D_with_id(point + 1, made)
     if len(observed):
         model.update_point_3d_errors()

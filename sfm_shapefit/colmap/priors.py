@@ -18,7 +18,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import is_number, refuse_irregular_file
 from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -31,11 +31,7 @@ _LARGEST = 1e30
 
 
 def database_priors(path: Path, model: PosedModel) -> PositionPriors:
-    """Read the pose priors of a database.
-
-    Args:
-        path: the database; it is not changed.
-        model: the posed images, matched by name.
+    """Read the pose priors of the model's images, matched by name, from a database, which is not changed.
 
     Raises:
         InputError: if the database has no prior of these images, mixes coordinate systems, or is damaged.
@@ -60,11 +56,8 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
     """Read a text table `name x y z [sigma | sigma_x sigma_y sigma_z]`, by commas or white space.
 
     A first line that names the columns is optional; where it calls the second one lat or latitude, rows
-    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments.
-
-    Args:
-        path: the table.
-        model: the posed images, matched by name; other names are passed over.
+    are latitude, longitude (degrees) and altitude (meters). Lines that begin with # are comments; names that
+    are not among the model's are passed over.
 
     Raises:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
@@ -83,7 +76,7 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
             continue
         cells = next(csv.reader([line])) if "," in line else line.split()
         cells = [cell.strip() for cell in cells]
-        if first and len(cells) > 1 and not _is_number(cells[1]):
+        if first and len(cells) > 1 and not is_number(cells[1]):
             system = _WGS84 if cells[1].lower() in _GEODETIC_NAMES else _CARTESIAN
         else:
             position, covariance = _parse(path, number, cells)
@@ -100,27 +93,15 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
 
 def _prior_rows(path: Path) -> list[tuple[str, object, object, object]]:
     """Return name, position, covariance and coordinate system of all priors, of any schema version."""
-    newer = (
-        "SELECT images.name, position, position_covariance, coordinate_system FROM pose_priors "
-        f"JOIN images ON images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
-    )
-    older = (
-        "SELECT images.name, position, position_covariance, coordinate_system FROM pose_priors "
-        "JOIN images ON images.image_id = pose_priors.image_id"
-    )
-    oldest = (
-        "SELECT images.name, position, NULL, coordinate_system FROM pose_priors "
-        "JOIN images ON images.image_id = pose_priors.image_id"
-    )
-    return readonly_rows(
-        path,
-        "pose_priors",
-        {
-            ("corr_data_id", "corr_sensor_type", "position_covariance"): newer,
-            ("image_id", "position_covariance"): older,
-            ("image_id", "position"): oldest,
-        },
-    )
+    selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
+    covariance, by_image = "position_covariance", "images.image_id = pose_priors.image_id"
+    by_data = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
+    queries = {
+        ("corr_data_id", "corr_sensor_type", covariance): selected.format(covariance, by_data),
+        ("image_id", covariance): selected.format(covariance, by_image),
+        ("image_id", "position"): selected.format("NULL", by_image),
+    }
+    return readonly_rows(path, "pose_priors", queries)
 
 
 def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
@@ -132,17 +113,9 @@ def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
     return np.frombuffer(blob, dtype="<f8").astype(np.float64)
 
 
-def _is_number(cell: str) -> bool:
-    try:
-        float(cell)
-    except ValueError:
-        return False
-    return True
-
-
 def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, FloatArray]:
     """Return position and covariance of a line of a table."""
-    if len(cells) not in _TABLE_COLUMNS or not all(map(_is_number, cells[1:])):
+    if len(cells) not in _TABLE_COLUMNS or not all(map(is_number, cells[1:])):
         raise InputError(
             f"{path}, line {number}: expected a name, three coordinates and at most one standard deviation "
             "or three"
@@ -153,17 +126,17 @@ def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, Float
             f"{path}, line {number}: coordinates must be finite and standard deviations positive, "
             f"all below {_LARGEST:g}"
         )
-    variances = np.broadcast_to(values[3:] ** 2 if len(values) > 3 else np.nan, 3)
-    return values[:3], np.diag(variances) if len(values) > 3 else np.full((3, 3), np.nan)
+    if len(values) == 3:
+        return values, np.full((3, 3), np.nan)
+    return values[:3], np.diag(np.broadcast_to(values[3:] ** 2, 3))
 
 
 def _priors(
     found: dict[int, tuple[FloatArray, FloatArray, int]], source: str, *, geodetic: bool
 ) -> PositionPriors:
     """Return priors in Cartesian axes."""
-    cameras = np.array(sorted(found), dtype=np.int64)
-    positions = np.array([found[k][0] for k in cameras.tolist()])
-    covariances = np.array([found[k][1] for k in cameras.tolist()])
+    cameras = sorted(found)
+    positions, covariances = (np.array([found[k][part] for k in cameras]) for part in (0, 1))
     statement = source
     if geodetic:
         if (np.abs(positions[:, 0]) > 90.0).any() or (np.abs(positions[:, 1]) > 360.0).any():
@@ -174,4 +147,9 @@ def _priors(
         statement += (
             f", in metres east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
-    return PositionPriors(cameras=cameras, positions=positions, covariances=covariances, statement=statement)
+    return PositionPriors(
+        cameras=np.array(cameras, dtype=np.int64),
+        positions=positions,
+        covariances=covariances,
+        statement=statement,
+    )

@@ -19,6 +19,7 @@ lengths are known, that is the mark of a false pair. Pairs within 5 degrees of t
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -26,7 +27,7 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.quiet import quiet_stderr
 from sfm_shapefit.directions.matches import MatchBatch
@@ -94,7 +95,8 @@ def relative_rotations(
         with ThreadPoolExecutor(threads) as pool, quiet_stderr():
             rows, before = [], 0
             for batch in database.iter_matches(min_matches):
-                estimate = _Estimate(model, _pixels(database, batch), batch)
+                pixels = {image: database.keypoints(image) for image in np.unique(batch.pairs).tolist()}
+                estimate = partial(_estimate, model, pixels, batch)
                 for k, row in enumerate(pool.map(estimate, range(len(batch.pairs)))):
                     if advance is not None:
                         advance(before + k + 1, database.num_pairs)
@@ -109,47 +111,27 @@ def relative_rotations(
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Estimate:
-    """Estimates the relative rotation of one pair of a batch at a time."""
-
-    model: PosedModel
-    pixels: dict[int, FloatArray]
-    batch: MatchBatch
-
-    def __call__(self, k: int) -> tuple[tuple[int, int], FloatArray, int, bool] | None:
-        """Return pair, rotation, number of matches and soundness; None if the pair has no rotation."""
-        i, j = self.batch.pairs[k].tolist()
-        matches = self.batch.keypoints[self.batch.offsets[k] : self.batch.offsets[k + 1]]
-        cameras = [_camera_of(self.model, image) for image in (i, j)]
-        options = pycolmap.TwoViewGeometryOptions()
-        options.compute_relative_pose = True
-        options.ransac.random_seed = 0
-        geometry = pycolmap.estimate_calibrated_two_view_geometry(
-            cameras[0],
-            self.pixels[i][matches[:, 0]],
-            cameras[1],
-            self.pixels[j][matches[:, 1]],
-            np.repeat(np.arange(len(matches), dtype=np.uint32)[:, None], 2, axis=1),
-            options,
-        )
-        is_guess = not all(camera.has_prior_focal_length for camera in cameras)
-        sound = geometry.config in _SOUND_CONFIGS or (geometry.config == _CONFIG.UNCALIBRATED and is_guess)
-        pose = geometry.cam2_from_cam1
-        if pose is None or not (sound or geometry.config == _CONFIG.UNCALIBRATED):
-            return None
-        rotation = pose.rotation.matrix()
-        if not np.isfinite(rotation).all():
-            return None
-        return (i, j), rotation, len(geometry.inlier_matches), sound
-
-
-def _pixels(database: MatchDatabase, batch: MatchBatch) -> dict[int, FloatArray]:
-    """Return the keypoints of the images of a batch."""
-    return {image: database.keypoints(image) for image in np.unique(batch.pairs).tolist()}
-
-
-def _camera_of(model: PosedModel, image: int) -> pycolmap.Camera:
-    """Return the camera of an image by its index."""
-    reconstruction = model.reconstruction
-    return reconstruction.camera(reconstruction.image(int(model.image_ids[image])).camera_id)
+def _estimate(
+    model: PosedModel, pixels: dict[int, FloatArray], batch: MatchBatch, k: int
+) -> tuple[tuple[int, int], FloatArray, int, bool] | None:
+    """Return pair k, its rotation, number of matches and soundness; None if the pair has no rotation."""
+    i, j = batch.pairs[k].tolist()
+    matches = batch.keypoints[batch.offsets[k] : batch.offsets[k + 1]]
+    first, second = model.camera(i), model.camera(j)
+    options = pycolmap.TwoViewGeometryOptions()
+    options.compute_relative_pose = True
+    options.ransac.random_seed = 0
+    each_with_itself = np.repeat(np.arange(len(matches), dtype=np.uint32)[:, None], 2, axis=1)
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(
+        first, pixels[i][matches[:, 0]], second, pixels[j][matches[:, 1]], each_with_itself, options
+    )
+    is_uncalibrated = geometry.config == _CONFIG.UNCALIBRATED
+    is_guess = not (first.has_prior_focal_length and second.has_prior_focal_length)
+    sound = geometry.config in _SOUND_CONFIGS or (is_uncalibrated and is_guess)
+    pose = geometry.cam2_from_cam1
+    if pose is None or not (sound or is_uncalibrated):
+        return None
+    rotation = pose.rotation.matrix()
+    if not np.isfinite(rotation).all():
+        return None
+    return (i, j), rotation, len(geometry.inlier_matches), sound

@@ -2,9 +2,9 @@
 
     minimize  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
 
-from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs beyond
-`max_error_deg` of the result are left out and what stays connected is averaged once more, as pycolmap's
-global mapper does; cameras outside that component have no rotation.
+from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs more than 10
+degrees off the result are left out and what stays connected is averaged once more, as pycolmap's global
+mapper does; cameras outside that component have no rotation.
 
 Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in GLOMAP.
 """
@@ -14,6 +14,7 @@ import numpy.typing as npt
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.colmap.quiet import quiet_output
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.rotations.averaged import Loss
@@ -22,7 +23,7 @@ _LOSSES = {
     "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,
     "half-norm": pycolmap.RotationWeightType.HALF_NORM,
 }
-# This is pycolmap's own default.
+# Pairs that are farther off after the first averaging are left out of the second; this is pycolmap's default.
 _MAX_ERROR_DEG = 10.0
 _CAMERA_ID = 1
 
@@ -35,8 +36,6 @@ def average_rotations(
     *,
     loss: Loss = "geman-mcclure",
     count_matches: bool = True,
-    max_error_deg: float = _MAX_ERROR_DEG,
-    seed: int = 0,
 ) -> tuple[FloatArray, BoolArray]:
     """Return a rotation for each image that the pairs tie to the largest consistent component.
 
@@ -49,8 +48,6 @@ def average_rotations(
         loss: of the residual angles; "half-norm" (their square root) is finer, but fails more often.
         count_matches: False leaves the weights to the spanning tree alone: a few false pairs of many matches
             then do less harm.
-        max_error_deg: pairs that are farther off after the first averaging are left out of the second.
-        seed: of pycolmap's random draws.
 
     Returns:
         Rotations (n, 3, 3) cam_from_world, the identity where there is none, and (n,) who has one.
@@ -67,8 +64,8 @@ def average_rotations(
     graph = _pose_graph(pairs, rotations, np.maximum(np.rint(counts), 1.0).astype(np.int64))
     model = _unposed_model(num_images)
     options = pycolmap.RotationEstimatorOptions()
-    options.random_seed = seed
-    options.max_rotation_error_deg = max_error_deg
+    options.random_seed = 0
+    options.max_rotation_error_deg = _MAX_ERROR_DEG
     options.weight_type = _LOSSES[loss]
     if weights is not None and count_matches:
         options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
@@ -79,17 +76,7 @@ def average_rotations(
                 raise UnsolvableError(
                     "pycolmap's rotation averaging failed; check the relative rotations, or give rotations"
                 )
-    return _rotations_of(model)
-
-
-def _rotations_of(model: pycolmap.Reconstruction) -> tuple[FloatArray, BoolArray]:
-    """Return the rotations (n, 3, 3), the identity where there is none, and (n,) who has one."""
-    n = len(model.images)
-    found, registered = np.tile(np.eye(3), (n, 1, 1)), np.zeros(n, dtype=np.bool_)
-    for image_id in model.reg_image_ids():
-        found[image_id - 1] = model.image(image_id).cam_from_world().rotation.matrix()
-        registered[image_id - 1] = True
-    return found, registered
+    return rotations_of(model, list(range(1, num_images + 1)))
 
 
 def _pose_graph(pairs: IntArray, rotations: FloatArray, counts: IntArray) -> pycolmap.PoseGraph:

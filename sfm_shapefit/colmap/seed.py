@@ -5,7 +5,7 @@ the very same quaternion, so that rotations and intrinsics come out bit-identica
 their rigs are not touched: all images of a frame move with it.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +16,8 @@ from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, PosedModel
 from sfm_shapefit.errors import InputError
 
-Keypoints = Mapping[int, FloatArray] | Callable[[int], FloatArray]
-"""Pixels (k, 2) of the keypoints of an image, by its index into `PosedModel.image_ids`."""
+Keypoints = Callable[[int], FloatArray | None]
+"""Returns the pixels (k, 2) of the keypoints of an image, by its index into `PosedModel.image_ids`."""
 
 
 def build_seed(
@@ -37,7 +37,7 @@ def build_seed(
             unless another image of their frame is placed.
         centers: (n, 3) camera centers in world axes; rows of images that are not placed are ignored.
         keypoints: what becomes the images' points2D, for matches of a database to refer to. Images for which
-            it has none (a missing key, or no rows), and all images if None, keep those of the model.
+            it has none (None, or no rows), and all images if None, keep those of the model.
         fixed: (n,) images whose frame keeps its pose to the last bit; none if None.
 
     Raises:
@@ -65,7 +65,7 @@ def build_seed(
             translation = -(turn @ (centers[index] - model.frame_offsets[index]))
             frame.rig_from_world = pycolmap.Rigid3d(rotation, translation)
             settled.add(image.frame_id)
-        xy = _keypoints_of(keypoints, index)
+        xy = None if keypoints is None else keypoints(index)
         if xy is not None and len(xy):
             image.points2D.clear()  # the setter insists on it
             image.points2D = pycolmap.Image(keypoints=np.ascontiguousarray(xy, dtype=np.float64)).points2D
@@ -111,10 +111,3 @@ def write_model(reconstruction: pycolmap.Reconstruction, folder: Path, *, text: 
         raise InputError(
             f"the model in {folder} could not be written completely; check the free space"
         ) from error
-
-
-def _keypoints_of(keypoints: Keypoints | None, index: int) -> FloatArray | None:
-    """Return the keypoints of one image, or None if there are none for it."""
-    if keypoints is None:
-        return None
-    return keypoints(index) if callable(keypoints) else keypoints.get(index)

@@ -23,12 +23,13 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy
+from sfm_shapefit.colmap.model import UInt64Array, observed_points, points2d_xy, sort_observations
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
@@ -77,7 +78,10 @@ def correspondence_graph(
                 raise InputError(
                     f"the pair {names} has matches of keypoints that do not exist; match the images again"
                 )
-            graph.add_two_view_geometry(i, j, _two_view_geometry(matches))
+            geometry = pycolmap.TwoViewGeometry()
+            geometry.config = _CALIBRATED
+            geometry.inlier_matches = matches.astype(np.uint32)
+            graph.add_two_view_geometry(i, j, geometry)
     graph.finalize()
     return graph
 
@@ -109,12 +113,12 @@ def triangulate(
         ValueError: if a track of the other model observes a point2D that `seed` does not have.
         WorkerError: if a worker died and the executor does not replace it.
     """
-    options = options or StructureOptions()
+    options, advance = options or StructureOptions(), advance or (lambda _done, _total: None)
     structure = seed if in_place else copy_without_points(seed)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
-        _triangulate_matches(structure, tracks, options, advance or _unheard)
+        _triangulate_matches(structure, tracks, options, advance)
     else:
-        _triangulate_tracks(structure, tracks, options, advance or _unheard, executor)
+        _triangulate_tracks(structure, tracks, options, advance, executor)
     _filter(structure, options)
     return structure
 
@@ -160,23 +164,11 @@ def color_points(
 # --- triangulation ---------------------------------------------------------------------------------
 
 
-def _two_view_geometry(matches: IntArray) -> pycolmap.TwoViewGeometry:
-    """Return a geometry that carries nothing but inlier matches (k, 2)."""
-    geometry = pycolmap.TwoViewGeometry()
-    geometry.config = _CALIBRATED
-    geometry.inlier_matches = matches.astype(np.uint32)
-    return geometry
-
-
 def _filter(structure: pycolmap.Reconstruction, options: StructureOptions) -> None:
     """Do to our own `structure` what `filter_points` does to a copy; update the errors of points."""
     manager = pycolmap.ObservationManager(structure)
     manager.filter_all_points3D(options.max_reprojection_error_px, options.min_triangulation_angle_deg)
     manager.filter_points3D_with_short_tracks(options.min_track_length)
-
-
-def _unheard(_done: int, _total: int) -> None:
-    """Report to nobody."""
 
 
 def _triangulate_matches(
@@ -214,24 +206,24 @@ def _triangulate_tracks(
 ) -> None:
     """Add to our own `structure` the points of another model, each triangulated from its own track."""
     registered = sorted(structure.reg_image_ids())
-    observations = _Observations.of(structure, source, registered)
-    tracks = observations.tracks_of(options.min_track_length)
+    observations = _observe(structure, source, registered)
+    _, firsts, lengths = np.unique(observations.points, return_index=True, return_counts=True)
+    is_long = lengths >= options.min_track_length
+    tracks = list(zip(firsts[is_long].tolist(), (firsts + lengths)[is_long].tolist(), strict=True))
     tasks = _track_tasks(structure, registered, observations, tracks, options)
     parts = map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
     done = 0
     for part in parts:
         for (first, _), found in zip(tracks[done : done + len(part)], part, strict=True):
-            if found is not None:
-                xyz, inliers = found
-                seen = np.flatnonzero(inliers) + first
-                at = zip(
-                    observations.images[seen].tolist(), observations.keypoints[seen].tolist(), strict=True
-                )
-                track = pycolmap.Track([pycolmap.TrackElement(registered[i], k) for i, k in at])
-                point_id = int(observations.points[first])
-                color = source.point3D(point_id).color
-                point = pycolmap.Point3D(xyz=xyz, color=color, track=track)
-                structure.add_point3D_with_id(point_id, point)
+            if found is None:
+                continue
+            xyz, inliers = found
+            seen = np.flatnonzero(inliers) + first
+            at = zip(observations.images[seen].tolist(), observations.keypoints[seen].tolist(), strict=True)
+            track = pycolmap.Track([pycolmap.TrackElement(registered[i], k) for i, k in at])
+            point_id = int(observations.points[first])
+            color = source.point3D(point_id).color
+            structure.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=xyz, color=color, track=track))
         done += len(part)
         advance(done, len(tracks))
 
@@ -278,8 +270,7 @@ def triangulate_task(task: TrackTask) -> list[tuple[FloatArray, BoolArray] | Non
     return found
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Observations:
+class _Observations(NamedTuple):
     """What the registered images of one model see of another's 3D points, sorted by point, then by image."""
 
     points: UInt64Array
@@ -291,34 +282,19 @@ class _Observations:
     xy: FloatArray
     """(O, 2) pixels of that point."""
 
-    @classmethod
-    def of(
-        cls, structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, image_ids: list[int]
-    ) -> "_Observations":
-        """Collect the observations of the `source`, and their pixels in the `structure`."""
-        points, keypoints, xy = [], [], []
-        for image_id in image_ids:
-            image = structure.image(image_id)
-            if image.num_points2D() != source.image(image_id).num_points2D():
-                raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
-            seen, ids = observed_points(source.image(image_id))
-            points.append(ids)
-            keypoints.append(seen)
-            xy.append(points2d_xy(image)[seen])
-        images = np.repeat(np.arange(len(image_ids)), [len(seen) for seen in keypoints])
-        order = np.argsort(np.concatenate(points), kind="stable")
-        return cls(
-            points=np.concatenate(points)[order],
-            images=images[order],
-            keypoints=np.concatenate(keypoints)[order],
-            xy=np.concatenate(xy)[order],
-        )
 
-    def tracks_of(self, min_length: int) -> list[tuple[int, int]]:
-        """Return where each track of at least `min_length` observations starts, and where it ends."""
-        _, firsts, lengths = np.unique(self.points, return_index=True, return_counts=True)
-        firsts, lengths = firsts[lengths >= min_length], lengths[lengths >= min_length]
-        return list(zip(firsts.tolist(), (firsts + lengths).tolist(), strict=True))
+def _observe(
+    structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, image_ids: list[int]
+) -> _Observations:
+    """Return the observations of the `source`, and their pixels in the `structure`."""
+    parts = []
+    for image_id in image_ids:
+        image = structure.image(image_id)
+        if image.num_points2D() != source.image(image_id).num_points2D():
+            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
+        keypoints, ids = observed_points(source.image(image_id))
+        parts.append((ids, keypoints, points2d_xy(image)[keypoints]))
+    return _Observations(*sort_observations(parts))
 
 
 # --- colors ---------------------------------------------------------------------------------------
@@ -330,20 +306,16 @@ def _common_observations(
     """Return the ids of the two points that each points2D observes, where it observes one in both models."""
     ours, theirs = [np.empty(0, dtype=np.uint64)], [np.empty(0, dtype=np.uint64)]
     for image_id in sorted(result.reg_image_ids()):
-        if not _has_same_keypoints(result, source, image_id):
+        if not source.exists_image(image_id):
             continue
-        our_keypoints, our_ids = observed_points(result.image(image_id))
-        their_keypoints, their_ids = observed_points(source.image(image_id))
+        our, their = result.image(image_id), source.image(image_id)
+        if not np.array_equal(points2d_xy(our), points2d_xy(their)):
+            continue
+        our_keypoints, our_ids = observed_points(our)
+        their_keypoints, their_ids = observed_points(their)
         _, left, right = np.intersect1d(
             our_keypoints, their_keypoints, assume_unique=True, return_indices=True
         )
         ours.append(our_ids[left])
         theirs.append(their_ids[right])
     return np.concatenate(ours), np.concatenate(theirs)
-
-
-def _has_same_keypoints(a: pycolmap.Reconstruction, b: pycolmap.Reconstruction, image_id: int) -> bool:
-    """Tell whether an image has the same points2D in both reconstructions."""
-    if not b.exists_image(image_id) or a.image(image_id).num_points2D() != b.image(image_id).num_points2D():
-        return False
-    return np.array_equal(points2d_xy(a.image(image_id)), points2d_xy(b.image(image_id)))

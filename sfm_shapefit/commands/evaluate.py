@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.evaluation import Evaluation, evaluate_poses
+from sfm_shapefit.evaluation import CameraPoses, Evaluation, evaluate_poses
 
 if TYPE_CHECKING:
     import pycolmap
@@ -30,14 +30,6 @@ def evaluate(
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
-    model = read_model(reconstruction)
-    truth = read_model(reference)
-    return evaluate_poses(
-        model.names,
-        model.rotations,
-        model.centers,
-        truth.names,
-        truth.rotations,
-        truth.centers,
-        thresholds=thresholds,
-    )
+    models = read_model(reconstruction), read_model(reference)
+    poses, truth = (CameraPoses(model.names, model.rotations, model.centers) for model in models)
+    return evaluate_poses(poses, truth, thresholds)

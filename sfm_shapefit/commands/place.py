@@ -10,18 +10,10 @@ from sfm_shapefit.colmap.other_programs import relative_poses_of
 from sfm_shapefit.colmap.rotation_averaging import average_rotations
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import (
-    EpipolarGeometries,
-    is_g2o,
-    is_onedsfm,
-    is_relative_poses,
-    read_g2o,
-    read_g2o_rotations,
-    read_graph,
-    read_onedsfm,
-    read_relative_poses,
-    read_rotations,
-)
+from sfm_shapefit.formats.g2o import is_g2o, read_g2o, read_g2o_rotations
+from sfm_shapefit.formats.glomap_text import is_relative_poses, read_relative_poses
+from sfm_shapefit.formats.graph_text import read_graph
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results import GraphResult

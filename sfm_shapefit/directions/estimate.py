@@ -6,19 +6,14 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.kernels import MEASURES, MIN_MATCHES, estimate_pairs
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.geometry import tangent_bases
 
 
 def estimate_directions(
-    pairs: IntArray,
-    offsets: IntArray,
-    rays_i: FloatArray,
-    rays_j: FloatArray,
-    pixel_angles: FloatArray,
-    options: DirectionOptions | None = None,
-    threads: int = 1,
+    matches: RayMatches, options: DirectionOptions | None = None, threads: int = 1
 ) -> PairDirections:
     """Return one direction per pair from its matches and the known rotations.
 
@@ -26,40 +21,35 @@ def estimate_directions(
     a bit of the answer.
 
     Args:
-        pairs: (k, 2) camera indices.
-        offsets: (k + 1,) rows of the matches of pair p are offsets[p] to offsets[p + 1].
-        rays_i, rays_j: (M, 3) unit rays of the matched points in world axes.
-        pixel_angles: (k,) angle of one pixel in radians, 1 / focal length in px.
+        matches: those of k pairs.
         options: what to believe; defaults if None.
         threads: number of threads to share the pairs among.
     """
     options = options or DirectionOptions()
-    k = len(pairs)
+    k = len(matches.pairs)
     directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
-    a, b = np.ascontiguousarray(rays_i), np.ascontiguousarray(rays_j)
+    rays = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
+    given = (matches.offsets, *rays, matches.pixel_angles)
     settings = (options.inlier_threshold_px, options.num_hypotheses)
 
     def run(rows: IntArray) -> None:
-        estimate_pairs(rows, offsets, a, b, pixel_angles, *settings, directions, measures, moments)
+        estimate_pairs(rows, *given, *settings, directions, measures, moments)
 
     shares = np.array_split(np.arange(k, dtype=np.int64), max(1, threads))
-    if len(shares) == 1:
-        run(shares[0])
-    else:
-        with ThreadPoolExecutor(len(shares)) as pool:
-            list(pool.map(run, shares))
-    return _judge(pairs, np.diff(offsets), directions, measures, moments, options)
+    with ThreadPoolExecutor(len(shares)) as pool:
+        list(pool.map(run, shares))
+    return _judge(matches, directions, measures, moments, options)
 
 
 def _judge(
-    pairs: IntArray,
-    num_matches: IntArray,
+    matches: RayMatches,
     directions: FloatArray,
     measures: FloatArray,
     moments: FloatArray,
     options: DirectionOptions,
 ) -> PairDirections:
     """Decide which estimates to believe, and give the others their reason."""
+    num_matches = np.diff(matches.offsets)
     inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
     covariance = _tangent_covariance(directions, moments)
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
@@ -72,12 +62,12 @@ def _judge(
         (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
         (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
     )
-    status = np.full(len(pairs), DirectionStatus.USABLE, dtype=object)
+    status = np.full(len(num_matches), DirectionStatus.USABLE, dtype=object)
     for fired, reason in reversed(rules):
         status[fired] = reason
     usable: BoolArray = np.array([value is DirectionStatus.USABLE for value in status], dtype=np.bool_)
     return PairDirections(
-        pairs=pairs,
+        pairs=matches.pairs,
         directions=np.where(usable[:, None], directions, np.nan),
         status=list(status),
         num_matches=np.asarray(num_matches, dtype=np.int64),

@@ -1,7 +1,7 @@
-"""The values that reading matches gives: batches of matches as rays, and stored relative poses.
+"""Matches of image pairs as rays, and stored relative poses.
 
-A match of images i and j is a pair of keypoints that see the same point. Seen with known rotations,
-all that matters of a keypoint is the unit ray of its pixel in world axes.
+A match of images i and j is a pair of keypoints that see the same point. With known rotations, all that
+matters of a keypoint is the unit ray of its pixel in world axes.
 """
 
 from dataclasses import dataclass
@@ -10,19 +10,27 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class MatchBatch:
-    """The matches of k image pairs, M matches in all, one pair after the other."""
+class RayMatches:
+    """The matches of k image pairs, M in all, one pair after the other, as rays in world axes."""
 
     pairs: IntArray
-    """(k, 2) images (i, j), i < j, as indices into `PosedModel.image_ids`."""
+    """(k, 2) images (i, j)."""
     offsets: IntArray
     """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
+    rays_i: FloatArray
+    """(M, 3) unit rays of image i."""
+    rays_j: FloatArray
+    """(M, 3) unit rays of image j."""
+    pixel_angles: FloatArray
+    """(k,) angle of one pixel in radians, 1 / the smaller focal length in px."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchBatch(RayMatches):
+    """Matches that know their keypoints; images i < j are indices into `PosedModel.image_ids`."""
+
     keypoints: IntArray
     """(M, 2) index of the keypoint in image i and in image j."""
-    rays_i: FloatArray
-    """(M, 3) unit ray of the keypoint of image i, world axes."""
-    rays_j: FloatArray
-    """(M, 3) unit ray of the keypoint of image j, world axes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -67,7 +67,6 @@ class Tracks:
 def build_tracks(
     batches: Iterable[MatchBatch],
     directions: PairDirections,
-    pixel_angles: FloatArray,
     threshold_px: float,
     max_matches: int = _MAX_MATCHES,
 ) -> Tracks:
@@ -78,7 +77,6 @@ def build_tracks(
     Args:
         batches: the matches of all pairs.
         directions: what was measured of the same pairs.
-        pixel_angles: (n,) angle of one pixel of each camera in radians.
         threshold_px: largest Sampson error of a match that is kept.
         max_matches: held in memory; beyond, a share of the keypoints is drawn.
     """
@@ -94,7 +92,7 @@ def build_tracks(
         kept = np.repeat(row >= 0, counts) & _draw_matches(batch, counts, share)
         pair = np.repeat(np.arange(len(row)), counts)[kept]
         d = directions.directions[row[pair]]
-        angle = pixel_angles[batch.pairs[pair]].max(axis=1)
+        angle = batch.pixel_angles[pair]
         agrees = _sampson_px(batch.rays_i[kept], batch.rays_j[kept], d, angle) <= threshold_px
         chosen = np.flatnonzero(kept)[agrees]
         keys.append(batch.pairs[pair[agrees]] * _KEYPOINTS + batch.keypoints[chosen])

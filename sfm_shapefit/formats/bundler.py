@@ -25,8 +25,8 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.json_node import is_rotation
-from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.formats.lines import is_number, text_of
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
 from sfm_shapefit.geometry import FLIP_YZ
 
 _HEADER = "# Bundle file v0.3"
@@ -51,40 +51,32 @@ def read_bundler(file: Path) -> PosedModelFile:
     Raises:
         InputError: if the file is malformed, naming the line.
     """
-    words = _Words.of(file)
+    words = _Words(file)
     num_cameras, num_points = words.integer(), words.integer()
     if num_cameras < 0 or num_points < 0:
         raise words.error("the numbers of cameras and points must not be negative")
     all_names = _names(file, num_cameras)
     index_of: dict[int, int] = {}
-    cameras: list[FloatArray] = []
+    cameras: list[list[float]] = []
     rotations, centers = [], []
     for camera in range(num_cameras):
         values = words.numbers(_NUMBERS_PER_CAMERA)
-        focal = values[0]
-        if focal <= 0.0:
+        if values[0] <= 0.0:
             continue
         rotation = values[3:12].reshape(3, 3)
         if not is_rotation(rotation):
             raise words.error(f"camera {camera} has no rotation")
         index_of[camera] = len(cameras)
-        cameras.append(values[:3])
+        cameras.append(values[:3].tolist())
         rotations.append(FLIP_YZ @ rotation)
         centers.append(-rotation.T @ values[12:15])
     points, colors, observed, offsets = _points(words, num_points, num_cameras, index_of)
     n = len(cameras)
     sizes = _sizes(n, observed, offsets)
-    halves = sizes / 2.0
-    images = observed[:, 1]
     return PosedModelFile(
         cameras=tuple(
-            Intrinsics(
-                model="RADIAL",
-                width=int(size[0]),
-                height=int(size[1]),
-                params=(float(f), size[0] / 2.0, size[1] / 2.0, float(k1), float(k2)),
-            )
-            for (f, k1, k2), size in zip(cameras, sizes.tolist(), strict=True)
+            Intrinsics("RADIAL", int(width), int(height), (f, width / 2.0, height / 2.0, k1, k2))
+            for (f, k1, k2), (width, height) in zip(cameras, sizes.tolist(), strict=True)
         ),
         names=tuple(all_names[camera] for camera in index_of),
         camera_of=np.arange(n),
@@ -93,27 +85,24 @@ def read_bundler(file: Path) -> PosedModelFile:
         points=points,
         colors=colors,
         observed=observed,
-        pixels=halves[images] + offsets * [1.0, -1.0],
+        pixels=(sizes / 2.0)[observed[:, 1]] + offsets * [1.0, -1.0],
     )
 
 
 class _Words:
     """The words of a file, one after the other, with their lines."""
 
-    def __init__(self, file: Path, words: list[str], lines: list[int]) -> None:
-        self.file, self._words, self._lines, self._next = file, words, lines, 0
-
-    @classmethod
-    def of(cls, file: Path) -> "_Words":
+    def __init__(self, file: Path) -> None:
         first, _, rest = text_of(file).partition("\n")
         if first.strip() != _HEADER:
             raise InputError(f"{file}, line 1: expected {_HEADER!r}; other versions are not read")
-        words, lines = [], []
+        self.file, self._next = file, 0
+        self._words: list[str] = []
+        self._lines: list[int] = []
         for number, line in enumerate(rest.splitlines(), start=2):
-            own = line.split()
-            words += own
-            lines += [number] * len(own)
-        return cls(file, words, lines)
+            words = line.split()
+            self._words += words
+            self._lines += [number] * len(words)
 
     def numbers(self, count: int) -> FloatArray:
         """Return the next numbers, all finite."""
@@ -125,7 +114,9 @@ class _Words:
         except ValueError:
             values = np.full(count, np.nan)
         if not np.isfinite(values).all():
-            self._next += int(np.argmax([not _is_finite(word) for word in taken]))
+            self._next += next(
+                k for k, word in enumerate(taken) if not (is_number(word) and np.isfinite(float(word)))
+            )
             raise self.error(f"{self._words[self._next]!r} is no finite number")
         self._next += count
         return values
@@ -142,13 +133,6 @@ class _Words:
         """Return the error that names the line that was read last."""
         line = self._lines[min(self._next, len(self._lines) - 1)]
         return InputError(f"{self.file}, line {line}: {what}")
-
-
-def _is_finite(word: str) -> bool:
-    try:
-        return bool(np.isfinite(float(word)))
-    except ValueError:
-        return False
 
 
 def _points(
@@ -173,8 +157,7 @@ def _points(
     return (
         np.array(points).reshape(-1, 3),
         np.array(colors).reshape(-1, 3).astype(np.int64),
-        np.array(observed, dtype=np.int64).reshape(-1, 2),
-        np.array(offsets, dtype=np.float64).reshape(-1, 2),
+        *observation_arrays(observed, offsets),
     )
 
 

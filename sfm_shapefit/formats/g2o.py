@@ -21,7 +21,14 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import is_repeated, node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import (
+    TextTable,
+    first_words,
+    is_repeated,
+    node_indices,
+    read_lines,
+    rotations_by_name,
+)
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
 
@@ -31,20 +38,12 @@ _POSE_COLUMNS, _RELATIVE_POSE_COLUMNS = 9, 10
 _INFORMATION = 21
 _PASSED_OVER = ("VERTEX_", "PARAMS_", "FIX")
 _FORM = "EDGE_SE3:QUAT i j x y z qx qy qz qw"
-_UNIT_TOLERANCE = 1e-3
 
 
 def is_g2o(source: Path | str) -> bool:
     """Return whether a path is a text file whose first word is a tag of g2o."""
-    path = Path(source)
-    if not path.is_file():
-        return False
-    try:
-        with path.open(encoding="utf-8") as stream:
-            first = next((words[0] for line in stream if (words := line.split("#", 1)[0].split())), "")
-    except (OSError, UnicodeDecodeError):
-        return False
-    return first.startswith(("EDGE_", *_PASSED_OVER))
+    words = first_words(Path(source))
+    return bool(words) and words[0].startswith(("EDGE_", *_PASSED_OVER))
 
 
 def read_g2o(path: Path | str) -> EpipolarGeometries:
@@ -53,20 +52,20 @@ def read_g2o(path: Path | str) -> EpipolarGeometries:
     Raises:
         InputError: if the file is malformed or holds edges of another kind, naming the first bad line.
     """
-    file = Path(path)
-    numbers, rows = _select_tag(file, _RELATIVE_POSE)
-    rows = [row[:-_INFORMATION] if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION else row for row in rows]
-    values = number_table(file, numbers, rows, first=3, width=_RELATIVE_POSE_COLUMNS)
-    names, nodes = node_indices([word for row in rows for word in row[1:3]])
-    pairs = nodes.reshape(-1, 2)
-    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
+    table = _select_tag(Path(path), _RELATIVE_POSE)
+    for row in table.rows:
+        if len(row) == _RELATIVE_POSE_COLUMNS + _INFORMATION:
+            del row[-_INFORMATION:]
+    values = table.values(first=3, width=_RELATIVE_POSE_COLUMNS)
+    names, pairs = table.pairs(first=1)
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a vertex with itself")
     largest = np.abs(values[:, :3]).max(axis=1)
-    refuse(file, numbers, ~(largest > 0.0), "has no translation, so no direction")
-    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    table.refuse(~(largest > 0.0), "has no translation, so no direction")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     return EpipolarGeometries(
-        names=tuple(names),
+        names=names,
         pairs=pairs,
-        rotations=_rotations(file, numbers, values[:, 3:]).swapaxes(1, 2),
+        rotations=_rotations(table, values[:, 3:]),
         to_second=normalized(values[:, :3] / largest[:, None]),  # squares neither overflow nor vanish
     )
 
@@ -77,21 +76,15 @@ def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatA
     Raises:
         InputError: if the file is malformed, naming the first bad line, or has none of the cameras.
     """
-    file = Path(path)
-    numbers, rows = _select_tag(file, _POSE)
-    values = number_table(file, numbers, rows, first=2, width=_POSE_COLUMNS)
-    ids = [row[1] for row in rows]
-    refuse(file, numbers, is_repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
-    rotations = _rotations(file, numbers, values[:, 3:]).swapaxes(1, 2)
-    index = {name: k for k, name in enumerate(names)}
-    inside = [k for k, name in enumerate(ids) if name in index]
-    if not inside:
+    table = _select_tag(Path(path), _POSE)
+    values = table.values(first=2, width=_POSE_COLUMNS)
+    ids = [row[1] for row in table.rows]
+    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
+    found, known = rotations_by_name(names, ids, _rotations(table, values[:, 3:]))
+    if not known.any():
         raise InputError(
-            f"{file} has a pose of none of the {len(names)} vertices of the edges; check its ids"
+            f"{path} has a pose of none of the {len(names)} vertices of the edges; check its ids"
         )
-    found, known = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros(len(names), dtype=np.bool_)
-    where = [index[ids[k]] for k in inside]
-    found[where], known[where] = rotations[inside], True
     return found, known
 
 
@@ -118,29 +111,23 @@ def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray 
     lines = []
     for k, (name, row) in enumerate(zip(names, values.tolist(), strict=True)):
         if not numbered:
-            lines.append(f"# {k} {_one_line(name)}")
+            lines.append(f"# {k} {''.join(c if c.isprintable() else '?' for c in name)}")
         lines.append(" ".join([tag, name if numbered else str(k), *map(repr, row)]))
     return "\n".join(lines) + "\n"
 
 
-def _one_line(name: str) -> str:
-    return "".join(c if c.isprintable() else "?" for c in name)
-
-
-def _select_tag(file: Path, tag: str) -> tuple[list[int], list[list[str]]]:
-    """Return numbers and words of the lines of one tag; edges that are not understood are refused."""
-    numbers, rows = read_lines(file, _FORM)
-    known = {_POSE, _RELATIVE_POSE}
-    strange = [row[0] not in known and not row[0].startswith(_PASSED_OVER) for row in rows]
-    refuse(file, numbers, np.array(strange), f"is neither a vertex nor {_FORM}, which alone can be read")
-    chosen = [k for k, row in enumerate(rows) if row[0] == tag]
+def _select_tag(file: Path, tag: str) -> TextTable:
+    """Return the lines of one tag; edges that are not understood are refused."""
+    table = read_lines(file, _FORM)
+    strange = [row[0] != _RELATIVE_POSE and not row[0].startswith(_PASSED_OVER) for row in table.rows]
+    table.refuse(np.array(strange), f"is neither a vertex nor {_FORM}, which alone can be read")
+    chosen = [k for k, row in enumerate(table.rows) if row[0] == tag]
     if not chosen:
         raise InputError(f"{file} has no {tag}; give a pose graph in three dimensions")
-    return [numbers[k] for k in chosen], [rows[k] for k in chosen]
+    return TextTable(file, [table.numbers[k] for k in chosen], [table.rows[k] for k in chosen])
 
 
-def _rotations(file: Path, numbers: list[int], quaternions: FloatArray) -> FloatArray:
-    """Return the rotations (k, 3, 3) of quaternions x, y, z, w, which must be of length 1."""
-    lengths = np.linalg.norm(quaternions, axis=1)
-    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit quaternion qx qy qz qw")
-    return np.asarray(Rotation.from_quat(quaternions).as_matrix())
+def _rotations(table: TextTable, quaternions: FloatArray) -> FloatArray:
+    """Return the transposed rotations (k, 3, 3) of quaternions x, y, z, w, which must be of length 1."""
+    table.refuse_no_unit(quaternions, "has no unit quaternion qx qy qz qw")
+    return np.asarray(Rotation.from_quat(quaternions).as_matrix()).swapaxes(1, 2)

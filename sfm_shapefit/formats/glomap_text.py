@@ -14,31 +14,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import (
-    first_words,
-    is_repeated,
-    node_indices,
-    number_table,
-    read_lines,
-    refuse,
-)
+from sfm_shapefit.formats.lines import UNIT_TOLERANCE, first_numbers, is_repeated, read_lines
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
 
 _COLUMNS = 9
-_UNIT_TOLERANCE = 1e-3
 
 
 def is_relative_poses(source: Path | str) -> bool:
     """Return whether a path is a text file whose first line is one of GLOMAP's: 9 words, a quaternion."""
-    first = first_words(Path(source))
-    try:
-        values = np.array(first[2:], dtype=np.float64)
-    except ValueError:
+    values = first_numbers(Path(source), _COLUMNS)
+    if values is None:
         return False
-    if len(first) != _COLUMNS:
-        return False
-    is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= _UNIT_TOLERANCE
+    is_unit = abs(float(np.linalg.norm(values[:4])) - 1.0) <= UNIT_TOLERANCE
     return is_unit and bool(np.any(values[4:]))  # a direction in 7 dimensions would be of length 1 with these
 
 
@@ -48,22 +36,18 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
     Raises:
         InputError: if the file is malformed, naming the first bad line.
     """
-    file = Path(path)
-    numbers, rows = read_lines(file, "NAME1 NAME2 QW QX QY QZ TX TY TZ")
-    values = number_table(file, numbers, rows, first=2, width=_COLUMNS)
-    names, nodes = node_indices([word for row in rows for word in row[:2]])
-    pairs = nodes.reshape(-1, 2)
+    table = read_lines(Path(path), "NAME1 NAME2 QW QX QY QZ TX TY TZ")
+    values = table.values(first=2, width=_COLUMNS)
+    names, pairs = table.pairs()
     quaternions, translations = values[:, :4], values[:, 4:]
-    lengths = np.linalg.norm(quaternions, axis=1)
-    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins an image with itself")
-    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit quaternion QW QX QY QZ")
-    refuse(
-        file, numbers, ~(np.linalg.norm(translations, axis=1) > 0.0), "has no translation, so no direction"
-    )
-    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
+    lengths = np.linalg.norm(translations, axis=1)
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins an image with itself")
+    table.refuse_no_unit(quaternions, "has no unit quaternion QW QX QY QZ")
+    table.refuse(np.asarray(~(lengths > 0.0)), "has no translation, so no direction")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "gives a pair for the second time")
     rotations = Rotation.from_quat(np.roll(quaternions, -1, axis=1)).as_matrix()
     return EpipolarGeometries(
-        names=tuple(names),
+        names=names,
         pairs=pairs,
         rotations=rotations,
         to_second=normalized(-np.einsum("kji,kj->ki", rotations, translations)),

@@ -15,7 +15,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import node_indices, number_table, read_lines, refuse
+from sfm_shapefit.formats.lines import read_lines
 from sfm_shapefit.viewgraph import ViewGraph
 
 # Directions printed with 5 digits pass.
@@ -23,7 +23,6 @@ _UNIT_TOLERANCE = 1e-4
 _ROUNDED = 1e-7
 # Sums of squares of products of weights must not overflow.
 _LARGEST_WEIGHT = 1e30
-_FORM = "i j vx vy vz [weight]"
 # A row has at least two ids and a direction in the plane.
 _MIN_COLUMNS = 4
 
@@ -37,22 +36,22 @@ def read_graph(path: Path | str) -> ViewGraph:
         InputError: if the file cannot be read, naming the first malformed line by its number.
     """
     file = Path(path)
-    numbers, rows = read_lines(file, _FORM)
-    width = len(rows[0])
+    table = read_lines(file, "i j vx vy vz [weight]")
+    width = len(table.rows[0])
     if width < _MIN_COLUMNS:
-        raise InputError(f"{file}, line {numbers[0]}: expected i j and a direction, got {width} columns")
-    values = number_table(file, numbers, rows, first=2, width=width)
+        raise InputError(
+            f"{file}, line {table.numbers[0]}: expected i j and a direction, got {width} columns"
+        )
+    values = table.values(first=2, width=width)
     with np.errstate(over="ignore"):  # a length that overflows is no unit length
         directions, weights = _directions_and_weights(values)
         lengths = np.linalg.norm(directions, axis=1)
-    ids, nodes = node_indices([word for row in rows for word in row[:2]])
-    edges = nodes.reshape(-1, 2)
-
-    refuse(file, numbers, edges[:, 0] == edges[:, 1], "joins a node with itself")
-    refuse(file, numbers, ~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE), "has no unit direction")
-    refuse(file, numbers, ~(weights > 0.0), "has a weight that is not positive")
+    ids, edges = table.pairs()
+    table.refuse(edges[:, 0] == edges[:, 1], "joins a node with itself")
+    table.refuse(np.asarray(~(np.abs(lengths - 1.0) <= _UNIT_TOLERANCE)), "has no unit direction")
+    table.refuse(~(weights > 0.0), "has a weight that is not positive")
     extreme = (weights < 1.0 / _LARGEST_WEIGHT) | (weights > _LARGEST_WEIGHT)
-    refuse(file, numbers, extreme, f"has a weight beyond 1 / {_LARGEST_WEIGHT:g} to {_LARGEST_WEIGHT:g}")
+    table.refuse(extreme, f"has a weight beyond 1 / {_LARGEST_WEIGHT:g} to {_LARGEST_WEIGHT:g}")
     rounded = np.abs(lengths - 1.0) > _ROUNDED  # printed with few digits; ViewGraph sees to the rest
     directions = np.where(rounded[:, None], directions / lengths[:, None], directions)
     try:

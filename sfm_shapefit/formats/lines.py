@@ -2,6 +2,8 @@
 
 import re
 import stat
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,8 @@ from sfm_shapefit.errors import InputError
 
 # Longer numbers are words: Python refuses to convert very long ones.
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
+UNIT_TOLERANCE = 1e-3
+"""By how much the length of a quaternion or direction, or R R^T, may be off: a few printed digits pass."""
 
 
 def refuse_irregular_file(path: Path) -> None:
@@ -53,64 +57,92 @@ def first_words(file: Path) -> list[str]:
         return []
 
 
-def read_lines(file: Path, form: str) -> tuple[list[int], list[list[str]]]:
-    """Return the numbers and the words of the lines that are not empty; `#` begins a comment.
+def first_numbers(file: Path, width: int) -> FloatArray | None:
+    """Return what follows two names in the first line that is not empty; None unless it has `width` words."""
+    words = first_words(file)
+    try:
+        values = np.array(words[2:], dtype=np.float64)
+    except ValueError:
+        return None
+    return values if len(words) == width else None
 
-    Args:
-        file: a text file.
-        form: what its lines should look like, for the message.
+
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """The words of some lines of a file, and the numbers of these lines for messages."""
+
+    file: Path
+    numbers: list[int]
+    rows: list[list[str]]
+
+    def refuse(self, bad: BoolArray, reason: str) -> None:
+        """Raise InputError for the first line that is bad."""
+        if bad.any():
+            raise InputError(f"{self.file}, line {self.numbers[int(np.argmax(bad))]}: {reason}")
+
+    def values(self, first: int, width: int) -> FloatArray:
+        """Return the finite numbers of the columns from `first` on, shape (m, width - first).
+
+        Raises:
+            InputError: naming the first line with another number of columns, or a word that is no number.
+        """
+        for number, row in zip(self.numbers, self.rows, strict=True):
+            if len(row) != width:
+                raise InputError(f"{self.file}, line {number}: has {len(row)} columns, expected {width}")
+        try:
+            values = np.array([row[first:] for row in self.rows], dtype=np.float64)
+        except ValueError:
+            words = ((n, w) for n, row in zip(self.numbers, self.rows, strict=True) for w in row[first:])
+            number, word = next((n, w) for n, w in words if not is_number(w))
+            raise InputError(f"{self.file}, line {number}: {word!r} is not a number") from None
+        self.refuse(np.asarray(~np.isfinite(values).all(axis=1)), "has a number that is not finite")
+        return values
+
+    def pairs(self, first: int = 0) -> tuple[tuple[str, ...], IntArray]:
+        """Return the names in the two columns from `first` on, in order, and their indices (m, 2)."""
+        names, nodes = node_indices([word for row in self.rows for word in row[first : first + 2]])
+        return names, nodes.reshape(-1, 2)
+
+    def refuse_no_unit(self, vectors: FloatArray, reason: str) -> None:
+        """Raise InputError for the first line whose vector (m, d) is not of length 1."""
+        lengths = np.linalg.norm(vectors, axis=1)
+        self.refuse(np.asarray(~(np.abs(lengths - 1.0) <= UNIT_TOLERANCE)), reason)
+
+
+def read_lines(file: Path, form: str) -> TextTable:
+    """Return the lines of a text file that are not empty; `#` begins a comment.
 
     Raises:
-        InputError: if the file cannot be read or holds nothing.
+        InputError: if the file cannot be read or holds no line; `form` is what one should look like.
     """
     numbers, rows = [], []
     for number, line in enumerate(text_of(file).splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if words:
+        if words := line.split("#", 1)[0].split():
             numbers.append(number)
             rows.append(words)
     if not rows:
         raise InputError(f"{file} has no lines of the form {form}; give some")
-    return numbers, rows
+    return TextTable(file, numbers, rows)
 
 
-def number_table(
-    file: Path, numbers: list[int], rows: list[list[str]], *, first: int, width: int
-) -> FloatArray:
-    """Return the finite numbers of the columns from `first` on, shape (m, width - first).
-
-    Raises:
-        InputError: naming the first line that has another number of columns, or a word that is no number.
-    """
-    for number, row in zip(numbers, rows, strict=True):
-        if len(row) != width:
-            raise InputError(f"{file}, line {number}: has {len(row)} columns, expected {width}")
-    try:
-        values = np.array([row[first:] for row in rows], dtype=np.float64)
-    except ValueError:
-        number, word = next(
-            (n, w) for n, row in zip(numbers, rows, strict=True) for w in row[first:] if not _is_number(w)
-        )
-        raise InputError(f"{file}, line {number}: {word!r} is not a number") from None
-    refuse(file, numbers, np.asarray(~np.isfinite(values).all(axis=1)), "has a number that is not finite")
-    return values
-
-
-def node_indices(words: list[str]) -> tuple[list[str], IntArray]:
+def node_indices(words: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
     """Return the distinct ids in order, numbers by value, and the index of every word among them."""
-    distinct = set(words)
-    if all(_IS_INTEGER.fullmatch(word) for word in distinct):
-        ids = sorted(distinct, key=lambda word: (int(word), word))
-    else:
-        ids = sorted(distinct)
+    ids = sorted(set(words))
+    if all(_IS_INTEGER.fullmatch(word) for word in ids):
+        ids.sort(key=int)
     index = {word: k for k, word in enumerate(ids)}
-    return ids, np.fromiter((index[word] for word in words), dtype=np.int64, count=len(words))
+    return tuple(ids), np.fromiter((index[word] for word in words), dtype=np.int64, count=len(words))
 
 
-def refuse(file: Path, numbers: list[int], bad: BoolArray, reason: str) -> None:
-    """Raise InputError for the first line that is bad."""
-    if bad.any():
-        raise InputError(f"{file}, line {numbers[int(np.argmax(bad))]}: {reason}")
+def rotations_by_name(
+    names: Sequence[str], ids: Sequence[str], rotations: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return the rotations (n, 3, 3) of names, the identity where the ids have none, and (n,) who has one."""
+    row_of = {name: row for row, name in enumerate(ids)}
+    known = np.array([name in row_of for name in names], dtype=np.bool_)
+    found = np.tile(np.eye(3), (len(names), 1, 1))
+    found[known] = rotations[[row_of[name] for name in names if name in row_of]]
+    return found, known
 
 
 def is_repeated(rows: IntArray) -> BoolArray:
@@ -120,7 +152,8 @@ def is_repeated(rows: IntArray) -> BoolArray:
     return found
 
 
-def _is_number(word: str) -> bool:
+def is_number(word: str) -> bool:
+    """Return whether a word is a number for Python, finite or not."""
     try:
         float(word)
     except ValueError:

@@ -19,28 +19,19 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
 from sfm_shapefit.geometry import FLIP_YZ
 
-_RADIAL_KEYS = {
-    "SIMPLE_PINHOLE": "",
-    "PINHOLE": "",
-    "SIMPLE_RADIAL": "k1",
-    "RADIAL": "k1 k2",
-    "OPENCV": "k1 k2 p1 p2",
-    "FULL_OPENCV": "k1 k2 p1 p2 k3 k4 k5 k6",
-}
-_FISHEYE_KEYS = {
-    "SIMPLE_FISHEYE": "",
-    "FISHEYE": "",
-    "SIMPLE_RADIAL_FISHEYE": "k1",
-    "RADIAL_FISHEYE": "k1 k2",
-    "OPENCV_FISHEYE": "k1 k2 k3 k4",
-}
-_ONE_FOCAL = {
-    "SIMPLE_PINHOLE",
-    "SIMPLE_RADIAL",
-    "RADIAL",
-    "SIMPLE_FISHEYE",
-    "SIMPLE_RADIAL_FISHEYE",
-    "RADIAL_FISHEYE",
+# Of each camera model: nerfstudio's name, the number of focal lengths, and the keys of the distortion.
+_MODELS = {
+    "SIMPLE_PINHOLE": ("OPENCV", 1, ()),
+    "PINHOLE": ("OPENCV", 2, ()),
+    "SIMPLE_RADIAL": ("OPENCV", 1, ("k1",)),
+    "RADIAL": ("OPENCV", 1, ("k1", "k2")),
+    "OPENCV": ("OPENCV", 2, ("k1", "k2", "p1", "p2")),
+    "FULL_OPENCV": ("OPENCV", 2, ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
+    "SIMPLE_FISHEYE": ("OPENCV_FISHEYE", 1, ()),
+    "FISHEYE": ("OPENCV_FISHEYE", 2, ()),
+    "SIMPLE_RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1, ("k1",)),
+    "RADIAL_FISHEYE": ("OPENCV_FISHEYE", 1, ("k1", "k2")),
+    "OPENCV_FISHEYE": ("OPENCV_FISHEYE", 2, ("k1", "k2", "k3", "k4")),
 }
 # nerfstudio has no such terms of FULL_OPENCV.
 _DENOMINATOR = ("k4", "k5", "k6")
@@ -68,28 +59,25 @@ def nerf_text(scene: PosedModelFile) -> str:
 
 def _intrinsics(camera: Intrinsics) -> dict[str, Any]:
     """Return a camera's keys."""
-    is_fisheye = camera.model in _FISHEYE_KEYS
-    if not is_fisheye and camera.model not in _RADIAL_KEYS:
+    if camera.model not in _MODELS:
         raise InputError(
             f"the camera model {camera.model} has no equivalent in transforms.json; "
             "undistort the images first"
         )
-    keys = (_FISHEYE_KEYS if is_fisheye else _RADIAL_KEYS)[camera.model].split()
-    focal = camera.params[:1] * 2 if camera.model in _ONE_FOCAL else camera.params[:2]
-    rest = camera.params[1:] if camera.model in _ONE_FOCAL else camera.params[2:]
-    distortion = dict(zip(keys, rest[2:], strict=True))
-    if camera.model == "FULL_OPENCV":
-        denominator = [distortion.pop(key) for key in _DENOMINATOR]
-        if any(denominator):
-            raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
+    name, num_focals, keys = _MODELS[camera.model]
+    focals, (cx, cy, *coefficients) = camera.params[:num_focals], camera.params[num_focals:]
+    distortion = dict(zip(keys, coefficients, strict=True))
+    denominator = [distortion.pop(key) for key in _DENOMINATOR if key in distortion]
+    if any(denominator):
+        raise InputError("transforms.json has no k4, k5, k6 of FULL_OPENCV; undistort the images first")
     return {
-        "camera_model": "OPENCV_FISHEYE" if is_fisheye else "OPENCV",
-        "fl_x": focal[0],
-        "fl_y": focal[1],
-        "cx": rest[0],
-        "cy": rest[1],
+        "camera_model": name,
+        "fl_x": focals[0],
+        "fl_y": focals[-1],
+        "cx": cx,
+        "cy": cy,
         "w": camera.width,
         "h": camera.height,
         **distortion,
-        "camera_angle_x": float(2.0 * np.arctan(camera.width / (2.0 * focal[0]))),
+        "camera_angle_x": float(2.0 * np.arctan(camera.width / (2.0 * focals[0]))),
     }

@@ -25,21 +25,18 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import (
-    first_words,
+    UNIT_TOLERANCE,
+    first_numbers,
     is_repeated,
     node_indices,
-    number_table,
     read_lines,
-    refuse,
+    rotations_by_name,
 )
 from sfm_shapefit.geometry import FLIP_YZ, nearest_rotations, normalized, rotation_angles_deg
 from sfm_shapefit.viewgraph import ViewGraph
 
 _PAIRS_FILE, _COMPONENT_FILE = "EGs.txt", "cc.txt"
 _PAIR_COLUMNS, _ROTATION_COLUMNS = 14, 10
-# R R^T and |t| may be off by so much, for the published files have six digits.
-_ROTATION_TOLERANCE = 1e-3
-"""From Bundler's camera axes to COLMAP's, and back."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -92,12 +89,8 @@ def is_onedsfm(source: Path | str) -> bool:
     path = Path(source)
     if path.is_dir():
         return (path / _PAIRS_FILE).is_file()
-    first = first_words(path)
-    try:
-        values = np.array(first[2:], dtype=np.float64)
-    except ValueError:
-        return False
-    return len(first) == _PAIR_COLUMNS and not _is_no_rotation(values[None, :9].reshape(1, 3, 3))[0]
+    values = first_numbers(path, _PAIR_COLUMNS)
+    return values is not None and not _is_no_rotation(values[:9].reshape(1, 3, 3))[0]
 
 
 def read_onedsfm(source: Path | str) -> EpipolarGeometries:
@@ -109,19 +102,16 @@ def read_onedsfm(source: Path | str) -> EpipolarGeometries:
         InputError: if a file cannot be read, naming the first malformed line by its number.
     """
     path = Path(source)
-    file = path / _PAIRS_FILE if path.is_dir() else path
-    numbers, rows = read_lines(file, "i j R11 ... R33 t1 t2 t3")
-    values = number_table(file, numbers, rows, first=2, width=_PAIR_COLUMNS)
+    table = read_lines(path / _PAIRS_FILE if path.is_dir() else path, "i j R11 ... R33 t1 t2 t3")
+    values = table.values(first=2, width=_PAIR_COLUMNS)
     rotations, translations = values[:, :9].reshape(-1, 3, 3), values[:, 9:]
-    names, nodes = node_indices([word for row in rows for word in row[:2]])
-    pairs = nodes.reshape(-1, 2)
-    refuse(file, numbers, _is_no_rotation(rotations), "has no rotation matrix in columns 3 to 11")
-    lengths = np.linalg.norm(translations, axis=1)
-    refuse(file, numbers, np.abs(lengths - 1.0) > _ROTATION_TOLERANCE, "has no unit direction at its end")
-    refuse(file, numbers, pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
-    refuse(file, numbers, is_repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
+    names, pairs = table.pairs()
+    table.refuse(_is_no_rotation(rotations), "has no rotation matrix in columns 3 to 11")
+    table.refuse_no_unit(translations, "has no unit direction at its end")
+    table.refuse(pairs[:, 0] == pairs[:, 1], "joins a camera with itself")
+    table.refuse(is_repeated(np.sort(pairs, axis=1)), "repeats an earlier pair; keep one of them")
     found = EpipolarGeometries(
-        names=tuple(names),
+        names=names,
         pairs=pairs,
         rotations=FLIP_YZ @ nearest_rotations(rotations).swapaxes(1, 2) @ FLIP_YZ,
         to_second=normalized(translations) @ FLIP_YZ,
@@ -138,21 +128,14 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
     Raises:
         InputError: if the file cannot be read, naming the first malformed line, or has none of the cameras.
     """
-    file = Path(path)
-    numbers, rows = read_lines(file, "i R11 R12 ... R33")
-    rotations = number_table(file, numbers, rows, first=1, width=_ROTATION_COLUMNS).reshape(-1, 3, 3)
-    refuse(file, numbers, _is_no_rotation(rotations), "has no rotation matrix")
-    index = {name: k for k, name in enumerate(names)}
-    ids = [row[0] for row in rows]
-    _, as_node = node_indices(ids)
-    refuse(file, numbers, is_repeated(as_node[:, None]), "gives an earlier camera a second rotation")
-    inside = [k for k, name in enumerate(ids) if name in index]
-    if not inside:
-        raise InputError(f"{file} has a rotation of none of the {len(names)} cameras; check its ids")
-    found, known = np.tile(np.eye(3), (len(names), 1, 1)), np.zeros(len(names), dtype=np.bool_)
-    where = [index[ids[k]] for k in inside]
-    found[where] = FLIP_YZ @ nearest_rotations(rotations[inside])
-    known[where] = True
+    table = read_lines(Path(path), "i R11 R12 ... R33")
+    rotations = table.values(first=1, width=_ROTATION_COLUMNS).reshape(-1, 3, 3)
+    table.refuse(_is_no_rotation(rotations), "has no rotation matrix")
+    ids = [row[0] for row in table.rows]
+    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
+    found, known = rotations_by_name(names, ids, FLIP_YZ @ nearest_rotations(rotations))
+    if not known.any():
+        raise InputError(f"{path} has a rotation of none of the {len(names)} cameras; check its ids")
     return found, known
 
 
@@ -186,23 +169,21 @@ def _text(ids: list[str], values: FloatArray) -> str:
 
 def _restrict(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:
     """Return the cameras of a cc.txt and the pairs between them."""
-    numbers, rows = read_lines(component, "i")
-    refuse(component, numbers, np.array([len(row) != 1 for row in rows]), "is not one camera's id")
-    wanted = {row[0] for row in rows}
+    table = read_lines(component, "i")
+    table.refuse(np.array([len(row) != 1 for row in table.rows]), "is not one camera's id")
+    wanted = {row[0] for row in table.rows}
     inside = np.array([name in wanted for name in found.names])
     kept = inside[found.pairs].all(axis=1)
     if not kept.any():
         raise InputError(f"{component} keeps no pair of {_PAIRS_FILE}; remove it, or correct its ids")
-    left = found.subset(np.flatnonzero(kept).tolist())
-    renumbered = np.cumsum(inside) - 1
-    return replace(
-        left, names=tuple(name for name in found.names if name in wanted), pairs=renumbered[left.pairs]
-    )
+    left, renumbered = found.subset(np.flatnonzero(kept).tolist()), np.cumsum(inside) - 1
+    names = tuple(name for name in found.names if name in wanted)
+    return replace(left, names=names, pairs=renumbered[left.pairs])
 
 
 def _is_no_rotation(matrices: FloatArray) -> BoolArray:
     """Return which of (k, 3, 3) matrices are not orthonormal, or mirror."""
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(matrices @ matrices.swapaxes(1, 2) - np.eye(3)).max(axis=(1, 2))
-        bad: BoolArray = ~((off <= _ROTATION_TOLERANCE) & (np.linalg.det(matrices) > 0.0))
+        bad: BoolArray = ~((off <= UNIT_TOLERANCE) & (np.linalg.det(matrices) > 0.0))
     return bad

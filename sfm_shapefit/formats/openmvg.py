@@ -24,10 +24,11 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.formats.json_node import JsonNode
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
 
 # This is openMVG's UndefinedIndexT.
 _NO_POSE = 2**32 - 1
+_CAMERA_KEYS = ("width", "height", "focal_length", "principal_point")
 
 
 def is_openmvg(content: object) -> bool:
@@ -99,33 +100,22 @@ def _found(node: JsonNode, key: str) -> JsonNode | None:
 
 def _camera(node: JsonNode) -> Intrinsics:
     """Return a camera in COLMAP's terms."""
-    members = {}
-    for key in ("width", "height", "focal_length", "principal_point"):
-        member = _found(node, key)
-        if member is None:
-            raise node.error(f"has no key {key!r}")
-        members[key] = member
-    width, height = members["width"].integer(), members["height"].integer()
-    f, center = members["focal_length"].number(), members["principal_point"].numbers(2)
+    found = [_found(node, key) or node.get(key) for key in _CAMERA_KEYS]
+    width, height = found[0].integer(), found[1].integer()
+    f, center = found[2].number(), found[3].numbers(2)
     if f <= 0.0 or width < 1 or height < 1:
         raise node.error("has a focal length or a size that is not positive")
-    model, params = _model(node, f, center)
-    return Intrinsics(model=model, width=width, height=height, params=params)
-
-
-def _model(node: JsonNode, f: float, center: list[float]) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's name and parameters of the camera model."""
     if k1 := _found(node, "disto_k1"):
-        return "SIMPLE_RADIAL", (f, *center, *k1.numbers(1))
-    if k3 := _found(node, "disto_k3"):
-        a, b, c = k3.numbers(3)
-        return "FULL_OPENCV", (f, f, *center, a, b, 0.0, 0.0, c, 0.0, 0.0, 0.0)
-    if t2 := _found(node, "disto_t2"):
-        a, b, c, p1, p2 = t2.numbers(5)
-        return "FULL_OPENCV", (f, f, *center, a, b, p1, p2, c, 0.0, 0.0, 0.0)
+        return Intrinsics("SIMPLE_RADIAL", width, height, (f, *center, *k1.numbers(1)))
     if fisheye := _found(node, "fisheye"):
-        return "OPENCV_FISHEYE", (f, f, *center, *fisheye.numbers(4))
-    return "SIMPLE_PINHOLE", (f, *center)
+        return Intrinsics("OPENCV_FISHEYE", width, height, (f, f, *center, *fisheye.numbers(4)))
+    if k3 := _found(node, "disto_k3"):
+        (a, b, c), p1, p2 = k3.numbers(3), 0.0, 0.0
+    elif t2 := _found(node, "disto_t2"):
+        a, b, c, p1, p2 = t2.numbers(5)
+    else:
+        return Intrinsics("SIMPLE_PINHOLE", width, height, (f, *center))
+    return Intrinsics("FULL_OPENCV", width, height, (f, f, *center, a, b, p1, p2, c, 0.0, 0.0, 0.0))
 
 
 def _structure(root: JsonNode, index_of: dict[int, int]) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -139,8 +129,4 @@ def _structure(root: JsonNode, index_of: dict[int, int]) -> tuple[FloatArray, In
                 observed.append((len(points), index_of[view]))
                 pixels.append(seen.get("value").get("x").numbers(2))
         points.append(node.get("X").numbers(3))
-    return (
-        np.array(points, dtype=np.float64).reshape(-1, 3),
-        np.array(observed, dtype=np.int64).reshape(-1, 2),
-        np.array(pixels, dtype=np.float64).reshape(-1, 2),
-    )
+    return np.array(points, dtype=np.float64).reshape(-1, 3), *observation_arrays(observed, pixels)

@@ -24,7 +24,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.json_node import JsonNode
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
 
 _TRACKS_FILE = "tracks.csv"
 _MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
@@ -45,18 +45,16 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
     """
     reconstructions = JsonNode(file, "", content).elements()
     chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
-    camera_ids, cameras = [], []
-    for key, node in chosen.get("cameras").items():
-        camera_ids.append(key)
-        cameras.append(_camera(node))
+    cameras = {key: _camera(node) for key, node in chosen.get("cameras").items()}
+    order = {key: k for k, key in enumerate(cameras)}
     names, camera_of, rotations, centers = [], [], [], []
     for name, shot in chosen.get("shots").items():
         key = shot.get("camera").text()
-        if key not in camera_ids:
+        if key not in cameras:
             raise shot.error(f"has the camera {key!r}, which is not among the cameras")
         rotation = Rotation.from_rotvec(shot.get("rotation").numbers(3)).as_matrix()
         names.append(name)
-        camera_of.append(camera_ids.index(key))
+        camera_of.append(order[key])
         rotations.append(rotation)
         centers.append(-rotation.T @ np.array(shot.get("translation").numbers(3)))
     ids, points, colors = [], [], []
@@ -65,12 +63,10 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
         points.append(node.get("coordinates").numbers(3))
         colors.append(node.get("color").numbers(3) if node.has("color") else [0.0, 0.0, 0.0])
     observed, scaled = _observations(file, ids, names)
-    sizes = np.array([[cameras[k].width, cameras[k].height] for k in camera_of], dtype=np.float64).reshape(
-        -1, 2
-    )
-    of_image = sizes[observed[:, 1]]
+    sizes = np.array([camera[1:3] for camera in cameras.values()], dtype=np.float64).reshape(-1, 2)
+    of_image = sizes[np.array(camera_of, dtype=np.int64)[observed[:, 1]]]
     return PosedModelFile(
-        cameras=tuple(cameras),
+        cameras=tuple(cameras.values()),
         names=tuple(names),
         camera_of=np.array(camera_of, dtype=np.int64),
         rotations=np.array(rotations).reshape(-1, 3, 3),
@@ -113,7 +109,7 @@ def _camera(node: JsonNode) -> Intrinsics:
         model, params = "FULL_OPENCV", (fx, fy, *center, k1, k2, *extra)
     else:
         model, params = "OPENCV", (fx, fy, *center, k1, k2, 0.0, 0.0)
-    return Intrinsics(model=model, width=width, height=height, params=params)
+    return Intrinsics(model, width, height, params)
 
 
 def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:
@@ -135,7 +131,4 @@ def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntA
             if track in point_of and image in image_of:
                 observed.append((point_of[track], image_of[image]))
                 coordinates.append((x, y))
-    return (
-        np.array(observed, dtype=np.int64).reshape(-1, 2),
-        np.array(coordinates, dtype=np.float64).reshape(-1, 2),
-    )
+    return observation_arrays(observed, coordinates)

@@ -4,23 +4,22 @@ COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pix
 first one at (0.5, 0.5), camera models and the order of their parameters by COLMAP's names.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Intrinsics:
-    """A camera model with its parameters."""
+class Intrinsics(NamedTuple):
+    """A camera, by COLMAP's name of its model and in COLMAP's order of parameters."""
 
     model: str
-    """COLMAP's name of the camera model."""
     width: int
     height: int
     params: tuple[float, ...]
-    """In COLMAP's order."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -44,3 +43,13 @@ class PosedModelFile:
     """(o, 2) point and image of each observation."""
     pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(o, 2) where."""
+
+
+def observation_arrays(
+    observed: Sequence[tuple[int, int]], places: Sequence[Sequence[float]]
+) -> tuple[IntArray, FloatArray]:
+    """Return observations (o, 2), point and image, and their places (o, 2); there may be none."""
+    return (
+        np.array(observed, dtype=np.int64).reshape(-1, 2),
+        np.array(places, dtype=np.float64).reshape(-1, 2),
+    )

@@ -24,12 +24,11 @@ from sfm_shapefit.formats.posed_model import PosedModelFile
 
 def tum_text(model: PosedModelFile) -> str:
     """Return the posed images as a trajectory; numbers round-trip."""
-    lines = []
     quaternions = Rotation.from_matrix(model.rotations.swapaxes(1, 2)).as_quat(canonical=True)  # x, y, z, w
-    for stamp, k in sorted(zip(_timestamps(model.names), range(len(model.names)), strict=True), key=_by_time):
-        numbers = [*model.centers[k].tolist(), *quaternions[k].tolist()]
-        lines.append(" ".join([stamp, *(repr(number + 0.0) for number in numbers)]))
-    return "# timestamp tx ty tz qx qy qz qw\n" + "".join(f"{line}\n" for line in lines)
+    numbers = (np.concatenate([model.centers, quaternions], axis=1) + 0.0).tolist()
+    rows = sorted(zip(_timestamps(model.names), numbers, strict=True), key=lambda row: float(row[0]))
+    lines = [" ".join([stamp, *map(repr, row)]) for stamp, row in rows]
+    return "\n".join(["# timestamp tx ty tz qx qy qz qw", *lines, ""])
 
 
 def poses_csv(model: PosedModelFile) -> str:
@@ -42,10 +41,6 @@ def poses_csv(model: PosedModelFile) -> str:
     for name, row in zip(model.names, numbers.tolist(), strict=True):
         writer.writerow([name, *map(repr, row)])
     return stream.getvalue()
-
-
-def _by_time(item: tuple[str, int]) -> tuple[float, int]:
-    return float(item[0]), item[1]
 
 
 def _timestamps(names: tuple[str, ...]) -> list[str]:

@@ -18,7 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import tangent_bases
 from sfm_shapefit.jit import kernel, mix_bits
 
@@ -28,11 +29,7 @@ _SIGNS_PER_HASH = 32  # two of the 64 bits of a hash make one sample
 
 
 def sample_direction_errors(
-    pairs: IntArray,
-    offsets: IntArray,
-    keypoints: IntArray,
-    rays: tuple[FloatArray, FloatArray],
-    pixel_angles: FloatArray,
+    matches: MatchBatch,
     directions: FloatArray,
     covariances: FloatArray,
     noise_px: FloatArray,
@@ -43,11 +40,7 @@ def sample_direction_errors(
     The samples of one keypoint are the same in every call, so batches of pairs may be sampled one by one.
 
     Args:
-        pairs: (k, 2) image indices.
-        offsets: (k + 1,) rows of the matches of pair p are offsets[p] to offsets[p + 1].
-        keypoints: (M, 2) keypoint of each match in its two images.
-        rays: two (M, 3) unit rays of the matches in world axes.
-        pixel_angles: (k,) angle of one pixel in radians.
+        matches: those of k pairs.
         directions: (k, 3) unit directions; NaN for pairs without one.
         covariances: (k, 2, 2) in `tangent_bases(directions)`, rad^2.
         noise_px: (k,) standard deviation of the Sampson errors behind the covariances.
@@ -56,16 +49,16 @@ def sample_direction_errors(
     Returns:
         (k, NUM_SAMPLES, 2) tangential errors in radians; 0 for pairs without a direction.
     """
-    scores = np.zeros((len(pairs), NUM_SAMPLES, 3))
+    scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
     known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
     v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
     _add_scores(
-        pairs,
-        offsets,
-        np.ascontiguousarray(keypoints),
-        np.ascontiguousarray(rays[0]),
-        np.ascontiguousarray(rays[1]),
-        pixel_angles,
+        matches.pairs,
+        matches.offsets,
+        np.ascontiguousarray(matches.keypoints),
+        np.ascontiguousarray(matches.rays_i),
+        np.ascontiguousarray(matches.rays_j),
+        matches.pixel_angles,
         known,
         v,
         threshold_px,

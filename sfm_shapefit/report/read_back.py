@@ -12,7 +12,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.report.drawing import Drawing, build_drawing
 from sfm_shapefit.results.result import GraphResult, LocateResult

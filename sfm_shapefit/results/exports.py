@@ -3,7 +3,8 @@
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import EpipolarGeometries, g2o_text, onedsfm_files
+from sfm_shapefit.formats.g2o import g2o_text
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries, onedsfm_files
 from sfm_shapefit.results.result import GraphResult
 
 

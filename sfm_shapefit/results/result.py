@@ -12,7 +12,7 @@ from sfm_shapefit.colmap.adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
-from sfm_shapefit.formats import EpipolarGeometries
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement

@@ -31,10 +31,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH, mean_rotation_l1, median_spread
 from sfm_shapefit.rotations.joint_refinement import (
     NormalEquations,
-    RayMatches,
     State,
     TurnPrior,
     at_state,

@@ -33,6 +33,7 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
@@ -49,22 +50,6 @@ _DENSE_UNKNOWNS = 900
 _OF_I, _OF_J = [0, 1, 2, 6, 7, 8], [3, 4, 5, 6, 7, 8]
 # C_j enters C_i - C_j with a minus.
 _SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RayMatches:
-    """The matches of k camera pairs, one pair after the other, as rays placed by the given rotations."""
-
-    pairs: IntArray
-    """(k, 2) cameras (i, j)."""
-    offsets: IntArray
-    """(k + 1,) the matches of pair p are rows offsets[p] to offsets[p + 1]."""
-    rays_i: FloatArray
-    """(M, 3) unit rays of camera i, world axes."""
-    rays_j: FloatArray
-    """(M, 3) unit rays of camera j, world axes."""
-    pixel_angles: FloatArray
-    """(k,) angle of one pixel in radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

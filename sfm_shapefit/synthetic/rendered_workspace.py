@@ -120,6 +120,7 @@ def _join(batches: list[MatchBatch]) -> MatchBatch:
         keypoints=np.concatenate([np.empty((0, 2), dtype=np.int64), *(batch.keypoints for batch in batches)]),
         rays_i=np.concatenate([none, *(batch.rays_i for batch in batches)]),
         rays_j=np.concatenate([none, *(batch.rays_j for batch in batches)]),
+        pixel_angles=np.concatenate([np.empty(0), *(batch.pixel_angles for batch in batches)]),
     )
 
 

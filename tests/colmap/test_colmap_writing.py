@@ -94,7 +94,14 @@ def batch_of(pairs, num_points):
     keypoints = np.tile(np.stack([np.arange(num_points)] * 2, axis=1), (len(pairs), 1))
     no_rays = np.zeros((len(keypoints), 3))
     offsets = num_points * np.arange(len(pairs) + 1)
-    return MatchBatch(pairs=pairs, offsets=offsets, keypoints=keypoints, rays_i=no_rays, rays_j=no_rays)
+    return MatchBatch(
+        pairs=pairs,
+        offsets=offsets,
+        keypoints=keypoints,
+        rays_i=no_rays,
+        rays_j=no_rays,
+        pixel_angles=np.zeros(len(pairs)),
+    )
 
 
 def seeded(reconstruction, centers=None, placed=None):
@@ -185,13 +192,13 @@ def test_images_that_had_no_pose_stay_without_one(tmp_path):
     assert seed.num_reg_images() == NUM_IMAGES - 1
 
 
-@pytest.mark.parametrize("as_mapping", [True, False])
-def test_keypoints_of_the_database_replace_the_models_where_there_are_any(as_mapping):
+@pytest.mark.parametrize("missing", [None, np.zeros((0, 2))], ids=["none", "no rows"])
+def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missing):
     original, _ = ring_model()
     model = read_model(original)
     xy = np.arange(10.0).reshape(5, 2)
     table = {0: xy, 3: xy + 0.5}
-    keypoints = table if as_mapping else (lambda index: table.get(index, np.zeros((0, 2))))
+    keypoints = {index: table.get(index, missing) for index in range(NUM_IMAGES)}.get
     seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
     np.testing.assert_array_equal([p.xy for p in seed.image(5).points2D], xy)
     np.testing.assert_array_equal([p.xy for p in seed.image(35).points2D], xy + 0.5)
@@ -355,7 +362,7 @@ def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_it
 def test_tracks_of_a_model_with_other_keypoints_are_refused():
     original, _ = ring_model()
     model = read_model(original)
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, {0: np.ones((5, 2))})
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, {0: np.ones((5, 2))}.get)
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
 
@@ -396,7 +403,7 @@ def test_colours_come_only_from_images_with_the_same_keypoints():
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in model.image_ids.tolist()]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
         keypoints = {k: moved[k] for k in changed}
-        seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
+        seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints.get)
         graph = correspondence_graph(seed, model.image_ids, all_matches())
         structure = color_points(triangulate(seed, graph), original)
         assert structure.num_points3D() == 120
@@ -420,7 +427,7 @@ def with_one_more_point(xyz, image_ids, offset_px=0.0):
             xy = camera.img_from_cam(x)
         own = np.array([p.xy for p in original.image(image_id).points2D])
         extra[index] = np.vstack([own, xy + np.array([offset_px * (image_id == image_ids[0]), 0.0])])
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, extra)
+    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, extra.get)
     for point in original.points3D.values():
         seed.add_point3D(point.xyz, pycolmap.Track(point.track.elements))
     elements = [pycolmap.TrackElement(i, 120) for i in image_ids]

@@ -9,7 +9,9 @@ import pytest
 
 from sfm_shapefit.baselines import linf
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.formats import g2o_text, graph_text, is_onedsfm, read_graph, read_onedsfm, read_rotations
+from sfm_shapefit.formats.g2o import g2o_text
+from sfm_shapefit.formats.graph_text import graph_text, read_graph
+from sfm_shapefit.formats.onedsfm import is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions

@@ -7,6 +7,7 @@ import pytest
 
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.directions.relative_poses import from_relative_poses
@@ -39,15 +40,14 @@ def make_pair(seed, *, count=100, noise_px=0.0, wrong=0.0, baseline=(1.0, 0.2, -
 def estimate(pairs, options=None, threads=1) -> PairDirections:
     """Estimate a list of (rays_i, rays_j, ...) as one batch."""
     counts = [len(pair[0]) for pair in pairs]
-    return estimate_directions(
-        np.array([(k, k + 1) for k in range(len(pairs))]),
-        np.concatenate([[0], np.cumsum(counts)]),
-        np.concatenate([pair[0] for pair in pairs]),
-        np.concatenate([pair[1] for pair in pairs]),
-        np.full(len(pairs), 1.0 / FOCAL_PX),
-        options,
-        threads,
+    matches = RayMatches(
+        pairs=np.array([(k, k + 1) for k in range(len(pairs))]),
+        offsets=np.concatenate([[0], np.cumsum(counts)]),
+        rays_i=np.concatenate([pair[0] for pair in pairs]),
+        rays_j=np.concatenate([pair[1] for pair in pairs]),
+        pixel_angles=np.full(len(pairs), 1.0 / FOCAL_PX),
     )
+    return estimate_directions(matches, options, threads)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.tracks import Tracks, build_tracks, covering_set, join_points
-from sfm_shapefit.evaluation import evaluate_poses
+from sfm_shapefit.evaluation import CameraPoses, evaluate_poses
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
@@ -36,18 +36,13 @@ def scene(cameras=6, seed=0, noise=0.0, wrong=0.0):
         keypoints=np.stack([first, other.ravel()], axis=1),
         rays_i=rays[i, first],
         rays_j=rays[j, other.ravel()],
+        pixel_angles=np.full(len(pairs), PIXEL),
     )
     return centers, points, batch
 
 
-def measured(batch):
-    return estimate_directions(
-        batch.pairs, batch.offsets, batch.rays_i, batch.rays_j, np.full(len(batch.pairs), PIXEL)
-    )
-
-
-def tracks_of(batch, cameras=6, **options):
-    return build_tracks([batch], measured(batch), np.full(cameras, PIXEL), 2.0, **options)
+def tracks_of(batch, **options):
+    return build_tracks([batch], estimate_directions(batch), 2.0, **options)
 
 
 def reordered(batch, order):
@@ -59,6 +54,7 @@ def reordered(batch, order):
         keypoints=batch.keypoints[rows],
         rays_i=batch.rays_i[rows],
         rays_j=batch.rays_j[rows],
+        pixel_angles=batch.pixel_angles[order],
     )
 
 
@@ -79,7 +75,7 @@ def test_tracks_do_not_depend_on_the_order_of_pairs_or_on_batches():
     shuffled = reordered(batch, order)
     one, other = tracks_of(batch), tracks_of(shuffled)
     halves = [reordered(shuffled, half) for half in np.array_split(np.arange(len(order)), 2)]
-    split = build_tracks(halves, measured(batch), np.full(6, PIXEL), 2.0)
+    split = build_tracks(halves, estimate_directions(batch), 2.0)
     for again in (other, split):
         np.testing.assert_array_equal(again.offsets, one.offsets)
         np.testing.assert_array_equal(again.cameras, one.cameras)
@@ -126,7 +122,7 @@ def test_no_matches_give_no_tracks_and_an_unchanged_graph():
         offsets=np.zeros(1, dtype=np.int64), cameras=np.zeros(0, dtype=np.int64), rays=np.zeros((0, 3))
     )
     _, _, batch = scene()
-    assert build_tracks([], measured(batch), np.full(6, PIXEL), 2.0).num_tracks == 0
+    assert build_tracks([], estimate_directions(batch), 2.0).num_tracks == 0
     assert len(covering_set(tracks, 6)) == 0
 
 
@@ -163,12 +159,14 @@ def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
 
 def test_two_views_are_no_track():
     _, _, batch = scene(cameras=2)
-    assert tracks_of(batch, cameras=2).num_tracks == 0
+    assert tracks_of(batch).num_tracks == 0
 
 
 def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     centers, points, batch = scene()
-    directions = measured(batch)
+    directions = estimate_directions(batch)
+    from sfm_shapefit.viewgraph import ViewGraph
+
     graph = ViewGraph(6, batch.pairs, directions.directions, names=[f"{k}.jpg" for k in range(6)])
     joint = join_points(graph, directions.covariance, tracks_of(batch), np.full(6, PIXEL), noise_px=2.0)
     assert joint.num_points == NUM_POINTS
@@ -210,7 +208,9 @@ def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_can
         assert len(placement.cameras) == len(centers)
         names = [str(k) for k in range(len(centers))]
         rotations = np.tile(np.eye(3), (len(centers), 1, 1))
-        found = evaluate_poses(names, rotations, placement.locations, names, rotations, centers)
+        found = evaluate_poses(
+            CameraPoses(names, rotations, placement.locations), CameraPoses(names, rotations, centers)
+        )
         errors[name] = found.position.max / np.ptp(centers[:, 0])
     assert errors["points"] < 3e-3  # of the street's length
     assert errors["pairs"] > 10 * errors["points"]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import graph_text, read_graph
+from sfm_shapefit.formats.graph_text import graph_text, read_graph
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.program import run

@@ -23,9 +23,10 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import EpipolarGeometries, read_relative_poses, relative_poses_text
+from sfm_shapefit.formats.glomap_text import read_relative_poses, relative_poses_text
 from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
+from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
 from tests.program import run

@@ -6,16 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats import (
-    g2o_text,
-    is_g2o,
-    is_onedsfm,
-    onedsfm_files,
-    read_g2o,
-    read_g2o_rotations,
-    read_onedsfm,
-    read_rotations,
-)
+from sfm_shapefit.formats.g2o import g2o_text, is_g2o, read_g2o, read_g2o_rotations
+from sfm_shapefit.formats.onedsfm import is_onedsfm, onedsfm_files, read_onedsfm, read_rotations
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from tests.scenes import real_scene
 

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.correlated_errors import sample_direction_errors
 from sfm_shapefit.judgement.uncertainty import propagate
@@ -111,7 +112,6 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
     v = normalized(differences(scene.centers, scene.pairs))
     bases = tangent_bases(v)
     pixel = 1.0 / scene.options.focal_length_px
-    pixels = np.full(scene.num_pairs, pixel)
     first, second = rays_of(scene, 0.0, np.random.default_rng(0))
     pair_of = np.repeat(np.arange(scene.num_pairs), np.diff(scene.match_offsets))
 
@@ -124,17 +124,15 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
         return sums
 
     covariances = np.linalg.inv(bases.transpose(0, 2, 1) @ information(first, second) @ bases)  # of 1 px
-    sampled = sample_direction_errors(
-        scene.pairs,
-        scene.match_offsets,
-        scene.matches,
-        (first, second),
-        pixels,
-        v,
-        covariances,
-        pixels**0,
-        2.0,
+    matches = MatchBatch(
+        pairs=scene.pairs,
+        offsets=scene.match_offsets,
+        keypoints=scene.matches,
+        rays_i=first,
+        rays_j=second,
+        pixel_angles=np.full(scene.num_pairs, pixel),
     )
+    sampled = sample_direction_errors(matches, v, covariances, np.ones(scene.num_pairs), 2.0)
     sampled = sampled.transpose(1, 0, 2).reshape(len(sampled[0]), -1)
 
     real = []

@@ -7,7 +7,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
-from sfm_shapefit.formats import graph_text
+from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.judgement.conditioning import direction_spread
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.placement.diagnosis import diagnose, theory_of

@@ -8,6 +8,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus
 from sfm_shapefit.results import match_warnings
@@ -23,9 +24,14 @@ def statuses(**counts):
     """The outcome of so many pairs, each with the status of that name."""
     rays = np.tile([[0.0, 0.0, 1.0]], (sum(counts.values()), 1))
     pairs = np.column_stack([np.arange(len(rays)), np.arange(len(rays)) + 1])
-    none = estimate_directions(
-        pairs, np.arange(len(rays) + 1), rays, rays, np.full(len(rays), 1e-3), NO_DIRECTION
+    matches = RayMatches(
+        pairs=pairs,
+        offsets=np.arange(len(rays) + 1),
+        rays_i=rays,
+        rays_j=rays,
+        pixel_angles=np.full(len(rays), 1e-3),
     )
+    none = estimate_directions(matches, NO_DIRECTION)
     return replace(none, status=[DirectionStatus[name] for name in Counter(counts).elements()])
 
 

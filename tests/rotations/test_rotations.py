@@ -9,10 +9,11 @@ import sfm_shapefit
 from peers.colmap import average_rotations
 from sfm_shapefit import LocateOptions
 from sfm_shapefit.colmap.model import read_model, with_turned_cameras
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
 from sfm_shapefit.rotations import joint_refinement as epipolar
 from sfm_shapefit.rotations.acceptance import refine_rotations
-from sfm_shapefit.rotations.joint_refinement import RayMatches, State, at_state
+from sfm_shapefit.rotations.joint_refinement import State, at_state
 from tests.problems import all_pairs
 from tests.scenes import COURTYARD, RING, real_scene
 

@@ -19,11 +19,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal
 
-from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
 from sfm_shapefit.errors import InputError
@@ -49,21 +47,6 @@ class DirectionTask:
     cameras: PosedCameras
     """Of the whole model: the indices of pairs refer to them."""
     options: DirectionOptions
-
-
-def measure_batch(
-    batch: MatchBatch, focal_lengths_px: FloatArray, options: DirectionOptions, threads: int
-) -> PairDirections:
-    """Return the directions of a batch of pairs."""
-    return estimate_directions(
-        batch.pairs,
-        batch.offsets,
-        batch.rays_i,
-        batch.rays_j,
-        1.0 / focal_lengths_px[batch.pairs].min(axis=1),
-        options,
-        threads=threads,
-    )
 
 
 def measure_with_workers(
@@ -102,10 +85,8 @@ def measure_task(task: DirectionTask) -> list[PairDirections]:
     """Return the directions of a task's pairs, one value or none; what a worker runs."""
     model = from_posed_cameras(task.cameras)
     with open_database(task.database, model) as database:
-        found = [
-            measure_batch(batch, model.focal_lengths_px, task.options, threads=1)
-            for batch in database.iter_matches(1, part=task.part)
-        ]
+        batches = database.iter_matches(1, part=task.part)
+        found = [estimate_directions(batch, task.options) for batch in batches]
     return [concatenate(found)] if found else []
 
 

@@ -8,9 +8,10 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
-from sfm_shapefit.commands.stages.execution import measure_batch, measure_with_workers
+from sfm_shapefit.commands.stages.execution import measure_with_workers
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.memory import Workload
+from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.pair_directions import (
     CONTRADICTIONS,
     DirectionStatus,
@@ -56,9 +57,9 @@ def measure_directions(
     if executor is not None and source.database is not None:
         parts = measure_with_workers(source.database, model, options, executor, clock.advance)
     else:
-        wanted, threads = options, options.num_threads()
+        threads = options.num_threads()
         batches = source.counted(source.batches(), clock.advance)
-        parts = [measure_batch(batch, model.focal_lengths_px, wanted, threads) for batch in batches]
+        parts = [estimate_directions(batch, options, threads) for batch in batches]
     if not parts:
         raise UnsolvableError(
             "no two posed images share matches; match the images, or give the database that has their matches"
@@ -91,10 +92,9 @@ def build_graph(source: MatchSource, directions: PairDirections, options: Locate
     graph, covariance = view_graph(model, directions), directions.covariance[directions.usable()]
     if not (options.uses_points(model.num_images) and source.economy.points):
         return MeasuredGraph(graph, covariance=covariance)
-    pixel_angles = 1.0 / model.focal_lengths_px
-    tracks = build_tracks(source.batches(), directions, pixel_angles, options.inlier_threshold_px)
+    tracks = build_tracks(source.batches(), directions, options.inlier_threshold_px)
     chosen = tracks.subset(covering_set(tracks, model.num_images))
-    return join_points(graph, covariance, chosen, pixel_angles)
+    return join_points(graph, covariance, chosen, 1.0 / model.focal_lengths_px)
 
 
 def samples_errors(source: MatchSource, directions: PairDirections) -> bool:
@@ -126,11 +126,7 @@ def sample_errors(
     for batch in source.batches():
         rows = np.array([row_of[tuple(pair)] for pair in batch.pairs.tolist()], dtype=np.int64)
         errors[rows] = sample_direction_errors(
-            batch.pairs,
-            batch.offsets,
-            batch.keypoints,
-            (batch.rays_i, batch.rays_j),
-            1.0 / source.model.focal_lengths_px[batch.pairs].min(axis=1),
+            batch,
             directions.directions[rows],
             directions.covariance[rows],
             SIGMA_PER_MEDIAN * directions.median_residual_px[rows],

@@ -16,7 +16,7 @@ from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.formats import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement.place import Placement, place

@@ -11,11 +11,11 @@ from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource, open_source
 from sfm_shapefit.commands.stages.measure import build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.results import Inputs
 from sfm_shapefit.rotations.acceptance import refine_rotations
-from sfm_shapefit.rotations.joint_refinement import RayMatches
 
 _REFINEMENT_ROUNDS = 2
 # Residual of a direction beyond which no error of rotations is to blame.
@@ -78,9 +78,8 @@ def _rays_of_pairs(source: MatchSource, rows: IntArray, cameras: IntArray) -> Ra
             for start, count in zip(batch.offsets[chosen].tolist(), counts.tolist(), strict=True)
         ]
         kept = np.concatenate([np.zeros(0, dtype=np.int64), *picked])
-        pairs = batch.pairs[chosen]
-        angles = 1.0 / source.model.focal_lengths_px[pairs].min(axis=1)
-        parts.append((pairs, np.minimum(counts, limit), batch.rays_i[kept], batch.rays_j[kept], angles))
+        rays = batch.rays_i[kept], batch.rays_j[kept]
+        parts.append((batch.pairs[chosen], np.minimum(counts, limit), *rays, batch.pixel_angles[chosen]))
     pairs, counts, rays_i, rays_j, angles = (np.concatenate(column) for column in zip(*parts, strict=True))
     return RayMatches(
         pairs=np.searchsorted(cameras, pairs),

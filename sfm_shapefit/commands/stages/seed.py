@@ -134,4 +134,5 @@ def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterato
             keypoints=batch.keypoints[kept],
             rays_i=batch.rays_i[kept],
             rays_j=batch.rays_j[kept],
+            pixel_angles=batch.pixel_angles[~dropped],
         )
