@@ -1,24 +1,45 @@
-"""The rigs and frames of a synthetic scene in COLMAP's terms, for models and databases.
+"""The cameras, rigs, frames and images of a synthetic scene in COLMAP's terms, for models and databases.
 
-Sensor s of rig r is camera 3 r + s + 1, for COLMAP has every camera in one rig; frame f has id f + 1.
+Sensor s of rig r of S sensors is camera S r + s + 1, for COLMAP has every camera in one rig; rig r has id
+r + 1, frame f id f + 1, and image k id k + 1 and a name such as "0001.jpg".
 """
 
 import copy
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.synthetic import RigScene
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.synthetic.layouts import ByteArray
+from sfm_shapefit.synthetic.rigs import Rigs
 
 
-def camera_id_of(rigs: RigScene, index: int) -> int:
-    """Return the id of the camera of image `index`."""
-    rig = int(rigs.rig_of_frame[rigs.frame_of_image[index]])
-    return rig * int(rigs.sensor_centers.shape[1]) + int(rigs.sensor_of_image[index]) + 1
+class Points(NamedTuple):
+    """The points of a model."""
+
+    ids: IntArray
+    """(p,)"""
+    xyz: FloatArray
+    """(p, 3) world axes."""
+    colors: ByteArray
+    """(p, 3) red, green, blue."""
+    tracks: Sequence[IntArray]
+    """Per point (k, 2): (image, keypoint)."""
 
 
-def new_rigs(rigs: RigScene, camera: pycolmap.Camera) -> tuple[list[pycolmap.Camera], list[pycolmap.Rig]]:
+def image_name(index: int) -> str:
+    """Return the name of image `index` of a scene."""
+    return f"{index + 1:04d}.jpg"
+
+
+def rigid(rotation: FloatArray, translation: FloatArray) -> pycolmap.Rigid3d:
+    """Return the transform x -> rotation @ x + translation."""
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+
+
+def new_rigs(rigs: Rigs, camera: pycolmap.Camera) -> tuple[list[pycolmap.Camera], list[pycolmap.Rig]]:
     """Return the cameras, all alike, and the rigs with the poses of their sensors."""
     count, sensors = rigs.sensor_centers.shape[:2]
     cameras, made = [], []
@@ -32,43 +53,61 @@ def new_rigs(rigs: RigScene, camera: pycolmap.Camera) -> tuple[list[pycolmap.Cam
                 rig.add_ref_sensor(own.sensor_id)
             else:
                 rotation = rigs.sensor_rotations[r, s]
-                pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ rigs.sensor_centers[r, s])
-                rig.add_sensor(own.sensor_id, pose)
+                rig.add_sensor(own.sensor_id, rigid(rotation, -rotation @ rigs.sensor_centers[r, s]))
         made.append(rig)
     return cameras, made
 
 
-def new_frames(rigs: RigScene, images: list[pycolmap.Image]) -> list[pycolmap.Frame]:
-    """Return the frames of the images, without poses; each image is told its frame."""
+def new_images(
+    rigs: Rigs, keypoints: Sequence[FloatArray]
+) -> tuple[list[pycolmap.Image], list[pycolmap.Frame]]:
+    """Return the images with their keypoints (k, 2), and their frames, without poses."""
+    camera = rigs.rig_of_frame[rigs.frame_of_image] * rigs.sensor_centers.shape[1] + rigs.sensor_of_image + 1
     frames = [pycolmap.Frame(frame_id=f + 1, rig_id=int(rig) + 1) for f, rig in enumerate(rigs.rig_of_frame)]
-    for index, image in enumerate(images):
-        frames[rigs.frame_of_image[index]].add_data_id(image.data_id)
-        image.frame_id = int(rigs.frame_of_image[index]) + 1
-    return frames
+    images = [
+        pycolmap.Image(name=image_name(k), keypoints=xy, camera_id=int(camera[k]), image_id=k + 1)
+        for k, xy in enumerate(keypoints)
+    ]
+    for image, frame in zip(images, rigs.frame_of_image, strict=True):
+        frames[frame].add_data_id(image.data_id)
+    return images, frames
 
 
-def rig_model(
-    rigs: RigScene, camera: pycolmap.Camera, images: list[pycolmap.Image], centers: FloatArray
+def new_model(
+    rigs: Rigs,
+    camera: pycolmap.Camera,
+    rotations: FloatArray,
+    translations: FloatArray,
+    keypoints: Sequence[FloatArray],
+    points: Points | None,
 ) -> pycolmap.Reconstruction:
-    """Return a model with the true rotations and no points.
+    """Return a model; a frame has the pose of the reference sensor of its rig.
 
     Args:
-        rigs: the scene.
+        rigs: of n images.
         camera: whose intrinsics all have.
-        images: in the order of the scene, with their cameras' ids.
-        centers: (f, 3) centers of the frames.
+        rotations: (n, 3, 3) cam_from_world.
+        translations: (n, 3) cam_from_world.
+        keypoints: per image, (k, 2).
+        points: with their tracks; none if None.
     """
     model = pycolmap.Reconstruction()
     cameras, made = new_rigs(rigs, camera)
+    images, frames = new_images(rigs, keypoints)
     for own in cameras:
         model.add_camera(own)
     for rig in made:
         model.add_rig(rig)
-    first = np.flatnonzero(rigs.sensor_of_image == 0)
-    for f, frame in enumerate(new_frames(rigs, images)):
-        rotation = rigs.scene.rotations[first[f]]  # the reference sensor's axes are the rig's
-        frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centers[f])
+    for frame, k in zip(frames, np.flatnonzero(rigs.sensor_of_image == 0), strict=True):
+        frame.rig_from_world = rigid(rotations[k], translations[k])
         model.add_frame(frame)
-    for image in images:
+    for image, f in zip(images, rigs.frame_of_image, strict=True):
+        image.frame_id = int(f) + 1
         model.add_image(image)
+    if points is not None:
+        for point_id, xyz, color, seen in zip(*points, strict=True):
+            track = pycolmap.Track([pycolmap.TrackElement(k + 1, keypoint) for k, keypoint in seen.tolist()])
+            point = pycolmap.Point3D(xyz=xyz, color=color, track=track)
+            model.add_point3D_with_id(int(point_id), point)
+        model.update_point_3d_errors()
     return model
