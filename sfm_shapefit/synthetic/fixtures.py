@@ -44,6 +44,7 @@ This module needs pytest, and no part of the package imports it.
 """
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,7 +59,6 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic import (
         GraphProblem,
         RenderedScene,
-        RenderOptions,
         Scene,
         StreetProblem,
         WorkspaceOptions,
@@ -110,13 +110,14 @@ def assert_reconstruction_near(
         complaints.append(
             f"{placed:.0%} of the cameras are placed, not {min_placed:.0%}: {errors.missing} miss"
         )
-    for value, limit, subject, unit in (
-        (errors.position.max, max_error, f"{worst} is", " off"),
-        (errors.position.median, max_median_error, "the median camera is", " off"),
-        (errors.rotation_deg.max, max_rotation_error_deg, f"{turned} is turned by", " deg"),
+    largest, median, angle = errors.position.max, errors.position.median, errors.rotation_deg.max
+    for error, limit, said, unit in (
+        (largest, max_error, f"{worst} is {largest:.3g} off", ""),
+        (median, max_median_error, f"the median camera is {median:.3g} off", ""),
+        (angle, max_rotation_error_deg, f"{turned} is turned by {angle:.3g} deg", " deg"),
     ):
-        if limit is not None and value > limit:
-            complaints.append(f"{subject} {value:.3g}{unit}, limit {limit:g}{unit.replace(' off', '')}")
+        if limit is not None and error > limit:
+            complaints.append(f"{said}, limit {limit:g}{unit}")
     assert not complaints, "; ".join(complaints)
 
 
@@ -145,15 +146,12 @@ def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: fl
 @pytest.fixture(scope="session")
 def scene_of() -> "Callable[..., Scene]":
     """Make photographed scenes: 12 images of 1200 points with 0.5 px of noise, if nothing else is said."""
-    made: dict[Any, Scene] = {}
+    from sfm_shapefit.synthetic import SceneOptions, make_scene
+
+    make = cache(make_scene)
 
     def scene(shape: str, **changes: Any) -> "Scene":
-        from sfm_shapefit.synthetic import SceneOptions, make_scene
-
-        options = SceneOptions(**{"shape": shape, "num_images": 12, "num_points": 1200, **changes})
-        if options not in made:
-            made[options] = make_scene(options)
-        return made[options]
+        return make(SceneOptions(**{"shape": shape, "num_images": 12, "num_points": 1200, **changes}))
 
     return scene
 
@@ -177,17 +175,14 @@ drive_scene = _shape_fixture("drive", "Cameras that look ahead along a street.")
 @pytest.fixture(scope="session")
 def rendered_scene_of() -> "Callable[..., RenderedScene]":
     """Make scenes to be drawn: 8 images of 640 x 480 pixels, if nothing else is said."""
-    made: dict[Any, RenderedScene] = {}
+    from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
 
-    def scene(shape: str, render: "RenderOptions | None" = None, **changes: Any) -> "RenderedScene":
-        from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
+    make = cache(make_rendered_scene)
+    default = {"num_images": 8, "image_width": 640, "image_height": 480, "focal_length_px": 560.0}
 
-        default = {"num_images": 8, "image_width": 640, "image_height": 480, "focal_length_px": 560.0}
+    def scene(shape: str, render: RenderOptions | None = None, **changes: Any) -> "RenderedScene":
         options = SceneOptions(**{"shape": shape, **default, **changes})
-        key = (options, render or RenderOptions())
-        if key not in made:
-            made[key] = make_rendered_scene(*key)
-        return made[key]
+        return make(options, render or RenderOptions())
 
     return scene
 

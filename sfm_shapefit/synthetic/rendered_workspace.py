@@ -23,6 +23,7 @@ from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.synthetic.models import ModelParts, Points, image_name, new_camera, write_models
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import (
     RenderedScene,
@@ -30,9 +31,8 @@ from sfm_shapefit.synthetic.rendering import (
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.rig_workspace import Points, image_name
 from sfm_shapefit.synthetic.rigs import single_cameras
-from sfm_shapefit.synthetic.workspace import ModelParts, compact_database, new_camera, write_models
+from sfm_shapefit.synthetic.workspace import compact_database
 from sfm_shapefit.viewgraph import connected_components
 
 # A right match is off by no more: this is COLMAP's own limit for inliers.
@@ -181,10 +181,10 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
 
 def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
     """Return what models are made of: judged keypoints and their points, or none."""
-    none = [np.empty((0, 2))] * scene.num_images
-    points = None if judged is None else _true_points(judged)
-    keypoints = none if judged is None else judged.keypoints
-    return ModelParts(scene, single_cameras(scene.num_images), _camera(scene), keypoints, points)
+    rigs, camera = single_cameras(scene.num_images), _camera(scene)
+    if judged is None:
+        return ModelParts(scene, rigs, camera, [np.empty((0, 2))] * scene.num_images, None)
+    return ModelParts(scene, rigs, camera, judged.keypoints, _true_points(judged))
 
 
 def _true_points(judged: JudgedMatches) -> Points:

@@ -277,8 +277,6 @@ def _match_lists(
 ) -> list[IntArray]:
     """Return the (k, 2) matches of each pair, and append to the images the keypoints of the false lists."""
     real_points = list(keypoint_points)
-    appended = [[xy] for xy in keypoints]
-    count = [len(xy) for xy in keypoints]
     lists = []
     for e, pair in enumerate(pairs):
         if e not in false_lists:
@@ -286,15 +284,11 @@ def _match_lists(
             continue
         false = false_lists[e]
         image = pair[false.displaced]
-        new_keypoints = count[image] + np.arange(len(false.xy))
-        appended[image].append(false.xy)
-        count[image] += len(false.xy)
-        columns = [false.keypoints, new_keypoints]
+        columns = [false.keypoints, len(keypoints[image]) + np.arange(len(false.xy))]
         lists.append(np.stack(columns if false.displaced == 1 else columns[::-1], axis=1))
-    for image, parts in enumerate(appended):
-        keypoints[image] = np.concatenate(parts)
-        no_point = np.full(count[image] - len(real_points[image]), -1, dtype=np.int64)
-        keypoint_points[image] = np.concatenate([real_points[image], no_point])
+        no_point = np.full(len(false.xy), -1, dtype=np.int64)
+        keypoints[image] = np.concatenate([keypoints[image], false.xy])
+        keypoint_points[image] = np.concatenate([keypoint_points[image], no_point])
     return lists
 
 

@@ -11,19 +11,23 @@ which would leave companions beside the file for every reader, so it is switched
 
 import contextlib
 import sqlite3
-from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.seed import write_model
-from sfm_shapefit.synthetic.layouts import SceneCameras
-from sfm_shapefit.synthetic.options import ModelContent, WorkspaceOptions
-from sfm_shapefit.synthetic.rig_workspace import Points, new_images, new_model, new_rigs, rigid
+from sfm_shapefit.synthetic.models import (
+    ModelParts,
+    Points,
+    new_camera,
+    new_images,
+    new_rigs,
+    rigid,
+    write_models,
+)
+from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rigs import Rigs, single_cameras
 from sfm_shapefit.synthetic.scenes import Scene
 
@@ -54,41 +58,6 @@ def write_workspace(
         write_models(parts, workspace, options.model)
 
 
-class ModelParts(NamedTuple):
-    """What the models of a scene have in common."""
-
-    scene: SceneCameras
-    rigs: Rigs
-    camera: pycolmap.Camera
-    keypoints: Sequence[FloatArray]
-    """Per image, (k, 2)."""
-    points: Points | None
-
-    def model(self, rotations: FloatArray) -> pycolmap.Reconstruction:
-        """Return the model with the given rotations at the true centers."""
-        translations = np.array([-r @ c for r, c in zip(rotations, self.scene.centers, strict=True)])
-        return new_model(self.rigs, self.camera, rotations, translations, self.keypoints, self.points)
-
-    def rotations_only(self) -> pycolmap.Reconstruction:
-        """Return cameras and images with the stated rotations, all centers at the origin, and no points."""
-        scene, none = self.scene, [np.empty((0, 2))] * self.scene.num_images
-        origin = np.zeros((scene.num_images, 3))
-        return new_model(self.rigs, self.camera, scene.stated_rotations, origin, none, None)
-
-
-def write_models(parts: ModelParts, workspace: Path, content: ModelContent) -> None:
-    """Write sparse/0, and the truth where it is another model."""
-    scene = parts.scene
-    written = {"sparse/0": parts.model(scene.rotations)}
-    if content == "rotations":
-        written = {"sparse/0": parts.rotations_only(), "truth": written["sparse/0"]}
-    elif not np.array_equal(scene.rotations, scene.stated_rotations):
-        written = {"sparse/0": parts.model(scene.stated_rotations), "truth": written["sparse/0"]}
-    for folder, model in written.items():
-        (workspace / folder).mkdir(parents=True)
-        write_model(model, workspace / folder)
-
-
 def _points(scene: Scene) -> Points:
     """Return the points that two images or more show; point p of the scene has id p + 1."""
     image = np.repeat(np.arange(scene.num_images), [len(ids) for ids in scene.keypoint_points])
@@ -107,18 +76,6 @@ def _camera(scene: Scene) -> pycolmap.Camera:
     """Return the camera of a scene."""
     k = scene.calibration
     return new_camera(scene, "PINHOLE", [k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
-
-
-def new_camera(scene: SceneCameras, model: str, parameters: list[float]) -> pycolmap.Camera:
-    """Return a camera with the size of a scene's images."""
-    return pycolmap.Camera(
-        camera_id=1,
-        model=model,
-        width=scene.options.image_width,
-        height=scene.options.image_height,
-        params=parameters,
-        has_prior_focal_length=True,
-    )
 
 
 # --- database --------------------------------------------------------------------------------------------
