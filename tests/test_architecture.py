@@ -51,7 +51,7 @@ DOORS = {
     "pycolmap": {
         "colmap",
         "synthetic/workspace.py",
-        "synthetic/rig_workspace.py",
+        "synthetic/models.py",
         "synthetic/rendered_workspace.py",
     },
     "sqlite3": {"colmap", "synthetic/workspace.py"},

@@ -51,34 +51,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic.scenes import Scene, make_scene, project_points
     from sfm_shapefit.synthetic.streets import StreetProblem, street_problem
 
-_HOMES = {
-    "graphs": (
-        "Corruption",
-        "GraphProblem",
-        "Noise",
-        "box_graph_problem",
-        "community_graph_problem",
-        "corridor_graph_problem",
-        "expander_graph_problem",
-        "lawn_graph_problem",
-        "measured_problem",
-        "random_graph_problem",
-        "ring_graph_problem",
-        "trajectory_graph_problem",
-    ),
-    "options": ("RenderOptions", "SceneOptions", "WorkspaceOptions"),
-    "rendering": (
-        "RenderedScene",
-        "draw_image",
-        "make_rendered_scene",
-        "project_distorted",
-        "surface_points",
-    ),
-    "rigs": ("RigScene", "make_rig_drive"),
-    "scenes": ("Scene", "make_scene", "project_points"),
-    "streets": ("StreetProblem", "street_problem"),
-}
-_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+# In this order, a name is found before anything is imported that costs more than its own module.
+_HOMES = ("options", "graphs", "streets", "scenes", "rigs", "rendering")
 
 __all__ = [
     "Corruption",
@@ -112,11 +86,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in _HOME_OF:
-        globals()[name] = getattr(import_module(f"{__name__}.{_HOME_OF[name]}"), name)
-        return globals()[name]
+    for home in _HOMES if name in __all__ else ():
+        module = import_module(f"{__name__}.{home}")
+        if hasattr(module, name):
+            globals()[name] = getattr(module, name)
+            return globals()[name]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_HOME_OF})
+    return sorted({*globals(), *__all__})

@@ -44,8 +44,9 @@ This module needs pytest, and no part of the package imports it.
 """
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,6 @@ if TYPE_CHECKING:
     from sfm_shapefit.synthetic import (
         GraphProblem,
         RenderedScene,
-        RenderOptions,
         Scene,
         StreetProblem,
         WorkspaceOptions,
@@ -67,26 +67,6 @@ if TYPE_CHECKING:
 __all__ = ["assert_locations_near", "assert_reconstruction_near"]
 
 _FAMILIES = ("ring", "trajectory", "lawn", "box", "corridor", "community", "expander")
-
-
-class SceneMaker(Protocol):
-    """Makes scenes by shape."""
-
-    def __call__(self, shape: str, **changes: Any) -> "Scene": ...
-
-
-class RenderedSceneMaker(Protocol):
-    """Makes scenes to be drawn, by shape."""
-
-    def __call__(
-        self, shape: str, render: "RenderOptions | None" = None, **changes: Any
-    ) -> "RenderedScene": ...
-
-
-class WorkspaceMaker(Protocol):
-    """Writes scenes as folders."""
-
-    def __call__(self, scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path: ...
 
 
 # --- comparisons -------------------------------------------------------------------------------------------
@@ -130,15 +110,14 @@ def assert_reconstruction_near(
         complaints.append(
             f"{placed:.0%} of the cameras are placed, not {min_placed:.0%}: {errors.missing} miss"
         )
-    if max_error is not None and errors.position.max > max_error:
-        complaints.append(f"{worst} is {errors.position.max:.3g} off, limit {max_error:g}")
-    if max_median_error is not None and errors.position.median > max_median_error:
-        complaints.append(
-            f"the median camera is {errors.position.median:.3g} off, limit {max_median_error:g}"
-        )
-    if max_rotation_error_deg is not None and errors.rotation_deg.max > max_rotation_error_deg:
-        limit = f"limit {max_rotation_error_deg:g} deg"
-        complaints.append(f"{turned} is turned by {errors.rotation_deg.max:.3g} deg, {limit}")
+    largest, median, angle = errors.position.max, errors.position.median, errors.rotation_deg.max
+    for error, limit, said, unit in (
+        (largest, max_error, f"{worst} is {largest:.3g} off", ""),
+        (median, max_median_error, f"the median camera is {median:.3g} off", ""),
+        (angle, max_rotation_error_deg, f"{turned} is turned by {angle:.3g} deg", " deg"),
+    ):
+        if limit is not None and error > limit:
+            complaints.append(f"{said}, limit {limit:g}{unit}")
     assert not complaints, "; ".join(complaints)
 
 
@@ -165,59 +144,45 @@ def assert_locations_near(found: FloatArray, truth: FloatArray, *, max_error: fl
 
 
 @pytest.fixture(scope="session")
-def scene_of() -> SceneMaker:
+def scene_of() -> "Callable[..., Scene]":
     """Make photographed scenes: 12 images of 1200 points with 0.5 px of noise, if nothing else is said."""
-    made: dict[Any, Scene] = {}
+    from sfm_shapefit.synthetic import SceneOptions, make_scene
+
+    make = cache(make_scene)
 
     def scene(shape: str, **changes: Any) -> "Scene":
-        from sfm_shapefit.synthetic import SceneOptions, make_scene
-
-        options = SceneOptions(**{"shape": shape, "num_images": 12, "num_points": 1200, **changes})
-        if options not in made:
-            made[options] = make_scene(options)
-        return made[options]
+        return make(SceneOptions(**{"shape": shape, "num_images": 12, "num_points": 1200, **changes}))
 
     return scene
 
 
-@pytest.fixture(scope="session")
-def ring_scene(scene_of: SceneMaker) -> "Scene":
-    """Cameras around an object."""
-    return scene_of("ring")
+def _shape_fixture(shape: str, meaning: str) -> Any:
+    """Return the fixture of the scene of a shape."""
+
+    def scene(scene_of: "Callable[..., Scene]") -> "Scene":
+        return scene_of(shape)
+
+    scene.__doc__ = meaning
+    return pytest.fixture(scope="session", name=f"{shape}_scene")(scene)
+
+
+ring_scene = _shape_fixture("ring", "Cameras around an object.")
+facade_scene = _shape_fixture("facade", "A grid of cameras before a wall.")
+courtyard_scene = _shape_fixture("courtyard", "Cameras around the inside of four facades.")
+drive_scene = _shape_fixture("drive", "Cameras that look ahead along a street.")
 
 
 @pytest.fixture(scope="session")
-def facade_scene(scene_of: SceneMaker) -> "Scene":
-    """A grid of cameras before a wall."""
-    return scene_of("facade")
-
-
-@pytest.fixture(scope="session")
-def courtyard_scene(scene_of: SceneMaker) -> "Scene":
-    """Cameras around the inside of four facades."""
-    return scene_of("courtyard")
-
-
-@pytest.fixture(scope="session")
-def drive_scene(scene_of: SceneMaker) -> "Scene":
-    """Cameras that look ahead along a street."""
-    return scene_of("drive")
-
-
-@pytest.fixture(scope="session")
-def rendered_scene_of() -> RenderedSceneMaker:
+def rendered_scene_of() -> "Callable[..., RenderedScene]":
     """Make scenes to be drawn: 8 images of 640 x 480 pixels, if nothing else is said."""
-    made: dict[Any, RenderedScene] = {}
+    from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
 
-    def scene(shape: str, render: "RenderOptions | None" = None, **changes: Any) -> "RenderedScene":
-        from sfm_shapefit.synthetic import RenderOptions, SceneOptions, make_rendered_scene
+    make = cache(make_rendered_scene)
+    default = {"num_images": 8, "image_width": 640, "image_height": 480, "focal_length_px": 560.0}
 
-        default = {"num_images": 8, "image_width": 640, "image_height": 480, "focal_length_px": 560.0}
+    def scene(shape: str, render: RenderOptions | None = None, **changes: Any) -> "RenderedScene":
         options = SceneOptions(**{"shape": shape, **default, **changes})
-        key = (options, render or RenderOptions())
-        if key not in made:
-            made[key] = make_rendered_scene(*key)
-        return made[key]
+        return make(options, render or RenderOptions())
 
     return scene
 
@@ -226,7 +191,7 @@ def rendered_scene_of() -> RenderedSceneMaker:
 
 
 @pytest.fixture
-def workspace_of(tmp_path: Path) -> WorkspaceMaker:
+def workspace_of(tmp_path: Path) -> Callable[..., Path]:
     """Write scenes as COLMAP workspaces, each in a folder of its own."""
 
     def workspace(scene: "Scene | RenderedScene", options: "WorkspaceOptions | None" = None) -> Path:
@@ -245,13 +210,13 @@ def workspace_of(tmp_path: Path) -> WorkspaceMaker:
 
 
 @pytest.fixture
-def ring_workspace(ring_scene: "Scene", workspace_of: WorkspaceMaker) -> Path:
+def ring_workspace(ring_scene: "Scene", workspace_of: Callable[..., Path]) -> Path:
     """Write the ring: database.db, and the exact model in sparse/0."""
     return workspace_of(ring_scene)
 
 
 @pytest.fixture
-def corrupted_workspace(scene_of: SceneMaker, workspace_of: WorkspaceMaker) -> Path:
+def corrupted_workspace(scene_of: "Callable[..., Scene]", workspace_of: Callable[..., Path]) -> Path:
     """Write a courtyard with a fifth of its pairs wrong: rotations only in sparse/0, the answer in truth."""
     from sfm_shapefit.synthetic import WorkspaceOptions
 

@@ -75,12 +75,7 @@ class GraphProblem:
         return ViewGraph(len(self.locations), self.edges, self.directions)
 
 
-def random_graph_problem(
-    n: int,
-    p: float = 0.5,
-    d: int = 3,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def random_graph_problem(n: int, p: float = 0.5, d: int = 3, **noise: Unpack[Noise]) -> GraphProblem:
     """Return the random model of the paper: locations N(0, I_d), an Erdos-Renyi graph G(n, p).
 
     Args:
@@ -93,29 +88,19 @@ def random_graph_problem(
     """
     rng = _rng(noise)
     locations = rng.standard_normal((n, d))
-    i, j = np.triu_indices(n, k=1)
-    present = rng.random(len(i)) < p
-    edges = np.stack([i[present], j[present]], axis=1).astype(np.int64)
-    return _measure(locations, edges, rng, noise)
+    pairs = np.stack(np.triu_indices(n, k=1), axis=1)
+    return _measure(locations, pairs[rng.random(len(pairs)) < p], rng, noise)
 
 
-def expander_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def expander_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return locations N(0, I) and n degree / 2 pairs drawn uniformly; repeated draws are merged."""
     rng = _rng(noise)
     locations = rng.standard_normal((n, 3))
-    i, j = rng.integers(n, size=(2, round(n * degree / 2.0)))
-    return _measure(locations, _unique_pairs(i, j), rng, noise)
+    drawn = rng.integers(n, size=(2, round(n * degree / 2.0)))
+    return _measure(locations, _unique_pairs(drawn.T), rng, noise)
 
 
-def box_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def box_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return cameras uniform in a flat box, 1 x 1 x 0.1, each joined to its nearest; mean degree `degree`.
 
     The model of an area mapped from a drone. About degree / 1.25 neighbors are taken, because the union of
@@ -125,15 +110,11 @@ def box_graph_problem(
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
     neighbours = _nearest(locations, round(degree / 1.25))
     camera = np.repeat(np.arange(n), neighbours.shape[1])
-    return _measure(locations, _unique_pairs(camera, neighbours.ravel()), rng, noise)
+    return _measure(locations, _unique_pairs(np.column_stack([camera, neighbours.ravel()])), rng, noise)
 
 
 def trajectory_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    *,
-    speed_ratio: float = 1.0,
-    **noise: Unpack[Noise],
+    n: int, degree: float = 20.0, *, speed_ratio: float = 1.0, **noise: Unpack[Noise]
 ) -> GraphProblem:
     """Return a meandering trajectory: each camera joined to the next degree / 2, and 2 % of loop closures.
 
@@ -144,21 +125,18 @@ def trajectory_graph_problem(
     rng = _rng(noise)
     heading = np.cumsum(0.15 * rng.standard_normal(n))
     steps = np.stack([np.cos(heading), np.sin(heading), 0.2 * rng.standard_normal(n)], axis=1)
-    steps *= _speeds(n, speed_ratio)[:, None]
+    speeds = speed_ratio ** (0.5 * np.sin(6.0 * np.pi * np.arange(n) / n))
+    steps *= speeds[:, None]
     locations = np.cumsum(steps, axis=0) + 0.3 * rng.standard_normal((n, 3))
-    i, j = _next_ones(n, degree)
+    onward = _next_ones(n, degree)
     nearest = _nearest(locations, 60)
-    closing = rng.integers(n, size=len(i) // 50)
+    closing = rng.integers(n, size=len(onward) // 50)
     closed = nearest[closing, rng.integers(nearest.shape[1], size=len(closing))]
-    edges = _unique_pairs(np.concatenate([i, closing]), np.concatenate([j, closed]))
+    edges = _unique_pairs(np.concatenate([onward, np.column_stack([closing, closed])]))
     return _measure(locations, edges, rng, noise)
 
 
-def ring_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def ring_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return cameras round a circle, a step of 1 apart, each joined to the next degree / 2, and 5 far links.
 
     The model of a walk round a large building.
@@ -172,15 +150,11 @@ def ring_graph_problem(
     j = (i + np.tile(np.arange(1, reach + 1), n)) % n
     far = rng.integers(n, size=5)
     across = (far + rng.integers(n // 4, max(n - n // 4, n // 4 + 1), size=5)) % n
-    edges = _unique_pairs(np.concatenate([i, far]), np.concatenate([j, across]))
+    edges = _unique_pairs(np.concatenate([np.column_stack([i, j]), np.column_stack([far, across])]))
     return _measure(locations, edges, rng, noise)
 
 
-def lawn_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def lawn_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return strips of 50 cameras, each joined to the next degree / 4 along and to as many across.
 
     The model of an area mapped strip by strip with little overlap. Strips are 3 steps apart.
@@ -196,16 +170,11 @@ def lawn_graph_problem(
     for shift in range(-(reach // 2), reach - reach // 2):
         across = np.flatnonzero((place + shift >= 0) & (place + shift < 50))
         pairs.append(np.stack([across, across + 50 + shift], axis=1))
-    i, j = np.concatenate(pairs).T
-    edges = _unique_pairs(i[j < n], j[j < n])
-    return _measure(locations, edges, rng, noise)
+    edges = np.concatenate(pairs)
+    return _measure(locations, _unique_pairs(edges[edges[:, 1] < n]), rng, noise)
 
 
-def corridor_graph_problem(
-    n: int,
-    degree: float = 20.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def corridor_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return a corridor of about n / 2 cameras with 5 side branches.
 
     The model of a building's inside. Cameras within degree / 2 steps of one another are joined. Nothing
@@ -214,24 +183,17 @@ def corridor_graph_problem(
     rng = _rng(noise)
     length = n // 10
     main = n - 5 * length
-    walks = [_walk(np.zeros(2), 0.0, main, rng)]
+    walks, pairs = [_walk(np.zeros(2), 0.0, main, rng)], [_next_ones(main, degree)]
+    reach = max(round(degree / 2.0), 1)
     junctions = ((np.arange(5) + 0.5) * main / 5.0).astype(np.int64)
     for k, junction in enumerate(junctions.tolist()):
         walks.append(_walk(walks[0][junction], (-1.0) ** k * np.pi / 2.0, length, rng))
+        first = main + k * length
+        steps = np.add.outer(np.arange(1, length + 1), np.abs(np.arange(main) - junction))
+        pairs += [first + _next_ones(length, degree), np.array([first, 0]) + np.argwhere(steps <= reach)]
     flat = np.concatenate(walks)
     locations = np.concatenate([flat, np.zeros((n, 1))], axis=1) + 0.3 * rng.standard_normal((n, 3))
-    reach = max(round(degree / 2.0), 1)
-    i, j = _next_ones(main, degree)
-    pairs = [np.stack([i, j], axis=1)]
-    for k, junction in enumerate(junctions.tolist()):
-        first = main + k * length
-        i, j = _next_ones(length, degree)
-        pairs.append(np.stack([i, j], axis=1) + first)
-        steps = np.add.outer(np.arange(1, length + 1), np.abs(np.arange(main) - junction))
-        i, j = np.nonzero(steps <= reach)
-        pairs.append(np.stack([i + first, j], axis=1))
-    i, j = np.concatenate(pairs).T
-    return _measure(locations, _unique_pairs(i, j), rng, noise)
+    return _measure(locations, _unique_pairs(np.concatenate(pairs)), rng, noise)
 
 
 def _walk(start: FloatArray, heading: float, n: int, rng: np.random.Generator) -> FloatArray:
@@ -241,26 +203,14 @@ def _walk(start: FloatArray, heading: float, n: int, rng: np.random.Generator) -
     return walk
 
 
-def _speeds(n: int, ratio: float) -> FloatArray:
-    """Return (n,) lengths of steps that vary smoothly by a factor `ratio` around 1."""
-    speeds: FloatArray = ratio ** (0.5 * np.sin(6.0 * np.pi * np.arange(n) / n))
-    return speeds
+def _next_ones(n: int, degree: float) -> IntArray:
+    """Return the pairs (m, 2) of each of n cameras in a row with the next degree / 2."""
+    reach = min(max(round(degree / 2.0), 1), n - 1)
+    steps = [np.stack([np.arange(n - step), np.arange(step, n)], axis=1) for step in range(1, reach + 1)]
+    return np.concatenate([np.zeros((0, 2), dtype=np.int64), *steps])
 
 
-def _next_ones(n: int, degree: float) -> tuple[IntArray, IntArray]:
-    """Return the pairs of each of n cameras in a row with the next degree / 2."""
-    reach = max(min(max(round(degree / 2.0), 1), n - 1), 0)
-    i = [np.arange(n - step) for step in range(1, reach + 1)]
-    j = [np.arange(step, n) for step in range(1, reach + 1)]
-    none = [np.zeros(0, dtype=np.int64)]
-    return np.concatenate(none + i), np.concatenate(none + j)
-
-
-def community_graph_problem(
-    n: int,
-    degree: float = 30.0,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def community_graph_problem(n: int, degree: float = 30.0, **noise: Unpack[Noise]) -> GraphProblem:
     """Return clusters of about 400 cameras with a few hubs each, loosely joined: an internet collection.
 
     Locations are N(0, I) around centers N(0, diag(100, 100, 1)). Of the edges, 93 % join cameras of one
@@ -287,17 +237,11 @@ def community_graph_problem(
         target = np.where(leaves, near[target, rng.integers(near.shape[1], size=num_drawn)], target)
     drawn = bounds[target] + rng.random(num_drawn) * (bounds[target + 1] - bounds[target])
     j = np.searchsorted(cumulative, drawn, side="right")
-    backbone = [(np.arange(n - step), np.arange(step, n)) for step in range(1, min(5, n))]
-    i = np.concatenate([i, *(a for a, _ in backbone)])
-    j = np.concatenate([j, *(b for _, b in backbone)])
-    return _measure(locations, _unique_pairs(i, j), rng, noise)
+    edges = _unique_pairs(np.concatenate([np.column_stack([i, j]), _next_ones(n, 8.0)]))
+    return _measure(locations, edges, rng, noise)
 
 
-def measured_problem(
-    locations: FloatArray,
-    edges: IntArray,
-    **noise: Unpack[Noise],
-) -> GraphProblem:
+def measured_problem(locations: FloatArray, edges: IntArray, **noise: Unpack[Noise]) -> GraphProblem:
     """Return directions between given locations (n, d) along given pairs (m, 2)."""
     return _measure(locations, edges, _rng(noise), noise)
 
@@ -311,19 +255,14 @@ def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, n
     sigma, q, corruption = noise.get("sigma", 0.0), noise.get("q", 0.0), noise.get("corruption", "uniform")
     if corruption not in get_args(Corruption):
         raise ValueError(f"corruption must be one of {', '.join(get_args(Corruption))}, got {corruption!r}")
-
-    def noisy(t: FloatArray) -> FloatArray:
-        true = normalized(t[edges[:, 0]] - t[edges[:, 1]])
-        return normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
-
-    right = noisy(locations)
+    right = noisy_directions(locations, edges, sigma, rng)
     wrong = normalized(rng.standard_normal(right.shape))
     odds = np.full(len(edges), q) if corruption != "concentrated" else _odds_by_degree(edges, q)
     corrupted = rng.random(len(edges)) < odds
     false_locations = None
     if corruption == "self-consistent":  # drawn last: what is corrupted is the same for all models
         false_locations = locations[rng.permutation(len(locations))]
-        wrong = noisy(false_locations)
+        wrong = noisy_directions(false_locations, edges, sigma, rng)
     return GraphProblem(
         locations=locations,
         edges=edges,
@@ -331,6 +270,14 @@ def _measure(locations: FloatArray, edges: IntArray, rng: np.random.Generator, n
         corrupted=corrupted,
         false_locations=false_locations,
     )
+
+
+def noisy_directions(
+    locations: FloatArray, edges: IntArray, sigma: float | FloatArray, rng: np.random.Generator
+) -> FloatArray:
+    """Return the true directions (m, d) plus `sigma`, one or (m, 1), times unit vectors drawn at random."""
+    true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
+    return normalized(true + sigma * normalized(rng.standard_normal(true.shape)))
 
 
 def _odds_by_degree(edges: IntArray, q: float) -> FloatArray:
@@ -353,7 +300,7 @@ def _nearest(locations: FloatArray, k: int) -> IntArray:
     return nearest[:, 1:]  # the first is the location itself
 
 
-def _unique_pairs(i: npt.NDArray[np.integer], j: npt.NDArray[np.integer]) -> IntArray:
+def _unique_pairs(pairs: npt.NDArray[np.integer]) -> IntArray:
     """Return the unordered pairs (m, 2) of different cameras, each once, in lexicographic order."""
-    pairs = np.sort(np.stack([i, j], axis=1).astype(np.int64), axis=1)
-    return np.unique(pairs[pairs[:, 0] != pairs[:, 1]], axis=0)
+    ascending = np.sort(pairs.astype(np.int64), axis=1)
+    return np.unique(ascending[ascending[:, 0] != ascending[:, 1]], axis=0)

@@ -12,12 +12,36 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.synthetic.options import Shape
+from sfm_shapefit.synthetic.options import SceneOptions, Shape
 
 ByteArray = npt.NDArray[np.uint8]
 
 FARTHEST_M = 40.0
 """Surface texture is too small to be detected beyond."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class SceneCameras:
+    """The n cameras of a scene, true and as a model states them."""
+
+    options: SceneOptions
+    """What made the scene."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world, true."""
+    centers: FloatArray
+    """(n, 3) camera centers, true."""
+    stated_rotations: FloatArray
+    """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
+
+    @property
+    def num_images(self) -> int:
+        """Number of images, n."""
+        return len(self.centers)
+
+    @property
+    def calibration(self) -> FloatArray:
+        """The (3, 3) calibration matrix K of every image."""
+        return self.options.calibration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -167,8 +191,7 @@ def turn_at_random(rotations: FloatArray, sigma_rad: float, rng: np.random.Gener
     if sigma_rad == 0.0:
         return rotations
     turns = Rotation.from_rotvec(sigma_rad * rng.standard_normal((len(rotations), 3))).as_matrix()
-    turned: FloatArray = turns @ rotations
-    return turned
+    return np.asarray(turns @ rotations)
 
 
 def looking_along(forward: FloatArray, up: FloatArray | None = None) -> FloatArray:

@@ -23,6 +23,7 @@ from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.synthetic.models import ModelParts, Points, image_name, new_camera, write_models
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rendering import (
     RenderedScene,
@@ -30,19 +31,23 @@ from sfm_shapefit.synthetic.rendering import (
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.workspace import compact_database, image_name, rigid, write_models
+from sfm_shapefit.synthetic.rigs import single_cameras
+from sfm_shapefit.synthetic.workspace import compact_database
 from sfm_shapefit.viewgraph import connected_components
 
-_CAMERA_ID = 1
 # A right match is off by no more: this is COLMAP's own limit for inliers.
 _LARGEST_ERROR_PX = 4.0
-_POINT_COLOR = np.array([160, 160, 160], dtype=np.uint8)
+_POINT_GRAY = 160
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class JudgedMatches:
-    """The verified pairs of a rendered workspace, and how much of each is right."""
+    """The keypoints and verified pairs of a rendered workspace, and how much of each pair is right."""
 
+    keypoints: list[FloatArray]
+    """Per image, (k, 2) pixels."""
+    surface: list[FloatArray]
+    """Per image, (k, 3) the surface point under each keypoint, world axes; NaN where it is sky."""
     matches: MatchBatch
     """The inlier matches of m pairs; images are indices of the scene."""
     is_right: BoolArray
@@ -68,9 +73,11 @@ def write_rendered_workspace(
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
         _write_images(scene, workspace / "images")
+        judged = None
         if options.database:
             _match_images(scene, workspace, relative_poses=options.relative_poses)
-        _write_models(scene, workspace, options)
+            judged = judge_matches(scene, workspace / "database.db", scene.options.min_matches)
+        write_models(_parts(scene, judged), workspace, options.model)
 
 
 def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) -> JudgedMatches:
@@ -87,11 +94,9 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     Raises:
         InputError: if the database cannot be read or has none of the scene's images.
     """
-    model = read_model(_posed_model(scene, scene.rotations))
-    with open_database(database, model) as opened:
+    with open_database(database, read_model(_parts(scene, None).model(scene.rotations))) as opened:
         keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
-        batches = list(opened.iter_matches(min_matches))
-    joined = _join(batches)
+        joined = _join(list(opened.iter_matches(min_matches)))
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)
@@ -104,23 +109,26 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
         )
         is_right[rows] = errors < _LARGEST_ERROR_PX
         wrong[e] = 2 * is_right[rows].sum() < len(a)
-    return JudgedMatches(matches=joined, is_right=is_right, pair_is_wrong=wrong)
+    return JudgedMatches(
+        keypoints=keypoints, surface=surface, matches=joined, is_right=is_right, pair_is_wrong=wrong
+    )
 
 
 def _join(batches: list[MatchBatch]) -> MatchBatch:
     """Return batches as one."""
-    offsets, num_matches = [np.zeros(1, dtype=np.int64)], 0
-    for batch in batches:
-        offsets.append(batch.offsets[1:] + num_matches)
-        num_matches += len(batch.keypoints)
-    none = np.empty((0, 3))
+
+    def joined(name: str, empty: np.ndarray) -> np.ndarray:
+        return np.concatenate([empty, *(getattr(batch, name) for batch in batches)])
+
+    no_pair, no_ray = np.empty((0, 2), dtype=np.int64), np.empty((0, 3))
+    counts = [np.diff(batch.offsets) for batch in batches]
     return MatchBatch(
-        pairs=np.concatenate([np.empty((0, 2), dtype=np.int64), *(batch.pairs for batch in batches)]),
-        offsets=np.concatenate(offsets),
-        keypoints=np.concatenate([np.empty((0, 2), dtype=np.int64), *(batch.keypoints for batch in batches)]),
-        rays_i=np.concatenate([none, *(batch.rays_i for batch in batches)]),
-        rays_j=np.concatenate([none, *(batch.rays_j for batch in batches)]),
-        pixel_angles=np.concatenate([np.empty(0), *(batch.pixel_angles for batch in batches)]),
+        pairs=joined("pairs", no_pair),
+        offsets=np.cumsum(np.concatenate([[0], *counts]), dtype=np.int64),
+        keypoints=joined("keypoints", no_pair),
+        rays_i=joined("rays_i", no_ray),
+        rays_j=joined("rays_j", no_ray),
+        pixel_angles=joined("pixel_angles", np.empty(0)),
     )
 
 
@@ -149,7 +157,7 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
     database = workspace / "database.db"
     reader = pycolmap.ImageReaderOptions()
     reader.camera_model = "RADIAL"
-    reader.camera_params = ",".join(repr(value) for value in _camera_parameters(scene))
+    reader.camera_params = ",".join(repr(value) for value in _camera(scene).params.tolist())
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = scene.options.max_keypoints_per_image
     verification = pycolmap.TwoViewGeometryOptions()
@@ -172,86 +180,33 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
 # --- models ------------------------------------------------------------------------------------------------
 
 
-def _write_models(scene: RenderedScene, workspace: Path, options: WorkspaceOptions) -> None:
-    """Write sparse/0, and the truth where that is not it."""
-    tracks = _true_tracks(scene, workspace / "database.db") if options.database else None
-    truth = _posed_model(scene, scene.rotations, tracks)
-    if options.model == "rotations":
-        model = _posed_model(scene, scene.stated_rotations, at_origin=True)
-    elif np.array_equal(scene.rotations, scene.stated_rotations):
-        model = truth
-    else:
-        model = _posed_model(scene, scene.stated_rotations, tracks)
-    write_models(model, truth, workspace)
+def _parts(scene: RenderedScene, judged: JudgedMatches | None) -> ModelParts:
+    """Return what models are made of: judged keypoints and their points, or none."""
+    rigs, camera = single_cameras(scene.num_images), _camera(scene)
+    if judged is None:
+        return ModelParts(scene, rigs, camera, [np.empty((0, 2))] * scene.num_images, None)
+    return ModelParts(scene, rigs, camera, judged.keypoints, _true_points(judged))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Tracks:
-    """Keypoints, and which of them show the same surface point."""
-
-    keypoints: list[FloatArray]
-    points: FloatArray
-    """(p, 3) world axes."""
-    elements: list[list[tuple[int, int]]]
-    """Per point: (image, keypoint), at most one per image."""
-
-
-def _true_tracks(scene: RenderedScene, database: Path) -> _Tracks:
-    """Return the tracks along right matches, each at the mean of the surface points under its keypoints."""
-    judged = judge_matches(scene, database, scene.options.min_matches)
-    model = read_model(_posed_model(scene, scene.rotations))
-    with open_database(database, model) as opened:
-        keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
-    first = np.cumsum([0] + [len(xy) for xy in keypoints])
+def _true_points(judged: JudgedMatches) -> Points:
+    """Return the points along right matches, each at the mean of the surface points under its keypoints."""
+    first = np.cumsum([0] + [len(xy) for xy in judged.keypoints])
     pair = np.repeat(np.arange(len(judged.matches.pairs)), np.diff(judged.matches.offsets))
     nodes = (judged.matches.keypoints + first[judged.matches.pairs[pair]])[judged.is_right]
     label = connected_components(int(first[-1]), nodes)
     order = np.argsort(label, kind="stable")
-    groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
-    surface = np.concatenate([surface_points(scene, k, xy) for k, xy in enumerate(keypoints)])
-    points, elements = [], []
-    for group in groups:
-        images = np.searchsorted(first, group, side="right") - 1
-        images, once = np.unique(images, return_index=True)
-        if len(images) < 2:
-            continue
-        points.append(surface[group[once]].mean(axis=0))
-        elements.append(list(zip(images.tolist(), (group[once] - first[images]).tolist(), strict=True)))
-    return _Tracks(keypoints=keypoints, points=np.array(points).reshape(-1, 3), elements=elements)
-
-
-def _posed_model(
-    scene: RenderedScene, rotations: FloatArray, tracks: _Tracks | None = None, *, at_origin: bool = False
-) -> pycolmap.Reconstruction:
-    """Return a model with the given rotations at the true centers, or all at the origin, and its tracks."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(_camera(scene))
-    for k, (rotation, center) in enumerate(zip(rotations, scene.centers, strict=True)):
-        keypoints = np.empty((0, 2)) if tracks is None else tracks.keypoints[k]
-        image = pycolmap.Image(name=image_name(k), keypoints=keypoints, camera_id=_CAMERA_ID, image_id=k + 1)
-        translation = np.zeros(3) if at_origin else -rotation @ center
-        model.add_image_with_trivial_frame(image, rigid(rotation, translation))
-    if tracks is not None:
-        for xyz, seen in zip(tracks.points, tracks.elements, strict=True):
-            track = pycolmap.Track([pycolmap.TrackElement(k + 1, keypoint) for k, keypoint in seen])
-            model.add_point3D(xyz, track, _POINT_COLOR)
-        model.update_point_3d_errors()
-    return model
+    surface = np.concatenate(judged.surface)
+    points, tracks = [], []
+    for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1):
+        images, once = np.unique(np.searchsorted(first, group, side="right") - 1, return_index=True)
+        if len(images) >= 2:
+            points.append(surface[group[once]].mean(axis=0))
+            tracks.append(np.stack([images, group[once] - first[images]], axis=1))
+    colors = np.full((len(points), 3), _POINT_GRAY, dtype=np.uint8)
+    return Points(np.arange(1, len(points) + 1), np.reshape(points, (-1, 3)), colors, tracks)
 
 
 def _camera(scene: RenderedScene) -> pycolmap.Camera:
-    """Return the one camera of a scene."""
-    return pycolmap.Camera(
-        camera_id=_CAMERA_ID,
-        model="RADIAL",
-        width=scene.options.image_width,
-        height=scene.options.image_height,
-        params=_camera_parameters(scene),
-        has_prior_focal_length=True,
-    )
-
-
-def _camera_parameters(scene: RenderedScene) -> list[float]:
-    """Return f, cx, cy, k1, k2 of COLMAP's RADIAL model."""
+    """Return the camera of a scene: f, cx, cy, k1, k2 of COLMAP's RADIAL model."""
     k = scene.calibration
-    return [float(k[0, 0]), float(k[0, 2]), float(k[1, 2]), *scene.distortion[:2].tolist()]
+    return new_camera(scene, "RADIAL", [k[0, 0], k[0, 2], k[1, 2], *scene.distortion[:2]])

@@ -20,6 +20,7 @@ so that the first pixel's center is (0.5, 0.5).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -28,7 +29,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, turn_at_random
+from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, SceneCameras, turn_at_random
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
 
@@ -51,31 +52,13 @@ _OF_POINTS_ONLY = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RenderedScene:
+class RenderedScene(SceneCameras):
     """Cameras and the surfaces before them; `draw_image` takes the photographs."""
 
-    options: SceneOptions
-    """What made it."""
     render: RenderOptions
     """How it is drawn."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world, true."""
-    centers: FloatArray
-    """(n, 3) camera centers, true."""
-    stated_rotations: FloatArray
-    """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     surfaces: Surfaces
     """What is photographed."""
-
-    @property
-    def num_images(self) -> int:
-        """Number of images, n."""
-        return len(self.centers)
-
-    @property
-    def calibration(self) -> FloatArray:
-        """The (3, 3) calibration matrix K of every image."""
-        return self.options.calibration
 
     @property
     def distortion(self) -> FloatArray:
@@ -136,13 +119,12 @@ def encode_image(scene: RenderedScene, image: int) -> bytes:
 def surface_points(scene: RenderedScene, image: int, xy: FloatArray) -> FloatArray:
     """Return the (k, 3) points in world axes that pixels (k, 2) of an image show; NaN where it is sky."""
     rays = _undistort(scene, xy).reshape(1, -1, 2)
-    inverse, kept = _inverse_corners(scene, image)
-    bounds = np.tile(np.array([0, 1, 0, rays.shape[1]], dtype=np.int64), (len(kept), 1))
-    triangle, inverse_depth = _nearest_triangles(rays, inverse, bounds)
-    depth = np.where(triangle[0] >= 0, 1.0 / np.where(triangle[0] >= 0, inverse_depth[0], 1.0), np.nan)
+    triangles = _facing_triangles(scene, image)
+    bounds = np.tile(np.array([0, 1, 0, rays.shape[1]], dtype=np.int64), (len(triangles.rows), 1))
+    nearest, inverse_depth = _nearest_triangles(rays, triangles.inverse, bounds)
+    depth = np.where(nearest[0] >= 0, 1.0 / np.where(nearest[0] >= 0, inverse_depth[0], 1.0), np.nan)
     in_camera = np.column_stack([rays[0], np.ones(rays.shape[1])]) * depth[:, None]
-    points: FloatArray = in_camera @ scene.rotations[image] + scene.centers[image]
-    return points
+    return np.asarray(in_camera @ scene.rotations[image] + scene.centers[image])
 
 
 def project_distorted(scene: RenderedScene, image: int, points: FloatArray) -> FloatArray:
@@ -205,32 +187,41 @@ def _sample_rays(scene: RenderedScene) -> FloatArray:
     return _undistort(scene, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(rows, columns, 2)
 
 
-def _inverse_corners(scene: RenderedScene, image: int) -> tuple[FloatArray, IntArray]:
-    """Return V^-1 (k, 3, 3) of the triangles that turn their outside to a camera, and which those are."""
+class _Triangles(NamedTuple):
+    """The triangles that turn their outside to a camera."""
+
+    rows: IntArray
+    """(k,) in the surfaces."""
+    corners: FloatArray
+    """(k, 3, 3) in camera axes."""
+    inverse: FloatArray
+    """(k, 3, 3) V^-1."""
+
+
+def _facing_triangles(scene: RenderedScene, image: int) -> _Triangles:
+    """Return the triangles that may be seen."""
     in_camera = (scene.surfaces.corners - scene.centers[image]) @ scene.rotations[image].T
     v = np.ascontiguousarray(in_camera.swapaxes(1, 2))
     volume = np.linalg.det(v)
     size = np.prod(np.linalg.norm(in_camera, axis=2), axis=1)
     kept = np.flatnonzero((volume < -1e-12 * size) & (in_camera[:, :, 2].max(axis=1) > _NEAREST_DEPTH_M))
-    return np.linalg.inv(v[kept]), kept.astype(np.int64)
+    return _Triangles(kept, in_camera[kept], np.linalg.inv(v[kept]))
 
 
-def _bounds(scene: RenderedScene, image: int, kept: IntArray, rays: FloatArray) -> IntArray:
+def _bounds(corners: FloatArray, rays: FloatArray) -> IntArray:
     """Return the samples (k, 4) first and last row, first and last column that each triangle can cover.
 
     A triangle in front of the camera is bounded by its corners. Of one that passes behind it, it is only
     known whether it lies wholly beyond one side of the image, where the bounds are empty.
     """
-    in_camera = (scene.surfaces.corners[kept] - scene.centers[image]) @ scene.rotations[image].T
-    depth = in_camera[:, :, 2]
-    ahead = (depth > _NEAREST_DEPTH_M).all(axis=1)
-    bounds = np.empty((len(kept), 4), dtype=np.int64)
+    depth = corners[:, :, 2]
+    ahead = np.asarray((depth > _NEAREST_DEPTH_M).all(axis=1))
+    bounds = np.empty((len(corners), 4), dtype=np.int64)
     for axis, first in ((1, 0), (0, 2)):  # rows from y, columns from x
-        at = in_camera[:, :, axis]
-        other = 1 if axis == 1 else 0
+        at = corners[:, :, axis]
         # Least and largest ray of each row or column, made monotone: the bounds only grow by that.
-        least = np.minimum.accumulate(rays[:, :, axis].min(axis=other)[::-1])[::-1]
-        largest = np.maximum.accumulate(rays[:, :, axis].max(axis=other))
+        least = np.minimum.accumulate(rays[:, :, axis].min(axis=axis)[::-1])[::-1]
+        largest = np.maximum.accumulate(rays[:, :, axis].max(axis=axis))
         beyond = (at < least[0] * depth).all(axis=1) | (at > largest[-1] * depth).all(axis=1)
         slope = at / np.where(ahead[:, None], depth, 1.0)
         low = np.searchsorted(largest, slope.min(axis=1) - _RAY_SLACK, side="left")
@@ -269,27 +260,19 @@ def _nearest_triangles(
 
 def _shade(scene: RenderedScene, image: int, rays: FloatArray) -> npt.NDArray[np.float32]:
     """Return the colors (rows, columns, 3) of the samples of an image, 0 to 255."""
-    inverse, kept = _inverse_corners(scene, image)
-    nearest, _ = _nearest_triangles(rays, inverse, _bounds(scene, image, kept, rays))
+    triangles = _facing_triangles(scene, image)
+    nearest, _ = _nearest_triangles(rays, triangles.inverse, _bounds(triangles.corners, rays))
     pyramid, levels = _mipmaps(scene.surfaces.textures)
     up = rays @ scene.rotations[image][:2, 2] + scene.rotations[image][2, 2]
     height = np.clip(up / np.sqrt(1.0 + np.sum(rays**2, axis=2)), 0.0, 1.0)[:, :, None]
     sky = _SKY[0] + height * np.subtract(_SKY[1], _SKY[0])
     colors: npt.NDArray[np.float32] = sky.astype(np.float32)
     # Texture coordinates over inverse depth are linear in the ray: rows (u / z, v / z, 1 / z).
-    ones = np.ones((len(kept), 3, 1))
-    texels = np.concatenate([scene.surfaces.texels[kept], ones], axis=2)
-    img_from_ray = np.einsum("kca,kcb->kab", texels, inverse)
-    _paint(
-        colors,
-        rays,
-        nearest,
-        img_from_ray,
-        scene.surfaces.texture[kept],
-        scene.surfaces.brightness[kept],
-        pyramid,
-        levels,
-    )
+    kept = triangles.rows
+    texels = np.concatenate([scene.surfaces.texels[kept], np.ones((len(kept), 3, 1))], axis=2)
+    img_from_ray = np.einsum("kca,kcb->kab", texels, triangles.inverse)
+    texture, brightness = scene.surfaces.texture[kept], scene.surfaces.brightness[kept]
+    _paint(colors, rays, nearest, img_from_ray, texture, brightness, pyramid, levels)
     return colors
 
 

@@ -8,13 +8,13 @@ Rotations are known; the metric offsets of the sensors in their rigs are what fi
 A rig's axes are those of its first camera: x to the right, y down, z ahead.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.synthetic.layouts import LAYOUTS, Layout, looking_along, street
+from sfm_shapefit.synthetic.layouts import LAYOUTS, looking_along, street
 from sfm_shapefit.synthetic.options import SceneOptions
 from sfm_shapefit.synthetic.scenes import Scene, scene_of
 
@@ -34,11 +34,9 @@ _LANES_M, _HEIGHTS_M = np.array([0.0, 1.2]), np.array([1.5, 1.9])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RigScene:
-    """A photographed scene with the rigs that its images belong to."""
+class Rigs:
+    """Which images belong to which rig: image k is what a sensor of a rig saw in a frame of it."""
 
-    scene: Scene
-    """Image k is what sensor `sensor_of_image[k]` saw in frame `frame_of_image[k]`."""
     rig_of_frame: IntArray
     """(f,)"""
     frame_of_image: IntArray
@@ -49,6 +47,24 @@ class RigScene:
     """(rigs, sensors, 3, 3) sensor_from_rig."""
     sensor_centers: FloatArray
     """(rigs, sensors, 3) of each sensor in its rig, in meters; 0 for the reference."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RigScene(Rigs):
+    """A photographed scene with the rigs that its images belong to."""
+
+    scene: Scene
+
+
+def single_cameras(num_images: int) -> Rigs:
+    """Return one rig of one camera, and a frame for each image."""
+    return Rigs(
+        rig_of_frame=np.zeros(num_images, dtype=np.int64),
+        frame_of_image=np.arange(num_images),
+        sensor_of_image=np.zeros(num_images, dtype=np.int64),
+        sensor_rotations=np.eye(3)[None, None],
+        sensor_centers=np.zeros((1, 1, 3)),
+    )
 
 
 def make_rig_drive(options: SceneOptions) -> RigScene:
@@ -72,15 +88,12 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     rig_of_frame = np.arange(num_frames) % NUM_RIGS
     rotations, centers = _frames(num_frames, rig_of_frame, layout_rng)
     turns = _sensor_rotations()
-    rig_of_image = rig_of_frame[frame_of_image]
+    rig_of_image, frame_rotations = rig_of_frame[frame_of_image], rotations[frame_of_image]
     offsets = _OFFSETS_M[rig_of_image, sensor_of_image]
-    streets = LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng)
-    layout = Layout(
-        centers=centers[frame_of_image] + np.einsum("nji,nj->ni", rotations[frame_of_image], offsets),
-        rotations=turns[rig_of_image, sensor_of_image] @ rotations[frame_of_image],
-        points=streets.points,
-        normals=streets.normals,
-        colors=streets.colors,
+    layout = replace(
+        LAYOUTS["drive"](num_frames // NUM_RIGS + 1, options.num_points, layout_rng),
+        centers=centers[frame_of_image] + np.einsum("nji,nj->ni", frame_rotations, offsets),
+        rotations=turns[rig_of_image, sensor_of_image] @ frame_rotations,
     )
     return RigScene(
         scene=scene_of(layout, options, rngs),

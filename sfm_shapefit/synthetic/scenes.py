@@ -12,8 +12,7 @@ constraint of the true relative rotation and of a baseline that does not exist, 
 gives it away. Its second image gets keypoints of its own for that, which belong to no point.
 
 Conventions are COLMAP's: x_cam = R x_world + t with t = -R C; pixels count from the image's top left corner.
-World axes: z is up; one unit is a meter. OpenCV is imported when a scene is projected and
-not before.
+World axes: z is up; one unit is a meter. OpenCV is imported when a scene is projected and not before.
 """
 
 from collections.abc import Iterator
@@ -25,7 +24,14 @@ from scipy.sparse import coo_array, csr_array
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.synthetic.layouts import FARTHEST_M, LAYOUTS, ByteArray, Layout, turn_at_random
+from sfm_shapefit.synthetic.layouts import (
+    FARTHEST_M,
+    LAYOUTS,
+    ByteArray,
+    Layout,
+    SceneCameras,
+    turn_at_random,
+)
 from sfm_shapefit.synthetic.options import SceneOptions
 
 # Nothing is photographed closer than this.
@@ -41,19 +47,9 @@ _RELATIVE_POSE_DIRECTION_FACTOR = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scene:
+class Scene(SceneCameras):
     """A photographed scene: n images, p points, m pairs, M matches, and what is false among them."""
 
-    options: SceneOptions
-    """What made it."""
-    calibration: FloatArray
-    """(3, 3) K, in pixels."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world, true."""
-    centers: FloatArray
-    """(n, 3) camera centers, true."""
-    stated_rotations: FloatArray
-    """(n, 3, 3) cam_from_world as a model states them: the true ones after `rotation_noise_deg`."""
     points: FloatArray
     """(p, 3) surface points."""
     colors: ByteArray
@@ -76,11 +72,6 @@ class Scene:
     """(m, 3, 3) rotation of cam_j_from_cam_i as two-view geometry would estimate it."""
     relative_translations: FloatArray
     """(m, 3) unit translation of cam_j_from_cam_i, of the false baseline where the pair is corrupted."""
-
-    @property
-    def num_images(self) -> int:
-        """Number of images, n."""
-        return len(self.centers)
 
     @property
     def num_pairs(self) -> int:
@@ -139,17 +130,13 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
     lists = [_thin(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
     scrambled = [_scramble(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
-    relative_rotations, relative_translations = _relative_poses(
-        layout, pairs, false_lists, ray_noise_rad, pose_rng
-    )
+    relative = _relative_poses(layout, pairs, false_lists, ray_noise_rad, pose_rng)
+    noise_rad = np.radians(options.rotation_noise_deg)
     return Scene(
         options=options,
-        calibration=options.calibration,
         rotations=layout.rotations,
         centers=layout.centers,
-        stated_rotations=turn_at_random(
-            layout.rotations, np.radians(options.rotation_noise_deg), rotation_rng
-        ),
+        stated_rotations=turn_at_random(layout.rotations, noise_rad, rotation_rng),
         points=layout.points,
         colors=layout.colors,
         keypoints=tuple(keypoints),
@@ -159,8 +146,8 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
         matches=np.concatenate([rows for rows, _ in scrambled]),
         match_is_wrong=np.concatenate([wrong for _, wrong in scrambled]),
         pair_is_corrupted=np.isin(np.arange(len(pairs)), list(false_lists)),
-        relative_rotations=relative_rotations,
-        relative_translations=relative_translations,
+        relative_rotations=relative[0],
+        relative_translations=relative[1],
     )
 
 
@@ -238,10 +225,7 @@ def _photograph(
 
 
 def _in_view_from(
-    points: FloatArray,
-    centers: FloatArray,
-    cam_from_world: FloatArray,
-    options: SceneOptions,
+    points: FloatArray, centers: FloatArray, cam_from_world: FloatArray, options: SceneOptions
 ) -> BoolArray:
     """Return (c, k): which of the points a camera at each of the centers would show, whatever they face."""
     img_from_world = options.calibration @ cam_from_world
@@ -250,16 +234,14 @@ def _in_view_from(
     in_front = (depth > _NEAREST_DEPTH_M) & (depth < FARTHEST_M)
     xy = homogeneous[:, :, :2] / np.where(in_front, depth, 1.0)[:, :, None]
     margin_px = 4.0 * options.pixel_noise_px  # so that noise hardly ever costs a keypoint
-    in_view: BoolArray = in_front & _inside_image(xy, options, margin_px)
-    return in_view
+    return in_front & _inside_image(xy, options, margin_px)
 
 
 def _inside_image(xy: FloatArray, options: SceneOptions, margin_px: float = 0.0) -> BoolArray:
     """Return which of the pixels (..., 2) lie inside the image, `margin_px` away from its border."""
     x, y = xy[..., 0], xy[..., 1]
     in_width = (x >= margin_px) & (x <= options.image_width - margin_px)
-    inside: BoolArray = in_width & (y >= margin_px) & (y <= options.image_height - margin_px)
-    return inside
+    return np.asarray(in_width & (y >= margin_px) & (y <= options.image_height - margin_px))
 
 
 # --- pairs and matches -----------------------------------------------------------------------------------
@@ -295,8 +277,6 @@ def _match_lists(
 ) -> list[IntArray]:
     """Return the (k, 2) matches of each pair, and append to the images the keypoints of the false lists."""
     real_points = list(keypoint_points)
-    appended = [[xy] for xy in keypoints]
-    count = [len(xy) for xy in keypoints]
     lists = []
     for e, pair in enumerate(pairs):
         if e not in false_lists:
@@ -304,15 +284,11 @@ def _match_lists(
             continue
         false = false_lists[e]
         image = pair[false.displaced]
-        new_keypoints = count[image] + np.arange(len(false.xy))
-        appended[image].append(false.xy)
-        count[image] += len(false.xy)
-        columns = [false.keypoints, new_keypoints]
+        columns = [false.keypoints, len(keypoints[image]) + np.arange(len(false.xy))]
         lists.append(np.stack(columns if false.displaced == 1 else columns[::-1], axis=1))
-    for image, parts in enumerate(appended):
-        keypoints[image] = np.concatenate(parts)
-        no_point = np.full(count[image] - len(real_points[image]), -1, dtype=np.int64)
-        keypoint_points[image] = np.concatenate([real_points[image], no_point])
+        no_point = np.full(len(false.xy), -1, dtype=np.int64)
+        keypoints[image] = np.concatenate([keypoints[image], false.xy])
+        keypoint_points[image] = np.concatenate([keypoint_points[image], no_point])
     return lists
 
 
@@ -420,12 +396,9 @@ def _false_centers(center: FloatArray, true_center: FloatArray, rng: np.random.G
     """
     baseline = float(np.linalg.norm(center - true_center))
     unit = normalized(rng.standard_normal((40, 3)))
-    anywhere = center + baseline * unit[:16]
     nearby = true_center + baseline * np.linspace(1.0, 0.25, 24)[:, None] * unit[16:]
-    candidates = np.concatenate([anywhere, nearby])
-    far_enough = np.linalg.norm(candidates - center, axis=1) >= 0.5 * baseline
-    kept: FloatArray = candidates[far_enough]
-    return kept
+    candidates = np.concatenate([center + baseline * unit[:16], nearby])
+    return np.asarray(candidates[np.linalg.norm(candidates - center, axis=1) >= 0.5 * baseline])
 
 
 def _relative_poses(

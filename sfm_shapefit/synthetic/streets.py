@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import normalized
-from sfm_shapefit.synthetic.graphs import Seed
+from sfm_shapefit.synthetic.graphs import GraphProblem, Seed, noisy_directions
 
 # A camera is paired with so many cameras ahead.
 _BAND = 10
@@ -23,20 +23,12 @@ _SPEED_RATIO, _WAVE = 3.0, 50.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StreetProblem:
-    """Cameras and points of a street, with the directions between them."""
+class StreetProblem(GraphProblem):
+    """Cameras 0..num_cameras-1 of a street, then points, meters; pairs of cameras, then (camera, point)."""
 
-    locations: FloatArray
-    """(n, 3) the truth in meters: cameras 0..num_cameras-1, then points."""
     num_cameras: int
-    edges: IntArray
-    """(m, 2) pairs of cameras, then (camera, point)."""
-    directions: FloatArray
-    """(m, 3) measured unit directions of t_i - t_j."""
     covariance: FloatArray
-    """(m, 2, 2) of each in its tangent plane, rad^2, as far as it is not wrong."""
-    corrupted: BoolArray
-    """(m,) True where the direction is a random one."""
+    """(m, 2, 2) of each direction in its tangent plane, rad^2, as far as it is not wrong."""
 
 
 def street_problem(
@@ -61,10 +53,9 @@ def street_problem(
     pairs = np.array([(i, j) for i in range(n) for j in range(i + 1, min(i + _BAND, n - 1) + 1)])
     edges = np.concatenate([pairs, seen_by + np.array([0, n])])
     to_point = np.arange(len(edges)) >= len(pairs)
-    true = normalized(locations[edges[:, 0]] - locations[edges[:, 1]])
     noise = np.where(to_point, _RAY_NOISE_RAD, _PAIR_NOISE_RAD)
-    measured = normalized(true + noise[:, None] * normalized(rng.standard_normal(true.shape)))
-    wrong = normalized(rng.standard_normal(true.shape))
+    measured = noisy_directions(locations, edges, noise[:, None], rng)
+    wrong = normalized(rng.standard_normal(measured.shape))
     corrupted = rng.random(len(edges)) < np.where(to_point, _RAY_SHARE_WRONG, _PAIR_SHARE_WRONG)
     return StreetProblem(
         locations=locations,

@@ -10,6 +10,7 @@ axes: z is up; one unit is a meter.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -57,8 +58,7 @@ class Surfaces:
         return trimesh.Trimesh(vertices=self.corners.reshape(-1, 3), faces=faces, process=False)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Part:
+class _Part(NamedTuple):
     """A mesh with its picture."""
 
     corners: FloatArray
@@ -67,24 +67,19 @@ class _Part:
     texture: ByteArray
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Place:
-    """The axes of a thing: its origin on the ground, along its front, and into it."""
+class _Place(NamedTuple):
+    """The axes of a thing: its origin on the ground, and the horizontal unit vector along its front."""
 
     origin: FloatArray
     along: FloatArray
-    inward: FloatArray
 
-    @property
-    def world_from_local(self) -> FloatArray:
-        """The (4, 4) transform of coordinates (along, inward, up)."""
-        transform = np.eye(4)
-        transform[:3, :3] = np.stack([self.along, self.inward, [0.0, 0.0, 1.0]], axis=1)
-        transform[:3, 3] = self.origin
-        return transform
+    def axes(self) -> FloatArray:
+        """Return (3, 3) with columns along, into the thing (to the left), and up."""
+        x, y, _ = self.along
+        return np.array([[x, -y, 0.0], [y, x, 0.0], [0.0, 0.0, 1.0]])
 
 
-_UPRIGHT = _Place(origin=np.zeros(3), along=np.array([1.0, 0.0, 0.0]), inward=np.array([0.0, 1.0, 0.0]))
+_ALONG_X = np.array([1.0, 0.0, 0.0])
 
 
 def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
@@ -126,8 +121,11 @@ def _facade(num_images: int, repeated: float, rng: np.random.Generator) -> list[
     rows = -(-num_images // columns)
     num_houses = int(np.ceil((2.0 * columns + 20.0) / _HOUSE_WIDTH_M))
     low, high = -10.0, -10.0 + num_houses * _HOUSE_WIDTH_M
-    start = _Place(origin=np.array([low, 0.0, 0.0]), along=_UPRIGHT.along, inward=_UPRIGHT.inward)
-    houses = _row(start, num_houses, _house_maker(num_houses, 2.0 * rows + 8.0, repeated, rng))
+    houses = _row(
+        _Place(np.array([low, 0.0, 0.0]), _ALONG_X),
+        num_houses,
+        _house_maker(num_houses, 2.0 * rows + 8.0, repeated, rng),
+    )
     at = np.column_stack([rng.uniform(low, high, 2 * columns), rng.uniform(-3.0, -1.0, 2 * columns)])
     return houses + _boxes(at, 1.0, rng) + [_ground((low, -16.0), (high, 4.0), rng)]
 
@@ -137,12 +135,11 @@ def _courtyard(_num_images: int, repeated: float, rng: np.random.Generator) -> l
     half = np.array([12.0, 9.0])
     maker = _house_maker(12, 8.0, repeated, rng)
     parts = []
-    for turn in range(4):
-        x, y = [(1, 0), (0, 1), (-1, 0), (0, -1)][turn]
+    for turn, (x, y) in enumerate([(1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0)]):
         along, inward = np.array([x, y, 0.0]), np.array([-y, x, 0.0])
-        length, distance = 2.0 * half[turn % 2], half[1 - turn % 2]
-        start = _Place(origin=-0.5 * length * along + distance * inward, along=along, inward=inward)
-        parts += _row(start, 3, maker)  # those that reach beyond a corner are hidden by the next row
+        origin = -half[turn % 2] * along + half[1 - turn % 2] * inward
+        # Houses that reach beyond a corner are hidden by the next row.
+        parts += _row(_Place(origin, along), 3, maker)
     angle = rng.uniform(0.0, 2.0 * np.pi, 16)
     at = 0.85 * half * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     return parts + _boxes(at, 1.0, rng) + [_ground((-13.0, -10.0), (13.0, 10.0), rng)]
@@ -160,8 +157,7 @@ def _drive(num_images: int, repeated: float, rng: np.random.Generator) -> list[_
         next_feet = np.concatenate([feet[1:], feet[-1:] + (feet[-1:] - feet[-2:-1])])
         for foot, next_foot in zip(feet, next_feet, strict=True):
             ends = (foot, next_foot) if side > 0.0 else (next_foot, foot)
-            along = normalized(ends[1] - ends[0])
-            parts += maker(_Place(origin=ends[0], along=along, inward=_left_of(along)))
+            parts += maker(_Place(ends[0], normalized(ends[1] - ends[0])))
     stations = rng.uniform(0.0, end, round(end / 4.0))
     road, _, left = street(stations)
     sides = rng.choice([-1.0, 1.0], len(stations)) * rng.uniform(4.5, 5.5, len(stations))
@@ -188,9 +184,7 @@ def _ring(_num_images: int, repeated: float, rng: np.random.Generator) -> list[_
     for k, repeats in enumerate(_choose(_TOWER_SIDES, repeated, rng)):
         picture = repeating if repeats else facade_texture(*size, 100, rng)
         rows = side == k
-        parts.append(
-            _Part(corners=corners[rows], texels=texels[rows], normals=normals[rows], texture=picture)
-        )
+        parts.append(_Part(corners[rows], texels[rows], normals[rows], picture))
     around_foot = 2.0 * np.pi * np.arange(10) / 10.0
     at = 2.0 * np.stack([np.cos(around_foot), np.sin(around_foot)], axis=1) + rng.uniform(-0.2, 0.2, (10, 2))
     ground = _ground((-8.0, -8.0), (8.0, 8.0), rng, floor)
@@ -213,9 +207,9 @@ def _house_maker(
 ) -> Callable[[_Place], list[_Part]]:
     """Return what puts a house at each place it is given: at some the one that repeats, else a new one."""
     width = _HOUSE_WIDTH_M
+    size = (round(height_m * _TEXELS_PER_M), round(width * _TEXELS_PER_M))
 
     def drawn() -> tuple[ByteArray, FloatArray, FloatArray]:
-        size = (round(height_m * _TEXELS_PER_M), round(width * _TEXELS_PER_M))
         picture = facade_texture(*size, round(_STOREY_M * _TEXELS_PER_M), rng)
         count = round(width * height_m / 12.0)
         low = rng.uniform([0.2, 0.0, 1.0], [width - 1.2, 0.0, height_m - 1.5], (count, 3))
@@ -227,26 +221,23 @@ def _house_maker(
 
     def house(place: _Place) -> list[_Part]:
         picture, low, extent = repeating if next(repeats) else drawn()
-        front = _box(place, np.zeros(3), np.array([width, _HOUSE_DEPTH_M, height_m]), picture)
         before = low - extent * [0.0, 1.0, 0.0]  # balconies stand out of the front
         balconies = [_box(place, a, a + e, picture) for a, e in zip(before, extent, strict=True)]
-        return [front, *balconies]
+        return [_box(place, np.zeros(3), np.array([width, _HOUSE_DEPTH_M, height_m]), picture), *balconies]
 
     return house
 
 
 def _choose(count: int, fraction: float, rng: np.random.Generator) -> list[bool]:
     """Return which of so many things are among a random fraction of them."""
-    chosen: list[bool] = (rng.permutation(count) < round(fraction * count)).tolist()
-    return chosen
+    return list(rng.permutation(count) < round(fraction * count))
 
 
 def _row(start: _Place, num_houses: int, maker: Callable[[_Place], list[_Part]]) -> list[_Part]:
     """Return houses side by side from a place on."""
     parts = []
     for k in range(num_houses):
-        origin = start.origin + k * _HOUSE_WIDTH_M * start.along
-        parts += maker(_Place(origin=origin, along=start.along, inward=start.inward))
+        parts += maker(_Place(start.origin + k * _HOUSE_WIDTH_M * start.along, start.along))
     return parts
 
 
@@ -261,8 +252,7 @@ def _boxes(
     parts = []
     for x, y in at.tolist():
         angle = rng.uniform(0.0, 2.0 * np.pi)
-        along = np.array([np.cos(angle), np.sin(angle), 0.0])
-        place = _Place(origin=np.array([x, y, floor_m]), along=along, inward=_left_of(along))
+        place = _Place(np.array([x, y, floor_m]), np.array([np.cos(angle), np.sin(angle), 0.0]))
         extent = size_m * rng.uniform(0.6, 1.4, 3)
         pixels = round(2.0 * size_m * texels_per_m)
         low = -0.5 * extent * [1.0, 1.0, 0.0]
@@ -278,7 +268,8 @@ def _ground(
     density = min(_TEXELS_PER_M, _MOST_TEXELS / float(size.max()))
     width_px, height_px = np.ceil(density * size).astype(int).tolist()
     picture = ground_texture(height_px, width_px, rng)
-    return _box(_UPRIGHT, np.array([*low, level_m - 0.1]), np.array([*high, level_m]), picture, density)
+    place = _Place(np.zeros(3), _ALONG_X)
+    return _box(place, np.array([*low, level_m - 0.1]), np.array([*high, level_m]), picture, density)
 
 
 def _box(
@@ -292,15 +283,6 @@ def _box(
     top = np.where(down == 2, high[2], high[1])[:, None]
     rows = np.arange(len(local))
     u, v = local[rows, :, across], top - local[rows, :, down]
-    transform = place.world_from_local
-    return _Part(
-        corners=local @ transform[:3, :3].T + transform[:3, 3],
-        texels=texels_per_m * np.stack([u, v], axis=2),
-        normals=normals @ transform[:3, :3].T,
-        texture=picture,
-    )
-
-
-def _left_of(direction: FloatArray) -> FloatArray:
-    """Return the horizontal unit vector to the left of a horizontal one."""
-    return np.array([-direction[1], direction[0], 0.0])
+    axes = place.axes()
+    texels = texels_per_m * np.stack([u, v], axis=2)
+    return _Part(local @ axes.T + place.origin, texels, normals @ axes.T, picture)
