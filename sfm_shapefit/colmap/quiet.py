@@ -27,7 +27,11 @@ _heard = ContextVar("pycolmap_is_heard", default=False)
 
 @contextmanager
 def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
-    """Let pycolmap's messages through while the block runs, or, with False, silence them as by default."""
+    """Let pycolmap's messages through while the block runs, or silence them as by default.
+
+    Args:
+        enabled: let them through.
+    """
     token = _heard.set(enabled)
     try:
         yield

@@ -12,7 +12,7 @@ from tests.scenes import RING, ROOT
 
 
 def failing(error):
-    with console.reported():
+    with console.report_errors():
         raise error
 
 

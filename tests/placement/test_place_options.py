@@ -208,7 +208,5 @@ def test_what_the_rejected_pairs_agree_on_is_asked_anew_after_priors_pulled():
 
 def test_priors_do_not_pull_with_a_larger_factor_than_is_allowed(reset):
     placement, positions = reset
-    with pytest.raises(
-        InputError, match="factor_memory_mb allows 0; raise it, or leave out refine_with_priors"
-    ):
+    with pytest.raises(UnsolvableError, match="more than the 0 MB allowed for one"):
         pull(placement, priors_for(np.arange(40), positions), factor_memory_mb=NO_FACTOR)

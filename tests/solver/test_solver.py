@@ -259,6 +259,6 @@ def test_a_result_is_one_line_that_says_whether_it_converged():
     graph = problem(13, sigma=0.05)[0]
     whole, short = solve(graph), solve(graph, SolverOptions(max_iterations=3))
     assert (whole.converged, short.converged) == (True, False)
-    assert repr(whole).startswith("SolverResult(20 nodes in 3 dimensions, converged: objective 0.")
+    assert repr(whole).startswith("<SolverResult: 20 locations, converged, objective 0.")
     assert "max_iterations" in repr(short)
     assert len(repr(short)) < 150
