@@ -11,8 +11,9 @@ One step of Levenberg-Marquardt solves (H + mu diag(H)) step = -gradient (Marqua
 
     M = w (I - beta r r^T),        w = rho'(|r|^2) = 1 / (1 + |r|^2 / c^2),
 
-with beta from rho'' as far as M stays positive (Triggs et al. 2000, section 4.3): near the minimum steps
-converge as those of plain squares do, while the gradient w r has no approximation in it. H is
+with beta = 0 far from the minimum, where reweighted squares are a safe bound of the loss, and near it from
+rho'' as far as M stays positive (Triggs et al. 2000, section 4.3): there, steps converge as those of plain
+squares do. The gradient w r has no approximation in it. H is
 
     [ U    W^T ]   nodes: a frame (center, rotation vector), a lens
     [ W    V   ]   points: V is 3 x 3 blocks

@@ -76,6 +76,9 @@ class Layout:
     link_pair: IntArray
     """(q,) the pair of each link."""
 
+    turns: bool
+    """Whether rotations are unknowns."""
+
     @property
     def num_nodes(self) -> int:
         """Number of nodes, N."""
@@ -133,6 +136,7 @@ def lay_out(problem: AdjustmentProblem, options: AdjustmentOptions) -> Layout:
         entries_by_node=by_node,
         first_pair=first_pair,
         pairs=pairs,
+        turns=not options.hold_rotations,
         link_pair=np.searchsorted(pair_keys, links[:, 0] * len(active) + links[:, 1]),
     )
 

@@ -28,7 +28,6 @@ CHUNKS = 4
 """Into which the points are cut; each has sums of all nodes of its own."""
 
 _LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
-_LEAST_CURVATURE = 0.1  # of the weight of a residual, kept along it where the loss bends down
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -64,9 +63,21 @@ class NormalEquations:
 
 
 def linearise(
-    layout: Layout, values: Values, loss_scale_px: float | None, workers: Workers
+    layout: Layout,
+    values: Values,
+    loss_scale_px: float | None,
+    workers: Workers,
+    least_curvature: float = 1.0,
 ) -> NormalEquations:
-    """Return the normal equations of all observations at the given values."""
+    """Return the normal equations of all observations at the given values.
+
+    Args:
+        layout, values: what is adjusted, and where.
+        loss_scale_px: of the Cauchy loss; None for squares.
+        workers: share the chunks.
+        least_curvature: of the loss along a residual, as a share of its weight. 1 gives reweighted squares,
+            a bound of the loss from above; less lets it bend as it does, down to that share.
+    """
     num_nodes, num_links = layout.num_nodes, len(layout.links)
     nodes = np.zeros((CHUNKS, num_nodes, SLOTS, SLOTS))
     gradients = np.zeros((CHUNKS, num_nodes, SLOTS))
@@ -75,10 +86,9 @@ def linearise(
     point_gradients = np.empty((layout.num_points, 3))
     entries = np.empty((len(layout.entry_node), 3, SLOTS))
     given = _given(layout, values, loss_scale_px)
-    turns = np.append(layout.active.all(axis=1), False)[layout.node_of_frame]
     structure = (
-        layout.lens_slots, turns, layout.node_of_frame, layout.node_of_lens, layout.frame_entry,
-        layout.lens_entry, layout.link_of_camera, layout.first_entry,
+        layout.lens_slots, layout.turns, layout.node_of_frame, layout.node_of_lens, layout.frame_entry,
+        layout.lens_entry, layout.link_of_camera, layout.first_entry, least_curvature,
     )  # fmt: skip
     by_point_sums = (points, point_gradients, entries)
 
@@ -218,9 +228,8 @@ def _write_residuals(given: Any, out: Any) -> None:
 def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_point_sums: Any) -> None:
     """Add the observations of the points begin..end-1 to the normal equations."""
     first, cameras, pixels, frame_of_camera, lens_of_camera, _, _, _, _, points, lenses, scale = given
-    lens_slots, turns, node_of_frame, node_of_lens, frame_entry, lens_entry, link_of_camera, first_entry = (
-        structure
-    )
+    lens_slots, turns, node_of_frame, node_of_lens, frame_entry, lens_entry = structure[:6]
+    link_of_camera, first_entry, least_curvature = structure[6:]
     nodes, gradients, links = sums
     blocks, point_gradients, entries = by_point_sums
     body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
@@ -238,8 +247,8 @@ def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             _project(seen, lenses[lens], residual)
             residual -= pixels[k]
             _differentiate(seen, lenses[lens], by_seen, by_values)
-            _turn_derivatives(given, camera, body, by_seen, turns[frame], by_point, by_frame)
-            weights = _weigh(residual, scale)
+            _turn_derivatives(given, camera, body, by_seen, turns, by_point, by_frame)
+            weights = _weigh(residual, scale, least_curvature)
             _add_point(by_point, weights, residual, blocks[p], point_gradients[p])
             if frame_entry[k] >= 0:
                 node = node_of_frame[frame]
@@ -278,14 +287,17 @@ def _turn_derivatives(
 
 
 @kernel(exact=True)
-def _weigh(residual: Any, scale: float) -> tuple[float, float, float, float]:
-    """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature."""
+def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, float, float]:
+    """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature.
+
+    The curvature along the residual is at least the share `least` of that across it.
+    """
     if scale == np.inf:
         return 1.0, 1.0, 0.0, 1.0
     x, y = residual[0], residual[1]
     square = x * x + y * y
     w = 1.0 / (1.0 + square / scale)
-    bend = min(2.0 * w / scale, (1.0 - _LEAST_CURVATURE) / max(square, 1e-300))
+    bend = min(2.0 * w / scale, (1.0 - least) / max(square, 1e-300))
     return w, w * (1.0 - bend * x * x), -w * bend * x * y, w * (1.0 - bend * y * y)
 
 

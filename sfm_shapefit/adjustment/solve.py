@@ -26,7 +26,9 @@ from sfm_shapefit.laplacian.operators import Workers
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
 _LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
-_ROUNDING = 1e-15  # share of the cost: a smaller predicted decrease cannot be seen
+_ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
+_NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
+_LEAST_CURVATURE = 0.1  # of the weight of a residual, kept along it there
 _EXACT_PX = 1e-10  # rms residual that is rounding
 
 
@@ -122,10 +124,15 @@ def values_of(problem: AdjustmentProblem) -> Values:
 
 
 def linearise_all(
-    problem: AdjustmentProblem, layout: Layout, values: Values, options: AdjustmentOptions, workers: Workers
+    problem: AdjustmentProblem,
+    layout: Layout,
+    values: Values,
+    options: AdjustmentOptions,
+    workers: Workers,
+    least_curvature: float = 1.0,
 ) -> NormalEquations:
-    """Return the normal equations of observations and priors."""
-    normal = linearise(layout, values, options.loss_scale_px, workers)
+    """Return the normal equations of observations and priors; see `linearise`."""
+    normal = linearise(layout, values, options.loss_scale_px, workers, least_curvature)
     moves = layout.node_of_frame >= 0
     nodes = layout.node_of_frame[moves]
     for add, slots in ((add_center_prior, slice(0, 3)), (add_rotation_prior, slice(3, 6))):
@@ -150,6 +157,7 @@ class _Run:
         self.damping, self.growth = _FIRST_DAMPING, 2.0
         self.costs = [self.cost(self.values)]
         self.gradient_norm, self.iterations = math.inf, 0
+        self.bends, self.near = False, _NEAR
 
     def cost(self, values: Values) -> float:
         """Return the cost of observations and priors."""
@@ -159,7 +167,8 @@ class _Run:
     def iterate(self, on_iteration: OnIteration | None) -> Ending:
         """Take steps until a reason to stop."""
         while True:
-            normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers)
+            least = _LEAST_CURVATURE if self.bends else 1.0
+            normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers, least)
             self.gradient_norm = _gradient_norm(normal, self.costs[-1])
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
@@ -169,40 +178,47 @@ class _Run:
                 return ending
 
     def lower(self, normal: NormalEquations, on_iteration: OnIteration | None) -> Ending | None:
-        """Raise the damping until a step lowers the cost; return a reason to stop, if there is one."""
+        """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
         while True:
             if self.iterations >= self.options.max_iterations:
                 return Ending.MAX_ITERATIONS
-            self.iterations += 1
-            before = self.costs[-1]
-            proposal = self.propose(normal)
-            accepted = False
-            if proposal is not None:
-                values, predicted = proposal
-                if predicted <= _ROUNDING * before:
-                    return Ending.COST
-                after = self.cost(values)
-                gain = (before - after) / predicted
-                accepted = after < before and gain >= _LEAST_GAIN
-            if accepted:
-                self.values = values
-                self.costs.append(after)
-                self.damping = max(
-                    self.damping * max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3), _LEAST_DAMPING
-                )
-                self.growth = 2.0
-            else:
-                self.damping *= self.growth
-                self.growth *= 2.0
+            before, bent = self.costs[-1], self.bends
+            predicted, accepted = self.attempt(normal)
+            if not accepted and predicted <= _ROUNDING * before:
+                return Ending.COST
             step = AdjustmentStep(self.iterations, self.costs[-1], self.damping, accepted)
             answer = None if on_iteration is None else on_iteration(step)
             if answer is not None and not answer:  # a numpy False cancels too
                 return Ending.CANCELLED
             if accepted:
-                small = before - after <= self.options.cost_tolerance * before
+                small = before - self.costs[-1] <= self.options.cost_tolerance * before
                 return Ending.COST if small else None
+            if bent:
+                return None
             if self.damping > _MOST_DAMPING:
                 return Ending.STALLED
+
+    def attempt(self, normal: NormalEquations) -> tuple[float, bool]:
+        """Try one step, take it if it lowers the cost; return the decrease predicted, and whether it did."""
+        self.iterations += 1
+        before = self.costs[-1]
+        proposal = self.propose(normal)
+        values, predicted = (self.values, math.inf) if proposal is None else proposal
+        after = before if proposal is None else self.cost(values)
+        accepted = after < before and before - after >= _LEAST_GAIN * predicted
+        if accepted:
+            gain = (before - after) / predicted if predicted > 0.0 else 1.0
+            slower = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
+            self.costs.append(after)
+            self.growth = 2.0
+            self.bends = before - after <= self.near * before
+        elif self.bends:
+            self.bends, self.near = False, 0.1 * self.near
+        else:
+            self.damping *= self.growth
+            self.growth *= 2.0
+        return predicted, accepted
 
     def propose(self, normal: NormalEquations) -> tuple[Values, float] | None:
         """Return the values after a damped step and the decrease predicted; None if it has no solution."""
@@ -218,24 +234,24 @@ class _Run:
         damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
         slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
         predicted = 0.5 * (self.damping * damped - slope)
-        values = self.step(steps, point_steps)
+        values = move(layout, self.values, steps, point_steps)
         return None if values is None or not math.isfinite(predicted) else (values, predicted)
 
-    def step(self, steps: FloatArray, point_steps: FloatArray) -> Values | None:
-        """Return the values after steps of nodes (N, 6) and points (k, 3); None if a focal length is lost."""
-        layout, values = self.layout, self.values
-        moves = layout.node_of_frame >= 0
-        own = steps[layout.node_of_frame[moves]]
-        centers, rotations, lenses = values.centers.copy(), values.rotations, values.lenses.copy()
-        centers[moves] += own[:, :3]
-        if not self.options.hold_rotations:
-            rotations = rotations.copy()
-            rotations[moves] = turn(rotations[moves], own[:, 3:])
-        lens, value = np.nonzero(layout.lens_slots >= 0)
-        lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
-        if (lenses[:, :2] <= 0.0).any():
-            return None
-        return Values(rotations=rotations, centers=centers, points=values.points + point_steps, lenses=lenses)
+
+def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatArray) -> Values | None:
+    """Return the values after steps of nodes (N, 6) and points (k, 3); None if a focal length is lost."""
+    frames = np.flatnonzero(layout.node_of_frame >= 0)
+    own = steps[layout.node_of_frame[frames]]
+    centers, rotations, lenses = values.centers.copy(), values.rotations, values.lenses.copy()
+    centers[frames] += own[:, :3]
+    if layout.turns:
+        rotations = rotations.copy()
+        rotations[frames] = turn(rotations[frames], own[:, 3:])
+    lens, value = np.nonzero(layout.lens_slots >= 0)
+    lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
+    if (lenses[:, :2] <= 0.0).any():
+        return None
+    return Values(rotations=rotations, centers=centers, points=values.points + point_steps, lenses=lenses)
 
 
 def _gradient_norm(normal: NormalEquations, cost: float) -> float:

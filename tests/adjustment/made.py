@@ -6,7 +6,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig, reprojection_errors_px
+from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.residuals import reprojection_residuals
@@ -33,7 +33,7 @@ def looking_at(centers, targets):
 def ring_problem(
     rng, num_cameras=12, num_points=200, *, models=("SIMPLE_PINHOLE",), noise_px=0.5, share=0.5, sensors=0
 ):
-    """Return the true values with noisy pixels; with `sensors` > 0, each frame is a rig of so many cameras."""
+    """Return the truth with noisy pixels; with `sensors` > 0, each frame is a rig of so many cameras."""
     angles = 2.0 * np.pi * np.arange(num_cameras) / num_cameras
     centers = np.stack([4.0 * np.cos(angles), 4.0 * np.sin(angles), 0.5 * np.sin(3.0 * angles)], axis=1)
     points = rng.uniform(-1.0, 1.0, (num_points, 3))
@@ -141,6 +141,3 @@ def adjusted_by_pycolmap(
     solver.max_num_iterations, solver.num_threads = max_iterations, 1
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction)
     return adjuster.solve().ceres_summary
-
-
-__all__ = ["LENSES", "adjusted_by_pycolmap", "disturbed", "problem_of", "reprojection_errors_px", "ring_problem"]
