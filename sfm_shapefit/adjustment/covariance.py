@@ -29,7 +29,6 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
 
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
-_POINT_DAMPING = 1e-12  # a point of one view says nothing about its camera; held, it would
 _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest
 
 
@@ -67,7 +66,7 @@ def estimate_covariances(
     unseen = np.zeros(problem.num_frames, np.bool_)
     own = layout.node_of_frame >= 0
     unseen[own] = ~np.einsum("naa->na", normal.nodes)[layout.node_of_frame[own], :3].any(axis=1)
-    system = eliminate_points(layout, normal, _POINT_DAMPING, workers)
+    system = eliminate_points(layout, normal, 0.0, workers)
     workers.close()
     free = free_similarities(problem, options)
     motions = _motions(problem, layout, free, unseen)
@@ -104,9 +103,9 @@ def _two_nodes(problem: AdjustmentProblem, layout: Layout, unseen: BoolArray) ->
 def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None:
     """Double as many diagonal entries of the nodes given as there are motions, chosen to tell these apart."""
     count = motions.shape[2]
-    seen_there = motions[nodes].reshape(-1, count)
     if count == 0:
         return
+    seen_there = motions[nodes].reshape(-1, count)
     _, _, order = qr((seen_there / np.abs(motions).max(axis=(0, 1))).T, mode="economic", pivoting=True)
     rows, slots = np.divmod(order[:count], SLOTS)
     system.diagonal[nodes[rows], slots, slots] *= 2.0

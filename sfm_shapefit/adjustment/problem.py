@@ -174,10 +174,10 @@ class AdjustmentProblem:
         for name in ("cameras_seeing", "points_seen"):
             self._take(name, np.int64, (len(self.pixels),))
         _check_rotations(self.rotations, "rotation")
-        _check_range(self.cameras_seeing, self.num_cameras, "camera")
         _check_range(self.points_seen, self.num_points, "point")
         _check_range(self.lens_of_camera, len(self.lenses), "lens")
         self._check_rig()
+        _check_range(self.cameras_seeing, self.num_cameras, "camera")
         self._check_priors()
 
     @property

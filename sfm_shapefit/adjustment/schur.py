@@ -3,9 +3,10 @@
     S_ij = U_ij - sum_p W_ip^T V_p^-1 W_jp        c_i = -b_i + sum_p W_ip^T V_p^-1 b_p
     dX_p = -V_p^-1 (b_p + sum_i W_ip d_i)
 
-V_p is 3 x 3. A point that its observations do not determine (all behind their cameras, or a single view
-without damping) gets V_p^-1 = 0: it is held. So is an unknown on which nothing depends, such as the pose of
-a camera without observations: its diagonal entry becomes 1.
+V_p is 3 x 3. Where it is singular (all observations behind their cameras; a single view, without damping) a
+generalised inverse serves as well, for W_ip vanishes on the same directions: the point is held along them,
+and says nothing of its cameras that it should not. An unknown on which nothing depends, such as the pose of a
+camera without observations, is held too: its diagonal entry becomes 1.
 """
 
 from collections.abc import Callable
@@ -21,7 +22,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.operators import Workers
 
 _JOBS = 16  # ranges of nodes or points; a row is summed by one of them, so that their number does not matter
-_SINGULAR = 1e-14  # least pivot of a point's block, relative to its diagonal
+_SINGULAR = 1e-12  # least pivot of a point's block, relative to its diagonal: a parallax of 1e-6 rad
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -79,25 +80,20 @@ def step_points(
 
 @kernel(exact=True)
 def _invert(blocks: Any, damping: float, inverses: Any) -> None:
-    """Invert symmetric 3 x 3 blocks with a damped diagonal by their Cholesky factors; 0 where singular."""
+    """Invert 3 x 3 blocks L D L^T with a damped diagonal; the inverse of a pivot that is rounding is 0."""
     more = 1.0 + damping
     for p in range(len(blocks)):
         v = blocks[p]
-        a, d, f = v[0] * more, v[3] * more, v[5] * more
-        inverses[p] = 0.0
-        if not a > 0.0:
-            continue
-        l10, l20 = v[1] / a, v[2] / a
+        d0, d, f = v[0] * more, v[3] * more, v[5] * more
+        i0 = 1.0 / d0 if d0 > 0.0 else 0.0
+        l10, l20 = v[1] * i0, v[2] * i0
         d1 = d - l10 * v[1]
-        if not d1 > _SINGULAR * d:
-            continue
-        l21 = (v[4] - l20 * v[1]) / d1
-        d2 = f - l20 * v[2] - l21 * l21 * d1
-        if not d2 > _SINGULAR * f:
-            continue
-        m20 = l10 * l21 - l20  # the inverse of the unit triangle has -l10, m20, -l21 below its diagonal
-        ia, i1, i2 = 1.0 / a, 1.0 / d1, 1.0 / d2
-        inverses[p, 0] = ia + l10 * l10 * i1 + m20 * m20 * i2
+        i1 = 1.0 / d1 if d1 > _SINGULAR * d else 0.0
+        l21 = (v[4] - l20 * v[1]) * i1
+        d2 = f - l20 * v[2] - l21 * (v[4] - l20 * v[1])
+        i2 = 1.0 / d2 if d2 > _SINGULAR * f else 0.0
+        m20 = l10 * l21 - l20  # the inverse of L has -l10, m20 and -l21 below its diagonal
+        inverses[p, 0] = i0 + l10 * l10 * i1 + m20 * m20 * i2
         inverses[p, 1] = -l10 * i1 - m20 * l21 * i2
         inverses[p, 2] = m20 * i2
         inverses[p, 3] = i1 + l21 * l21 * i2

@@ -28,7 +28,7 @@ _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
 _LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
-_LEAST_CURVATURE = 0.1  # of the weight of a residual, kept along it there
+_LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
 _EXACT_PX = 1e-10  # rms residual that is rounding
 
 

@@ -46,8 +46,9 @@ def test_it_ends_at_a_stationary_point_that_is_as_good_as_the_noise():
     assert found.gradient_norm < 1e-7
     assert (np.diff(found.costs) < 0.0).all()
     assert found.cost < adjust(truth, TIGHT).costs[0]  # better than the truth, which noise has moved away
-    # 12 cameras with 100 points each at .5 px of 500 px from 4 away: 4e-3 for a point, a tenth for a camera
-    assert error(found.problem, truth) < 0.1 * error(start, truth)
+    # half a pixel of 500 px at a distance of 4 is 4e-3; a camera's depth is worse, its 100 points are many
+    assert error(found.problem, truth) < 4e-3
+    assert error(start, truth) > 2e-2
     misses = reprojection_errors_px(found.problem)
     assert 0.5 < np.sqrt(np.mean(misses**2) / 2.0) / 0.5 < 1.0
 
@@ -81,7 +82,7 @@ def test_fixed_frames_stay_to_the_bit(fixed, hold):
 def test_everything_fixed_leaves_points_to_adjust():
     truth, start = started(fixed=range(12))
     found = adjust(start, TIGHT)
-    assert found.gradient_norm < 1e-9
+    assert found.gradient_norm < 1e-7
     off = np.linalg.norm(found.problem.points - truth.points, axis=1)
     assert np.median(off) < 0.2 * np.median(np.linalg.norm(start.points - truth.points, axis=1))
 
@@ -155,6 +156,17 @@ def test_a_rig_of_one_sensor_at_its_origin_is_a_camera():
     )
 
 
+def edge_px(lens):
+    """Where a ray near the edge of the image meets it."""
+    fx, fy, cx, cy, k1, k2, p1, p2 = lens.values()
+    u, v = 0.25, 0.15
+    s = u * u + v * v
+    radial = 1.0 + k1 * s + k2 * s * s
+    x = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
+    y = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
+    return np.array([fx * x + cx, fy * y + cy])
+
+
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
 def test_a_wrong_focal_length_and_distortion_are_found(model):
     truth, start = started(models=(model,), noise_px=0.1)
@@ -165,9 +177,10 @@ def test_a_wrong_focal_length_and_distortion_are_found(model):
         wrong[-1] += 0.01
     start = replace(start, lenses=[Lens(model, tuple(wrong))])
     found = adjust(start, replace(TIGHT, free_focal_lengths=True, free_distortion=True)).problem.lenses[0]
-    # .1 px on 1200 observations: a focal length to .1 px / sqrt(1200) / .2 of it, distortion less well
+    # .1 px on 1200 observations: a focal length to .1 px / sqrt(1200) / .2 of it; k1 and k2 only together
     np.testing.assert_allclose(found.parameters[0], lens.parameters[0], rtol=1e-3)
-    np.testing.assert_allclose(found.parameters[3:], lens.parameters[3:], atol=5e-3)
+    np.testing.assert_allclose(edge_px(found), edge_px(lens), atol=0.3)
+    assert np.abs(edge_px(start.lenses[0]) - edge_px(lens)).max() > 3.0
     held = adjust(start, TIGHT).problem.lenses[0]
     assert held == start.lenses[0]
     fixed = replace(start, lenses=[replace(start.lenses[0], fixed=True)])

@@ -57,7 +57,7 @@ def test_both_measure_the_same_cost():
 def test_the_optimum_is_that_of_pycolmap_on_bundled_scenes(name):
     rng = np.random.default_rng(0)
     ours, theirs, cost, size = both_answers(noisy_model(name, rng), rng, TIGHT)
-    assert ours.gradient_norm < 1e-8
+    assert ours.gradient_norm < 1e-7
     assert ours.cost == pytest.approx(cost, rel=1e-9)
     np.testing.assert_allclose(theirs, ours.problem.centers, atol=1e-6 * size)
 
