@@ -81,18 +81,19 @@ def test_drawn_noise_scatters_as_the_covariances_say():
     exact = ring_problem(np.random.default_rng(0), 6, 40, noise_px=0.0)
     rng = np.random.default_rng(1)
     centers, turns = [], []
-    for _ in range(200):
+    for _ in range(120):
         pixels = exact.pixels + PLAIN.noise_px * rng.standard_normal(exact.pixels.shape)
         found = adjust(replace(exact, pixels=pixels), PLAIN).problem
         centers.append(found.centers - exact.centers)
         turns.append(Rotation.from_matrix(found.rotations @ exact.rotations.transpose(0, 2, 1)).as_rotvec())
     expected = estimate_covariances(exact, PLAIN)
-    # A variance of 200 draws is off by sqrt(2 / 200) = 10 %, the mean of 18 of them by 3 %.
+    # A variance of 120 draws is off by sqrt(2 / 120) = 13 %, the mean of 18 of them by 3 % and more,
+    # for neighbors are correlated.
     for drawn, covariances in ((centers, expected.centers), (turns, expected.rotations)):
         ratios = np.var(np.array(drawn), axis=0) / np.einsum("naa->na", covariances)
-        assert 0.9 < ratios.mean() < 1.1
-        assert ratios.min() > 0.6
-        assert ratios.max() < 1.5
+        assert 0.88 < ratios.mean() < 1.12
+        assert ratios.min() > 0.55
+        assert ratios.max() < 1.6
 
 
 def test_what_nothing_sees_is_not_a_number_and_moves_nothing_else():
