@@ -13,6 +13,7 @@ takes one solve for each of the at most seven motions.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg import qr
@@ -27,6 +28,7 @@ from sfm_shapefit.adjustment.solve import linearise_all, values_of
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.settings import merge_options
 
 _RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
 _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest
@@ -45,7 +47,7 @@ class FrameCovariances:
 
 
 def estimate_covariances(
-    problem: AdjustmentProblem, options: AdjustmentOptions | None = None
+    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
 ) -> FrameCovariances:
     """Return the covariances of the frames at the minimum that a problem stands at.
 
@@ -55,11 +57,12 @@ def estimate_covariances(
     Args:
         problem: `Adjusted.problem`.
         options: as it was adjusted with.
+        **overrides: single options by name.
 
     Raises:
         UnsolvableError: if the observations leave more open than a similarity.
     """
-    options = options or AdjustmentOptions()
+    options = merge_options(options, AdjustmentOptions, overrides)
     layout = lay_out(problem, options)
     workers = Workers(options.threads)
     normal = linearise_all(problem, layout, values_of(problem), options, workers)

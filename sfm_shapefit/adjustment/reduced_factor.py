@@ -20,6 +20,8 @@ from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,
     _factor_all,
+    _panels,
+    _parts,
     allocate_factor,
     analyse,
 )
@@ -127,8 +129,9 @@ class SparseFactor:
         weights = -system.pairs[:, :b, :b]  # the factor subtracts the weights of its edges
         swapped = plan.inverse[self.pair_nodes[:, 0]] > plan.inverse[self.pair_nodes[:, 1]]
         weights[swapped] = weights[swapped].transpose(0, 2, 1)
+        parts = _parts(factor, np.ascontiguousarray(weights).reshape(-1, b * b))
         with one_blas_thread():
-            failed, pivot = _factor_all(factor, weights.reshape(-1, b * b))
+            failed, pivot = _factor_all(factor, _panels(factor), parts)
         _refuse_singular(failed, pivot[:1])
 
     def solve(self, right: FloatArray) -> FloatArray:

@@ -3,6 +3,7 @@
 import enum
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -21,14 +22,17 @@ from sfm_shapefit.adjustment.residuals import (
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.settings import merge_options
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
 _LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
 _ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
 _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
 _LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
+_STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual that is rounding
 
 
@@ -37,13 +41,13 @@ class Ending(enum.Enum):
 
     COST = "the last step lowered the cost by less than the tolerance"
     GRADIENT = "the gradient is zero to its tolerance"
-    STALLED = "no step lowers the cost any more; it is at its minimum to rounding, or not smooth there"
+    STALLED = "no step lowers the cost any more, though the gradient is not zero; start closer"
     MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen cost_tolerance"
     CANCELLED = "on_iteration cancelled the adjustment; these are the best values so far"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Adjusted:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Adjusted(Displayed):
     """An adjustment's answer and how it went."""
 
     problem: AdjustmentProblem
@@ -68,27 +72,48 @@ class Adjusted:
         """The last and least cost, px^2."""
         return float(self.costs[-1])
 
+    def summary(self) -> dict[str, Any]:
+        """Return how it went in plain values."""
+        return {
+            "num_frames": self.problem.num_frames,
+            "num_points": self.problem.num_points,
+            "num_observations": self.problem.num_observations,
+            "initial_cost_px2": float(self.costs[0]),
+            "final_cost_px2": self.cost,
+            "gradient_norm": self.gradient_norm,
+            "iterations": self.iterations,
+            "converged": self.converged,
+            "ending": self.ending.value,
+        }
+
+    def _headline(self) -> str:
+        frames, state = self.problem.num_frames, "converged" if self.converged else self.ending.name.lower()
+        return f"{frames} frames, cost {self.costs[0]:.6g} to {self.cost:.6g} px^2, {state}"
+
 
 def adjust(
     problem: AdjustmentProblem,
     options: AdjustmentOptions | None = None,
+    *,
     on_iteration: OnIteration | None = None,
+    **overrides: Any,
 ) -> Adjusted:
     """Minimise the reprojection errors over centers, points and what the options free.
 
     Args:
         problem: the start; it is not changed.
-        options: settings; the defaults if None.
+        options: settings, see `help(AdjustmentOptions)`; defaults if None.
         on_iteration: called after each iteration; returning False cancels and returns the best values.
+        **overrides: single options by name: `adjust(problem, hold_rotations=True)`.
 
     Returns:
         The adjusted problem. Its gauge, as far as nothing in the problem holds it, is that of the start: the
         similarity that best maps its centers to the start's is the identity.
 
     Raises:
-        InputError: if there is no observation, or nothing may move.
+        InputError: if there is no observation.
     """
-    options = options or AdjustmentOptions()
+    options = merge_options(options, AdjustmentOptions, overrides)
     if problem.num_observations == 0:
         raise InputError("there is no observation, so there is nothing to adjust")
     run = _Run(problem, options)
@@ -185,7 +210,7 @@ class _Run:
             before, bent = self.costs[-1], self.bends
             predicted, accepted = self.attempt(normal)
             if not accepted and predicted <= _ROUNDING * before:
-                return Ending.COST
+                return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
             step = AdjustmentStep(self.iterations, self.costs[-1], self.damping, accepted)
             answer = None if on_iteration is None else on_iteration(step)
             if answer is not None and not answer:  # a numpy False cancels too
@@ -212,7 +237,8 @@ class _Run:
             self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
             self.costs.append(after)
             self.growth = 2.0
-            self.bends = before - after <= self.near * before
+            is_near = before - after <= self.near * before
+            self.bends = is_near and self.options.loss_scale_px is not None
         elif self.bends:
             self.bends, self.near = False, 0.1 * self.near
         else:

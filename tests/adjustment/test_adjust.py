@@ -63,8 +63,10 @@ def test_exact_pixels_give_the_exact_scene(loss):
 def test_held_rotations_stay_to_the_bit_and_centers_become_right():
     truth, start = started()
     start = replace(start, rotations=truth.rotations)
-    found = adjust(start, replace(TIGHT, hold_rotations=True)).problem
+    answer = adjust(start, replace(TIGHT, hold_rotations=True))
+    found = answer.problem
     np.testing.assert_array_equal(found.rotations, truth.rotations)
+    assert answer.gradient_norm < 1e-7  # of what may move
     assert error(found, truth) < error(adjust(start, TIGHT).problem, truth)  # exact rotations are worth much
 
 
@@ -297,7 +299,7 @@ def test_cancelling_keeps_the_best_values_so_far():
         seen.append(step)
         return np.bool_(len(seen) < 3)
 
-    found = adjust(start, TIGHT, watch)
+    found = adjust(start, TIGHT, on_iteration=watch)
     assert found.ending is Ending.CANCELLED
     assert not found.converged
     assert found.iterations == len(seen) == 3
@@ -307,6 +309,18 @@ def test_cancelling_keeps_the_best_values_so_far():
     np.testing.assert_array_equal(limited.problem.centers, found.problem.centers)
 
 
+def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
+    truth, _ = started()
+    start = disturbed(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
+    steps = []
+    found = adjust(start, replace(TIGHT, loss_scale_px=None), on_iteration=steps.append)
+    refused = [k for k, step in enumerate(steps) if not step.accepted]
+    assert len(refused) > 5
+    assert all(steps[k].damping > steps[k - 1].damping for k in refused)
+    assert (np.diff([found.costs[0], *(step.cost for step in steps)]) <= 0.0).all()
+    assert found.ending is Ending.STALLED or found.gradient_norm < 1e-6
+
+
 def test_what_the_callback_raises_comes_through():
     _, start = started()
 
@@ -314,7 +328,7 @@ def test_what_the_callback_raises_comes_through():
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        adjust(start, TIGHT, fail)
+        adjust(start, TIGHT, on_iteration=fail)
 
 
 def test_no_observation_is_said():
@@ -361,5 +375,15 @@ def test_wrong_priors_lenses_and_options_are_refused():
     with pytest.raises(InputError, match="not positive"):
         Lens("PINHOLE", (1.0, -2.0, 0.0, 0.0))
     for wrong in ({"loss_scale_px": 0.0}, {"noise_px": np.inf}, {"threads": 0}, {"linear_solver": "lu"}):
-        with pytest.raises(ValueError, match=f"AdjustmentOptions.{next(iter(wrong))} must be"):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong))} must"):
             AdjustmentOptions(**wrong)
+    with pytest.raises(TypeError, match="did you mean hold_rotations"):
+        adjust(start, hold_rotation=True)
+
+
+def test_the_answer_shows_itself():
+    _, start = started()
+    found = adjust(start, max_iterations=1)
+    assert "12 frames" in repr(found)
+    assert "max_iterations" in repr(found)
+    assert found.summary()["num_observations"] == start.num_observations
