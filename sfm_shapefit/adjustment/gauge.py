@@ -84,7 +84,7 @@ def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) 
         motion = _similarity(step, origin) @ motion
         if np.abs(step[3:]).max() < 1e-15:
             break
-    return _moved(problem, values, motion, turned=bool(free[3:6].any()))
+    return _apply(problem, values, motion, turned=bool(free[3:6].any()))
 
 
 def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
@@ -95,7 +95,7 @@ def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
     return np.asarray(expm(generator))
 
 
-def _moved(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, turned: bool) -> Values:
+def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, turned: bool) -> Values:
     """Return the values after a similarity of the world; fixed frames stay, rotations if not `turned`."""
     size = np.cbrt(np.linalg.det(motion[:3, :3]))
     moves = ~problem.is_fixed()

@@ -86,7 +86,7 @@ def linearise(
     points = np.empty((layout.num_points, 6))
     point_gradients = np.empty((layout.num_points, 3))
     entries = np.empty((len(layout.entry_node), 3, SLOTS))
-    given = _given(layout, values, loss_scale_px)
+    given = _inputs(layout, values, loss_scale_px)
     structure = (
         layout.lens_slots, layout.turns, layout.node_of_frame, layout.node_of_lens, layout.frame_entry,
         layout.lens_entry, layout.link_of_camera, layout.first_entry, least_curvature,
@@ -110,7 +110,7 @@ def linearise(
 
 def sum_losses(layout: Layout, values: Values, loss_scale_px: float | None, workers: Workers) -> float:
     """Return the cost of all observations, 1/2 sum rho(|r|^2), in px^2."""
-    given = _given(layout, values, loss_scale_px)
+    given = _inputs(layout, values, loss_scale_px)
     sums = np.zeros(CHUNKS)
 
     def job(k: int, begin: int, end: int) -> Callable[[], None]:
@@ -123,13 +123,13 @@ def sum_losses(layout: Layout, values: Values, loss_scale_px: float | None, work
 def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
     """Return the residuals (m, 2) in pixels, in the problem's order; NaN behind the camera."""
     residuals = np.empty((len(layout.camera), 2))
-    _write_residuals(_given(layout, values, None), residuals)
+    _write_residuals(_inputs(layout, values, None), residuals)
     ordered = np.empty_like(residuals)
     ordered[layout.observation] = residuals
     return ordered
 
 
-def _given(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
+def _inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
     """Return what every kernel here reads."""
     return (
         layout.first_observation, layout.camera, layout.pixels, layout.frame_of_camera, layout.lens_of_camera,

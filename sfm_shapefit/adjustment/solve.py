@@ -55,8 +55,8 @@ class Adjusted(Displayed):
     costs: FloatArray
     """(s + 1,) cost in px^2 at the start and after each step that lowered it."""
     gradient_norm: float
-    """Largest cosine between the residuals and a parameter's column of the Jacobian, in [0, 1], where the
-    last step was computed: 0 proves a stationary point."""
+    """Largest cosine between the residuals and a parameter's column of the Jacobian, in [0, 1], at the
+    answer: 0 proves a stationary point."""
     iterations: int
     """Linear systems solved, steps that were refused included."""
     ending: Ending
@@ -119,6 +119,7 @@ def adjust(
     run = _Run(problem, options)
     try:
         ending = run.iterate(on_iteration)
+        run.linearise()
     finally:
         run.workers.close()
     values = restore_gauge(problem, run.values, free_similarities(problem, options))
@@ -192,15 +193,20 @@ class _Run:
     def iterate(self, on_iteration: OnIteration | None) -> Ending:
         """Take steps until a reason to stop."""
         while True:
-            least = _LEAST_CURVATURE if self.bends else 1.0
-            normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers, least)
-            self.gradient_norm = _gradient_norm(normal, self.costs[-1])
+            normal = self.linearise()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
             ending = self.lower(normal, on_iteration)
             if ending is not None:
                 return ending
+
+    def linearise(self) -> NormalEquations:
+        """Return the normal equations at the best values, and note their gradient."""
+        least = _LEAST_CURVATURE if self.bends else 1.0
+        normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers, least)
+        self.gradient_norm = _gradient_norm(normal, self.costs[-1])
+        return normal
 
     def lower(self, normal: NormalEquations, on_iteration: OnIteration | None) -> Ending | None:
         """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""

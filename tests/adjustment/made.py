@@ -21,7 +21,7 @@ LENSES = {
 }
 
 
-def looking_at(centers, targets):
+def look_at(centers, targets):
     """Return cam_from_world rotations of cameras that look at targets, y down."""
     z = targets - centers
     z = z / np.linalg.norm(z, axis=1, keepdims=True)
@@ -37,7 +37,7 @@ def ring_problem(
     angles = 2.0 * np.pi * np.arange(num_cameras) / num_cameras
     centers = np.stack([4.0 * np.cos(angles), 4.0 * np.sin(angles), 0.5 * np.sin(3.0 * angles)], axis=1)
     points = rng.uniform(-1.0, 1.0, (num_points, 3))
-    rotations = looking_at(centers, np.zeros((num_cameras, 3)))
+    rotations = look_at(centers, np.zeros((num_cameras, 3)))
     lenses = tuple(Lens(model, LENSES[model]) for model in models)
     rig, count = None, num_cameras
     if sensors:
@@ -65,7 +65,7 @@ def ring_problem(
     return replace(problem, pixels=exact + noise_px * rng.standard_normal(exact.shape))
 
 
-def disturbed(problem, rng, center=0.05, rotation_rad=0.01, point=0.03):
+def disturb(problem, rng, center=0.05, rotation_rad=0.01, point=0.03):
     """Return the problem started elsewhere; fixed frames stay."""
     moves = ~problem.is_fixed()
     n = problem.num_frames
@@ -121,7 +121,7 @@ def with_values(reconstruction, problem, images, points):
     return copy
 
 
-def adjusted_by_pycolmap(
+def adjust_by_pycolmap(
     reconstruction, loss_scale_px, *, free_lenses=False, tolerance=1e-15, max_iterations=500
 ):
     """Adjust a model in place by pycolmap, in one thread; return the summary of Ceres."""

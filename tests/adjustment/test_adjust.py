@@ -18,19 +18,19 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import fit_similarity
-from tests.adjustment.made import disturbed, looking_at, ring_problem
+from tests.adjustment.made import disturb, look_at, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)
 
 
-def started(seed=0, *, fixed=(), **kwargs):
+def make_start(seed=0, *, fixed=(), **kwargs):
     """The truth with noisy pixels, and the same problem started elsewhere."""
     rng = np.random.default_rng(seed)
     truth = ring_problem(rng, **kwargs)
     flags = np.zeros(truth.num_frames, np.bool_)
     flags[list(fixed)] = True
     truth = replace(truth, fixed=flags)
-    return truth, disturbed(truth, rng, center=0.02, rotation_rad=0.003, point=0.02)
+    return truth, disturb(truth, rng, center=0.02, rotation_rad=0.003, point=0.02)
 
 
 def error(problem, truth):
@@ -40,7 +40,7 @@ def error(problem, truth):
 
 
 def test_it_ends_at_a_stationary_point_that_is_as_good_as_the_noise():
-    truth, start = started()
+    truth, start = make_start()
     found = adjust(start, TIGHT)
     assert found.converged
     assert found.gradient_norm < 1e-7
@@ -55,13 +55,13 @@ def test_it_ends_at_a_stationary_point_that_is_as_good_as_the_noise():
 
 @pytest.mark.parametrize("loss", [None, 1.0])
 def test_exact_pixels_give_the_exact_scene(loss):
-    truth, start = started(noise_px=0.0)
+    truth, start = make_start(noise_px=0.0)
     found = adjust(start, replace(TIGHT, loss_scale_px=loss))
     assert error(found.problem, truth) < 1e-9
 
 
 def test_held_rotations_stay_to_the_bit_and_centers_become_right():
-    truth, start = started()
+    truth, start = make_start()
     start = replace(start, rotations=truth.rotations)
     answer = adjust(start, replace(TIGHT, hold_rotations=True))
     found = answer.problem
@@ -73,7 +73,7 @@ def test_held_rotations_stay_to_the_bit_and_centers_become_right():
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("fixed", [(3,), (0, 5), (1, 2, 7)])
 def test_fixed_frames_stay_to_the_bit(fixed, hold):
-    truth, start = started(fixed=fixed)
+    truth, start = make_start(fixed=fixed)
     found = adjust(start, replace(TIGHT, hold_rotations=hold)).problem
     for name in ("rotations", "centers"):
         np.testing.assert_array_equal(getattr(found, name)[list(fixed)], getattr(start, name)[list(fixed)])
@@ -82,7 +82,7 @@ def test_fixed_frames_stay_to_the_bit(fixed, hold):
 
 
 def test_everything_fixed_leaves_points_to_adjust():
-    truth, start = started(fixed=range(12))
+    truth, start = make_start(fixed=range(12))
     found = adjust(start, TIGHT)
     assert found.gradient_norm < 1e-7
     off = np.linalg.norm(found.problem.points - truth.points, axis=1)
@@ -90,7 +90,7 @@ def test_everything_fixed_leaves_points_to_adjust():
 
 
 def test_a_tiny_sigma_equals_held_rotations_and_a_huge_one_free_ones():
-    _, start = started()
+    _, start = make_start()
 
     def weighted(sigma_rad):
         information = isotropic_information(np.full(start.num_frames, sigma_rad))
@@ -107,7 +107,7 @@ def test_a_tiny_sigma_equals_held_rotations_and_a_huge_one_free_ones():
 
 
 def test_a_center_prior_of_tiny_sigma_holds_and_sets_scale_and_origin():
-    truth, start = started()
+    truth, start = make_start()
     sigmas = np.full(start.num_frames, np.inf)
     sigmas[[0, 4, 8]] = 1e-6
     aims = 3.0 * truth.centers + 5.0
@@ -120,7 +120,7 @@ def test_a_center_prior_of_tiny_sigma_holds_and_sets_scale_and_origin():
 
 @pytest.mark.parametrize("hold", [False, True])
 def test_the_gauge_is_that_of_the_start(hold):
-    _, start = started()
+    _, start = make_start()
     found = adjust(start, replace(TIGHT, hold_rotations=hold)).problem
     fit = fit_similarity(found.centers, start.centers, rotate=not hold)
     np.testing.assert_allclose([fit.scale, *fit.translation, *fit.rotation.ravel()],
@@ -128,7 +128,7 @@ def test_the_gauge_is_that_of_the_start(hold):
 
 
 def test_one_fixed_frame_leaves_the_scale_which_stays():
-    _, start = started(fixed=(2,))
+    _, start = make_start(fixed=(2,))
     found = adjust(start, TIGHT).problem
     arms, before = found.centers - found.centers[2], start.centers - start.centers[2]
     assert np.sum(arms * before) / np.sum(arms * arms) == pytest.approx(1.0, abs=1e-12)
@@ -137,7 +137,7 @@ def test_one_fixed_frame_leaves_the_scale_which_stays():
 def test_a_rig_knows_its_scale():
     rng = np.random.default_rng(4)
     truth = ring_problem(rng, sensors=3, num_cameras=8)
-    start = disturbed(truth, rng, center=0.02, rotation_rad=0.003, point=0.02)
+    start = disturb(truth, rng, center=0.02, rotation_rad=0.003, point=0.02)
     start = replace(start, centers=1.1 * start.centers, points=1.1 * start.points)
     found = adjust(start, TIGHT).problem
     fit = fit_similarity(found.centers, truth.centers)
@@ -146,7 +146,7 @@ def test_a_rig_knows_its_scale():
 
 
 def test_a_rig_of_one_sensor_at_its_origin_is_a_camera():
-    _, start = started()
+    _, start = make_start()
     n = start.num_frames
     from sfm_shapefit.adjustment import Rig
 
@@ -171,7 +171,7 @@ def edge_px(lens):
 
 @pytest.mark.parametrize("model", ["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"])
 def test_a_wrong_focal_length_and_distortion_are_found(model):
-    truth, start = started(models=(model,), noise_px=0.1)
+    truth, start = make_start(models=(model,), noise_px=0.1)
     lens = truth.lenses[0]
     wrong = list(lens.parameters)
     wrong[0] *= 1.03
@@ -191,7 +191,7 @@ def test_a_wrong_focal_length_and_distortion_are_found(model):
 
 
 def test_cameras_share_a_lens_or_have_their_own():
-    _, start = started(models=("SIMPLE_PINHOLE", "SIMPLE_PINHOLE"), noise_px=0.1)
+    _, start = make_start(models=("SIMPLE_PINHOLE", "SIMPLE_PINHOLE"), noise_px=0.1)
     start = replace(start, lenses=[Lens("SIMPLE_PINHOLE", (f, 320.0, 240.0)) for f in (485.0, 515.0)])
     free = replace(TIGHT, free_focal_lengths=True)
     for lens in adjust(start, free).problem.lenses:
@@ -199,7 +199,7 @@ def test_cameras_share_a_lens_or_have_their_own():
 
 
 def test_a_fifth_of_wrong_observations_moves_nearly_nothing_under_cauchy():
-    truth, start = started()
+    truth, start = make_start()
     rng = np.random.default_rng(7)
     wrong = rng.random(start.num_observations) < 0.2
     pixels = np.where(wrong[:, None], rng.uniform(0.0, 600.0, start.pixels.shape), start.pixels)
@@ -212,7 +212,7 @@ def test_a_fifth_of_wrong_observations_moves_nearly_nothing_under_cauchy():
 @pytest.mark.parametrize("hold", [False, True])
 @pytest.mark.parametrize("free", [False, True])
 def test_dense_and_sparse_systems_give_the_same(hold, free):
-    _, start = started(models=("OPENCV", "SIMPLE_RADIAL"))
+    _, start = make_start(models=("OPENCV", "SIMPLE_RADIAL"))
     options = replace(TIGHT, hold_rotations=hold, free_focal_lengths=free, free_distortion=free)
     dense = adjust(start, replace(options, linear_solver="dense")).problem
     sparse = adjust(start, replace(options, linear_solver="sparse")).problem
@@ -223,7 +223,7 @@ def test_dense_and_sparse_systems_give_the_same(hold, free):
 
 @pytest.mark.parametrize("solver", ["dense", "sparse"])
 def test_threads_do_not_change_one_bit(solver):
-    _, start = started(num_cameras=20, num_points=400, models=("OPENCV", "PINHOLE"))
+    _, start = make_start(num_cameras=20, num_points=400, models=("OPENCV", "PINHOLE"))
     options = AdjustmentOptions(linear_solver=solver, free_focal_lengths=True, max_iterations=8)
     one = adjust(start, options)
     for threads in (2, 3):
@@ -234,7 +234,7 @@ def test_threads_do_not_change_one_bit(solver):
 
 
 def test_the_order_of_observations_matters_to_rounding_only():
-    _, start = started()
+    _, start = make_start()
     order = np.random.default_rng(0).permutation(start.num_observations)
     shuffled = replace(
         start,
@@ -248,10 +248,10 @@ def test_the_order_of_observations_matters_to_rounding_only():
 
 
 def test_a_camera_without_observations_and_a_point_behind_all_are_held():
-    _, start = started()
+    _, start = make_start()
     n, k = start.num_frames, start.num_points
     extra = AdjustmentProblem(
-        rotations=np.concatenate([start.rotations, looking_at(np.full((1, 3), 9.0), np.zeros((1, 3)))]),
+        rotations=np.concatenate([start.rotations, look_at(np.full((1, 3), 9.0), np.zeros((1, 3)))]),
         centers=np.concatenate([start.centers, np.full((1, 3), 9.0)]),
         points=np.concatenate([start.points, 3.0 * start.centers[:1]]),
         cameras_seeing=np.concatenate([start.cameras_seeing, [0]]),
@@ -270,7 +270,7 @@ def test_a_camera_without_observations_and_a_point_behind_all_are_held():
 
 
 def test_points_of_one_view_do_no_harm():
-    _, start = started()
+    _, start = make_start()
     single = start.points_seen < 20
     first = np.zeros(start.num_observations, np.bool_)
     first[np.unique(start.points_seen, return_index=True)[1]] = True
@@ -292,7 +292,7 @@ def test_points_of_one_view_do_no_harm():
 
 
 def test_cancelling_keeps_the_best_values_so_far():
-    _, start = started()
+    _, start = make_start()
     seen = []
 
     def watch(step):
@@ -310,8 +310,8 @@ def test_cancelling_keeps_the_best_values_so_far():
 
 
 def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
-    truth, _ = started()
-    start = disturbed(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
+    truth, _ = make_start()
+    start = disturb(truth, np.random.default_rng(3), center=2.0, rotation_rad=0.3, point=1.0)  # hopeless
     steps = []
     found = adjust(start, replace(TIGHT, loss_scale_px=None), on_iteration=steps.append)
     refused = [k for k, step in enumerate(steps) if not step.accepted]
@@ -322,7 +322,7 @@ def test_steps_that_would_raise_the_cost_are_refused_and_the_damping_grows():
 
 
 def test_what_the_callback_raises_comes_through():
-    _, start = started()
+    _, start = make_start()
 
     def fail(step):
         raise KeyboardInterrupt
@@ -332,7 +332,7 @@ def test_what_the_callback_raises_comes_through():
 
 
 def test_no_observation_is_said():
-    _, start = started()
+    _, start = make_start()
     none = np.zeros(0, np.int64)
     with pytest.raises(InputError, match="no observation"):
         adjust(replace(start, cameras_seeing=none, points_seen=none, pixels=np.zeros((0, 2))))
@@ -352,13 +352,13 @@ def test_no_observation_is_said():
     ],
 )
 def test_a_wrong_problem_is_refused_by_name(change, message):
-    _, start = started()
+    _, start = make_start()
     with pytest.raises(InputError, match=message):
         replace(start, **change)
 
 
 def test_wrong_priors_lenses_and_options_are_refused():
-    _, start = started()
+    _, start = make_start()
     n = start.num_frames
     with pytest.raises(InputError, match="positive semidefinite"):
         replace(
@@ -382,7 +382,7 @@ def test_wrong_priors_lenses_and_options_are_refused():
 
 
 def test_the_answer_shows_itself():
-    _, start = started()
+    _, start = make_start()
     found = adjust(start, max_iterations=1)
     assert "12 frames" in repr(found)
     assert "max_iterations" in repr(found)

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_shapefit.adjustment import AdjustmentOptions, adjust, reprojection_errors_px
 from sfm_shapefit.geometry import fit_similarity
-from tests.adjustment.made import adjusted_by_pycolmap, disturbed, problem_of, with_values
+from tests.adjustment.made import adjust_by_pycolmap, disturb, problem_of, with_values
 from tests.scenes import BUNDLED, real_scene
 
 LOSS_PX = 1.0
@@ -30,9 +30,9 @@ def both_answers(model, rng, options, *, free_lenses=False):
     """Our answer, pycolmap's centers aligned to it, pycolmap's cost, and the extent, from one start."""
     problem, images, points = problem_of(model)
     size = np.ptp(problem.centers, axis=0).max()
-    start = disturbed(problem, rng, center=1e-3 * size, rotation_rad=1e-3, point=1e-3 * size)
+    start = disturb(problem, rng, center=1e-3 * size, rotation_rad=1e-3, point=1e-3 * size)
     copy = with_values(model, start, images, points)
-    summary = adjusted_by_pycolmap(copy, options.loss_scale_px, free_lenses=free_lenses)
+    summary = adjust_by_pycolmap(copy, options.loss_scale_px, free_lenses=free_lenses)
     ours = adjust(start, options)
     centers = np.array([copy.image(image_id).projection_center() for image_id in images])
     theirs = fit_similarity(centers, ours.problem.centers).apply(centers)
@@ -42,7 +42,7 @@ def both_answers(model, rng, options, *, free_lenses=False):
 def test_both_measure_the_same_cost():
     model = noisy_model("photographed", np.random.default_rng(0))
     problem, images, points = problem_of(model)
-    start = disturbed(problem, np.random.default_rng(1), center=0.05, rotation_rad=1e-3, point=0.05)
+    start = disturb(problem, np.random.default_rng(1), center=0.05, rotation_rad=1e-3, point=0.05)
     copy = with_values(model, start, images, points)
     copy.update_point_3d_errors()
     errors = reprojection_errors_px(start)

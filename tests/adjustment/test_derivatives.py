@@ -12,7 +12,7 @@ from sfm_shapefit.adjustment.priors import sum_priors
 from sfm_shapefit.adjustment.residuals import linearise, reprojection_residuals, sum_losses
 from sfm_shapefit.adjustment.solve import linearise_all, move, values_of
 from sfm_shapefit.laplacian.operators import Workers
-from tests.adjustment.made import LENSES, disturbed, ring_problem
+from tests.adjustment.made import LENSES, disturb, ring_problem
 
 STEP = 1e-5  # central differences are off by its square times third derivatives, 1e-9 of the first ones here
 ALL_FREE = AdjustmentOptions(loss_scale_px=2.0, free_focal_lengths=True, free_distortion=True)
@@ -22,7 +22,7 @@ ONE = Workers(1)
 def small_problem(model, *, sensors=2, seed=0):
     """A problem far from its minimum, so that no derivative vanishes."""
     rng = np.random.default_rng(seed)
-    return disturbed(ring_problem(rng, 3, 8, models=(model,), sensors=sensors, share=0.8), rng)
+    return disturb(ring_problem(rng, 3, 8, models=(model,), sensors=sensors, share=0.8), rng)
 
 
 def with_priors(problem, rng):
