@@ -105,6 +105,24 @@ def problem_of(reconstruction):
     return problem, images, points
 
 
+def rig_problem_of(reconstruction):
+    """Return the adjustment problem of a model with rigs, and the ids of its frames."""
+    frames = sorted(reconstruction.reg_frame_ids())
+    plain, images, _ = problem_of(reconstruction)
+    poses = [reconstruction.frame(frame).rig_from_world for frame in frames]
+    rotations = np.array([pose.rotation.matrix() for pose in poses])
+    centers = np.array([-pose.rotation.matrix().T @ pose.translation for pose in poses])
+    frame_of_camera = np.array([frames.index(reconstruction.image(i).frame_id) for i in images])
+    turns = plain.rotations @ rotations[frame_of_camera].transpose(0, 2, 1)
+    arms = centers[frame_of_camera] - plain.centers
+    rig = Rig(
+        frame_of_camera=frame_of_camera,
+        rotations=turns,
+        translations=np.einsum("cab,cb->ca", plain.rotations, arms),
+    )
+    return replace(plain, rotations=rotations, centers=centers, rig=rig), frames
+
+
 def _lens(camera):
     return Lens(camera.model.name, tuple(camera.params))
 
@@ -122,13 +140,16 @@ def with_values(reconstruction, problem, images, points):
 
 
 def adjust_by_pycolmap(
-    reconstruction, loss_scale_px, *, free_lenses=False, tolerance=1e-15, max_iterations=500
+    reconstruction, loss_scale_px, *, free_lenses=False, tolerance=1e-15, max_iterations=500, fixed_frame=None
 ):
     """Adjust a model in place by pycolmap, in one thread; return the summary of Ceres."""
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(reconstruction.reg_image_ids()):
         config.add_image(image_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    if fixed_frame is None:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    else:
+        config.set_constant_rig_from_world_pose(fixed_frame)
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = free_lenses

@@ -11,11 +11,13 @@ from sfm_shapefit.adjustment import (
     CenterPrior,
     Ending,
     Lens,
+    Rig,
     RotationPrior,
     adjust,
     isotropic_information,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import fit_similarity
 from tests.adjustment.made import disturb, look_at, ring_problem
@@ -148,7 +150,6 @@ def test_a_rig_knows_its_scale():
 def test_a_rig_of_one_sensor_at_its_origin_is_a_camera():
     _, start = make_start()
     n = start.num_frames
-    from sfm_shapefit.adjustment import Rig
 
     rig = Rig(
         frame_of_camera=np.arange(n), rotations=np.tile(np.eye(3), (n, 1, 1)), translations=np.zeros((n, 3))
@@ -387,3 +388,37 @@ def test_the_answer_shows_itself():
     assert "12 frames" in repr(found)
     assert "max_iterations" in repr(found)
     assert found.summary()["num_observations"] == start.num_observations
+
+
+@pytest.mark.parametrize("hold", [False, True])
+def test_a_moved_and_scaled_world_gives_the_moved_and_scaled_answer(hold):
+    _, start = make_start()
+    options = replace(TIGHT, hold_rotations=hold)
+    turn = look_at(np.array([[1.0, 2.0, 0.5]]), np.zeros((1, 3)))[0]
+
+    def move(points):
+        return 40.0 * points @ turn.T + [5e4, -2e4, 300.0]
+
+    elsewhere = replace(
+        start,
+        rotations=start.rotations @ turn.T,
+        centers=move(start.centers),
+        points=move(start.points),
+    )
+    here, there = adjust(start, options), adjust(elsewhere, options)
+    # Coordinates of 5e4 are exact to 7e-12, a minimum to the root of the cost's rounding, 1e-7 of the scene.
+    np.testing.assert_allclose(there.problem.centers, move(here.problem.centers), atol=40.0 * 1e-6)
+    assert there.cost == pytest.approx(here.cost, rel=1e-10)
+
+
+def test_the_sparse_system_is_chosen_for_many_cameras_and_agrees_with_the_dense_one():
+    _, start = make_start(num_cameras=520, num_points=150, share=0.03)
+    options = AdjustmentOptions(max_iterations=3, noise_px=0.5)
+    assert lay_out(start, options).num_unknowns > 3000
+    auto = adjust(start, options).problem
+    np.testing.assert_array_equal(
+        auto.centers, adjust(start, options, linear_solver="sparse").problem.centers
+    )
+    dense = adjust(start, options, linear_solver="dense").problem
+    np.testing.assert_allclose(auto.centers, dense.centers, atol=1e-9 * 8.0)
+    assert not np.array_equal(auto.centers, dense.centers)  # rounding tells that two ways were gone

@@ -8,7 +8,7 @@ import pytest
 
 from sfm_shapefit.adjustment import AdjustmentOptions, adjust, reprojection_errors_px
 from sfm_shapefit.geometry import fit_similarity
-from tests.adjustment.made import adjust_by_pycolmap, disturb, problem_of, with_values
+from tests.adjustment.made import adjust_by_pycolmap, disturb, problem_of, rig_problem_of, with_values
 from tests.scenes import BUNDLED, real_scene
 
 LOSS_PX = 1.0
@@ -76,3 +76,24 @@ def test_the_optimum_is_that_of_pycolmap_on_a_real_scene():
     ours, theirs, cost, size = both_answers(model, np.random.default_rng(0), TIGHT)
     assert ours.cost == pytest.approx(cost, rel=1e-9)
     np.testing.assert_allclose(theirs, ours.problem.centers, atol=1e-6 * size)
+
+
+def test_the_optimum_of_a_rig_is_that_of_pycolmap():
+    pycolmap.set_random_seed(0)
+    made = pycolmap.SyntheticDatasetOptions()
+    made.num_rigs, made.num_cameras_per_rig, made.num_frames_per_rig, made.num_points3D = 1, 3, 8, 120
+    made.sensor_from_rig_translation_stddev, made.sensor_from_rig_rotation_stddev = 0.2, 5.0
+    model = pycolmap.synthesize_dataset(made)
+    noise = pycolmap.SyntheticNoiseOptions()
+    noise.point2D_stddev, noise.point3D_stddev, noise.rig_from_world_translation_stddev = 0.5, 0.01, 0.01
+    pycolmap.synthesize_noise(noise, model)
+    start, frames = rig_problem_of(model)
+    start = replace(start, fixed=np.arange(len(frames)) == 0)  # the rig knows the scale
+
+    adjust_by_pycolmap(model, LOSS_PX, fixed_frame=frames[0])
+    ours = adjust(start, TIGHT).problem
+    theirs = rig_problem_of(model)[0]
+    size = np.ptp(theirs.centers, axis=0).max()
+    assert np.abs(ours.centers - start.centers).max() > 1e-3 * size  # it had a way to go
+    np.testing.assert_allclose(ours.centers, theirs.centers, atol=1e-6 * size)
+    np.testing.assert_allclose(ours.rotations, theirs.rotations, atol=1e-6)
