@@ -25,6 +25,7 @@ LAYERS = [
     {"baselines"},
     {"rotations"},
     {"refinement"},
+    {"adjustment"},
     {"judgement"},
     {"placement"},
     {"evaluation"},

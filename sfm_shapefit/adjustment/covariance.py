@@ -1,0 +1,157 @@
+"""Covariances of the cameras at an adjustment's answer, points and lenses eliminated, in a stated gauge.
+
+The reduced system S is the information of all nodes in units of noise_px^-2. Where a similarity is free
+(`gauge`), S N = 0 on its motions N. K is S with as many diagonal entries raised as there are free motions, at
+coordinates of two frames that tell these motions apart: regular, and as sparse as S. Then
+
+    cov = noise_px^2 Z K^-1 Z^T,        Z = I - N (F^T N)^-1 F^T
+
+is the covariance with F^T x = 0 (the S-transformation: Baarda 1973, "S-transformations and criterion
+matrices"; Triggs et al. 2000, section 9). F are the centers' parts of N: the best similarity of the centers
+to the true ones is the identity, as in the gauge of `adjust`. Blocks of K^-1 are selected entries; K^-1 F
+takes one solve for each of the at most seven motions.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.linalg import qr
+
+from sfm_shapefit.adjustment.gauge import free_similarities, small_similarities
+from sfm_shapefit.adjustment.layout import SLOTS, Layout, lay_out
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
+from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
+from sfm_shapefit.adjustment.solve import linearise_all, values_of
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.settings import merge_options
+
+_RIDGES = (0.0, 1e-12, 1e-10, 1e-8)  # of each diagonal entry: what nothing holds becomes large, not singular
+_COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the largest
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FrameCovariances:
+    """Covariances of the frames' poses, right observations having `noise_px` of independent noise."""
+
+    centers: FloatArray
+    """(n, 3, 3) in squared units of the world, world axes; 0 for fixed frames, NaN where no point is seen."""
+    rotations: FloatArray
+    """(n, 3, 3) in rad^2, axes of the camera (the rig); 0 also for held rotations."""
+    free_similarities: int
+    """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
+
+
+def estimate_covariances(
+    problem: AdjustmentProblem, options: AdjustmentOptions | None = None, **overrides: Any
+) -> FrameCovariances:
+    """Return the covariances of the frames at the minimum that a problem stands at.
+
+    They are those of the linearised problem with the weights of the loss, and know of the noise of
+    observations and of the priors only: not of wrong calibration, nor of noise that observations share.
+
+    Args:
+        problem: `Adjusted.problem`.
+        options: as it was adjusted with.
+        **overrides: single options by name.
+
+    Raises:
+        UnsolvableError: if the observations leave more open than a similarity.
+    """
+    options = merge_options(options, AdjustmentOptions, overrides)
+    layout = lay_out(problem, options)
+    workers = Workers(options.threads)
+    normal = linearise_all(problem, layout, values_of(problem), options, workers)
+    unseen = np.zeros(problem.num_frames, np.bool_)
+    own = layout.node_of_frame >= 0
+    unseen[own] = ~np.einsum("naa->na", normal.nodes)[layout.node_of_frame[own], :3].any(axis=1)
+    system = eliminate_points(layout, normal, 0.0, workers)
+    workers.close()
+    free = free_similarities(problem, options)
+    motions = _motions(problem, layout, free, unseen)
+    factor = choose_factor(layout, options)
+    _ground(system, motions, _two_nodes(problem, layout, unseen))
+    _factor(factor, system)
+    blocks = factor.inverse_blocks()
+    if free.size:
+        blocks = _transform(blocks, factor, motions)
+    blocks *= options.noise_px**2
+    return _by_frame(layout, blocks, unseen, free.shape[1])
+
+
+def _motions(problem: AdjustmentProblem, layout: Layout, free: FloatArray, unseen: BoolArray) -> FloatArray:
+    """Return N (N, 6, f) at the nodes; lenses do not take part, nor do frames that nothing sees."""
+    moves = small_similarities(problem.rotations, problem.centers, problem.centers.mean(axis=0)) @ free
+    motions = np.zeros((layout.num_nodes, SLOTS, free.shape[1]))
+    taking = (layout.node_of_frame >= 0) & ~unseen
+    motions[layout.node_of_frame[taking]] = moves[taking]
+    return motions * layout.active[:, :, None]
+
+
+def _two_nodes(problem: AdjustmentProblem, layout: Layout, unseen: BoolArray) -> IntArray:
+    """Return the nodes of two frames that observations see: one in the middle, one well apart from it."""
+    frames = np.flatnonzero((layout.node_of_frame >= 0) & ~unseen)
+    arms = np.linalg.norm(problem.centers[frames] - np.median(problem.centers[frames], axis=0), axis=1)
+    first = frames[np.argsort(arms, kind="stable")[: 1 + len(arms) // 2][-1:]]
+    apart = np.linalg.norm(problem.centers[frames] - problem.centers[first], axis=1)
+    second = frames[np.argsort(apart, kind="stable")[: 1 + (3 * len(apart)) // 4][-1:]]
+    nodes: IntArray = layout.node_of_frame[np.concatenate([first, second])]
+    return nodes
+
+
+def _ground(system: ReducedSystem, motions: FloatArray, nodes: IntArray) -> None:
+    """Double as many diagonal entries of the nodes given as there are motions, chosen to tell these apart."""
+    count = motions.shape[2]
+    if count == 0:
+        return
+    seen_there = motions[nodes].reshape(-1, count)
+    _, _, order = qr((seen_there / np.abs(motions).max(axis=(0, 1))).T, mode="economic", pivoting=True)
+    rows, slots = np.divmod(order[:count], SLOTS)
+    system.diagonal[nodes[rows], slots, slots] *= 2.0
+
+
+def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
+    """Factor the system, with the smallest ridge that lets it be factored."""
+    entries = np.einsum("naa->na", system.diagonal)
+    given = entries.copy()
+    for ridge in _RIDGES:
+        entries[:] = given * (1.0 + ridge)
+        try:
+            factor.refactor(system)
+            return
+        except UnsolvableError:
+            if ridge == _RIDGES[-1]:
+                raise
+
+
+def _transform(blocks: FloatArray, factor: ReducedFactor, motions: FloatArray) -> FloatArray:
+    """Return the diagonal blocks of Z K^-1 Z^T."""
+    dual = motions.copy()
+    dual[:, 3:] = 0.0
+    gram = np.einsum("nai,naj->ij", dual, motions)
+    if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
+        dual[:, 3:] = motions[:, 3:] * np.sum(motions[:, :3] ** 2) / np.sum(motions[:, 3:] ** 2)
+        gram = np.einsum("nai,naj->ij", dual, motions)
+    dual = dual @ np.linalg.inv(gram)
+    solved = factor.solve(dual)
+    middle = np.einsum("nai,naj->ij", dual, solved)
+    cross = motions @ solved.transpose(0, 2, 1)
+    transformed: FloatArray = (
+        blocks - cross - cross.transpose(0, 2, 1) + motions @ middle @ motions.transpose(0, 2, 1)
+    )
+    return transformed
+
+
+def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int) -> FrameCovariances:
+    """Put the blocks of the nodes in the places of their frames."""
+    n = len(layout.node_of_frame)
+    centers, rotations = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
+    moves = layout.node_of_frame >= 0
+    own = blocks[layout.node_of_frame[moves]]
+    centers[moves], rotations[moves] = own[:, :3, :3], own[:, 3:, 3:]
+    centers[unseen], rotations[unseen] = np.nan, np.nan
+    return FrameCovariances(centers=centers, rotations=rotations, free_similarities=num_free)

@@ -1,0 +1,108 @@
+"""What the observations cannot see: a shift, a turn and a scaling of everything, as far as nothing holds it.
+
+A small similarity moves every frame by N_f xi, xi = (shift v, turn w, scaling s) about the centroid o:
+
+    dC_f = v + w x (C_f - o) + s (C_f - o),        rotation vector in camera axes: -R_f w.
+
+Fixed frames forbid what moves them; held rotations forbid turns; sensors off their rig's origin forbid
+scaling; priors forbid what they inform about, however weakly. What is left is free. An adjustment chooses it
+so that the centers' best similarity to the start has no such part: the gauge stays the start's.
+"""
+
+import numpy as np
+from scipy.linalg import expm
+
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.priors import cross_matrices
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.residuals import Values
+from sfm_shapefit.arrays import FloatArray
+
+_DIMENSION = 7
+_NONE = 1e-10  # share of the largest: what holds less holds nothing
+_MAX_ROUNDS = 20
+
+
+def small_similarities(rotations: FloatArray, centers: FloatArray, origin: FloatArray) -> FloatArray:
+    """Return N: how shifts, turns and scalings move centers and rotations, (n, 6, 7)."""
+    arms = centers - origin
+    moves = np.zeros((len(centers), 6, _DIMENSION))
+    moves[:, :3, :3] = np.eye(3)
+    moves[:, :3, 3:6] = -cross_matrices(arms)
+    moves[:, :3, 6] = arms
+    moves[:, 3:, 3:6] = -rotations
+    return moves
+
+
+def free_similarities(problem: AdjustmentProblem, options: AdjustmentOptions) -> FloatArray:
+    """Return a basis (7, f) of the small similarities about the centroid of the frames that nothing holds."""
+    origin = problem.centers.mean(axis=0)
+    spread = float(np.linalg.norm(problem.centers - origin, axis=1).max(initial=0.0)) or 1.0
+    scale = np.repeat([1.0, 1.0 / spread, 1.0 / spread], [3, 3, 1])
+    moves = small_similarities(problem.rotations, problem.centers, origin) * scale
+    moves[:, 3:] *= spread
+    may_turn, may_scale = not options.hold_rotations, True
+    if problem.rig is not None:
+        may_scale = not np.any(problem.rig.translations)
+    basis = np.eye(_DIMENSION)[:, np.repeat([True, may_turn, may_scale], [3, 3, 1])]
+    basis = basis @ _null_space((moves[problem.is_fixed()] @ basis).reshape(-1, basis.shape[1]))
+    for prior, slots in ((problem.rotation_prior, slice(3, 6)), (problem.center_prior, slice(0, 3))):
+        if prior is None:
+            continue
+        size = np.einsum("naa->n", prior.information)
+        information = prior.information / np.where(size > 0.0, size, 1.0)[:, None, None]
+        felt = moves[:, slots] @ basis
+        basis = basis @ _null_space(np.einsum("nai,nab,nbj->ij", felt, information, felt))
+    basis[np.abs(basis) < _NONE] = 0.0
+    return scale[:, None] * basis
+
+
+def _null_space(matrix: FloatArray) -> FloatArray:
+    """Return an orthonormal basis of what a matrix maps to nearly nothing; all is kept if it has no row."""
+    width = matrix.shape[1]
+    if not matrix.any() or width == 0:
+        return np.eye(width)
+    _, values, rows = np.linalg.svd(matrix.T @ matrix)
+    return np.asarray(rows[values <= _NONE * values[0]].T)
+
+
+def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) -> Values:
+    """Return the values moved by the free similarity that brings their centers closest to the problem's.
+
+    Args:
+        problem: the start.
+        values: an adjustment's answer.
+        free: from `free_similarities`.
+    """
+    origin = problem.centers.mean(axis=0)
+    motion = np.eye(4)
+    for _ in range(_MAX_ROUNDS if free.size else 0):
+        centers = values.centers @ motion[:3, :3].T + motion[:3, 3]
+        moves = small_similarities(values.rotations, centers, origin)[:, :3] @ free
+        lead = (problem.centers - centers).ravel()
+        step = free @ np.linalg.lstsq(moves.reshape(-1, free.shape[1]), lead, rcond=_NONE)[0]
+        motion = _similarity(step, origin) @ motion
+        if np.abs(step[3:]).max() < 1e-15:
+            break
+    return _apply(problem, values, motion, turned=bool(free[3:6].any()))
+
+
+def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
+    """Return the similarity exp(step) about the origin given, as a 4 x 4 matrix."""
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = cross_matrices(step[None, 3:6])[0] + step[6] * np.eye(3)
+    generator[:3, 3] = step[:3] - generator[:3, :3] @ origin
+    return np.asarray(expm(generator))
+
+
+def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, turned: bool) -> Values:
+    """Return the values after a similarity of the world; fixed frames stay, rotations if not `turned`."""
+    size = np.cbrt(np.linalg.det(motion[:3, :3]))
+    moves = ~problem.is_fixed()
+    centers, rotations = values.centers.copy(), values.rotations
+    centers[moves] = values.centers[moves] @ motion[:3, :3].T + motion[:3, 3]
+    if turned:
+        rotations = rotations.copy()
+        rotations[moves] = rotations[moves] @ (motion[:3, :3] / size).T
+    points = values.points @ motion[:3, :3].T + motion[:3, 3]
+    return Values(rotations=rotations, centers=centers, points=points, lenses=values.lenses)

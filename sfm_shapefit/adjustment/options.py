@@ -1,0 +1,74 @@
+"""Settings of an adjustment, and what it tells while it runs. Pure data, cheap to import."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+from sfm_shapefit.settings import Settings, explained, option
+
+LinearSolver = Literal["auto", "dense", "sparse"]
+
+
+@dataclass(frozen=True, slots=True)
+class AdjustmentStep:
+    """What an adjustment tells its `on_iteration` callback after each iteration."""
+
+    iteration: int
+    """Number of iterations done, from 1."""
+    cost: float
+    """The least cost so far, px^2."""
+    damping: float
+    """Levenberg-Marquardt damping of the next step, relative to the diagonal."""
+    accepted: bool
+    """Whether this iteration lowered the cost."""
+
+
+OnIteration = Callable[[AdjustmentStep], bool | None]
+"""Called after each iteration; returning False, or raising, cancels the adjustment."""
+
+
+@explained
+@dataclass(frozen=True, kw_only=True)
+class AdjustmentOptions(Settings):
+    """How poses and points are adjusted by their reprojection errors."""
+
+    loss_scale_px: float | None = option(
+        1.0, "Residual at which the Cauchy loss has halved the weight of an observation; None for squares."
+    )
+    hold_rotations: bool = option(
+        False, "Keep every rotation as it is, to the last bit; a prior on rotations then says nothing."
+    )
+    free_focal_lengths: bool = option(
+        False, "Adjust the focal lengths of all lenses that are not fixed; cameras of one lens share them."
+    )
+    free_distortion: bool = option(
+        False, "Adjust the distortion of all lenses that are not fixed, where their model has one."
+    )
+    noise_px: float = option(
+        0.5, "Standard deviation of a right observation per axis: it weighs priors and scales covariances."
+    )
+    cost_tolerance: float = option(1e-6, "Stop once a step lowers the cost by less than this share of it.")
+    gradient_tolerance: float = option(
+        1e-10, "Stop once no parameter's column of the Jacobian has a larger cosine with the residuals."
+    )
+    max_iterations: int = option(
+        100, "Limit of linear systems solved; reaching it is reported, never silent."
+    )
+    linear_solver: LinearSolver = option(
+        "auto",
+        "How the system of the cameras is factored: dense by LAPACK, or sparse in blocks; auto is dense up "
+        "to 3,000 unknowns (500 cameras).",
+    )
+    threads: int = option(1, "Threads that share the work; the answer is the same whatever their number.")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("loss_scale_px", "noise_px"):
+            value = getattr(self, name)
+            if value is not None and not 0.0 < value < math.inf:
+                raise ValueError(f"{name} must be positive and finite, got {value}")
+        self.check_range("cost_tolerance", 0.0, 1.0)
+        self.check_range("gradient_tolerance", 0.0, 1.0)
+        self.check_range("max_iterations", 1)
+        self.check_range("threads", 1, 256)

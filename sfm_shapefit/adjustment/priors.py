@@ -1,0 +1,88 @@
+"""Priors on rotations and centers: their cost, gradient and curvature, and small rotations.
+
+With d = log(R R_prior^T) and R <- exp(w) R, the derivative of d by w is the inverse left Jacobian of SO(3),
+
+    J^-1 = I - [d]/2 + (1/t^2 - (1 + cos t) / (2 t sin t)) [d]^2,      t = |d|
+
+(Sola, Deray, Atchuthan 2018, "A micro Lie theory for state estimation in robotics", eq. 146).
+"""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.residuals import Values
+from sfm_shapefit.arrays import FloatArray
+
+_SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
+
+
+def turn(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return exp(w) R for rotations (n, 3, 3) and rotation vectors (n, 3) in their camera axes."""
+    turned: FloatArray = Rotation.from_rotvec(vectors).as_matrix() @ rotations
+    return turned
+
+
+def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> float:
+    """Return the cost of all priors in px^2; those of fixed frames are constants and left out."""
+    moves = ~problem.is_fixed()
+    total = 0.0
+    for prior, off in ((problem.rotation_prior, _turns), (problem.center_prior, _shifts)):
+        if prior is not None:
+            d = off(problem, values)
+            total += float(np.einsum("n,na,nab,nb->", moves, d, prior.information, d))
+    return 0.5 * noise_px**2 * total
+
+
+def add_rotation_prior(
+    problem: AdjustmentProblem, values: Values, noise_px: float, blocks: FloatArray, gradients: FloatArray
+) -> None:
+    """Add the rotation prior to the blocks (n, 3, 3) and gradients (n, 3) of the rotations of all frames."""
+    if problem.rotation_prior is None:
+        return
+    d = _turns(problem, values)
+    jacobian = _inverse_left_jacobians(d)
+    pulled = noise_px**2 * jacobian.transpose(0, 2, 1) @ problem.rotation_prior.information
+    blocks += pulled @ jacobian
+    gradients += np.einsum("nab,nb->na", pulled, d)
+
+
+def add_center_prior(
+    problem: AdjustmentProblem, values: Values, noise_px: float, blocks: FloatArray, gradients: FloatArray
+) -> None:
+    """Add the center prior to the blocks (n, 3, 3) and gradients (n, 3) of the centers of all frames."""
+    if problem.center_prior is None:
+        return
+    information = noise_px**2 * problem.center_prior.information
+    blocks += information
+    gradients += np.einsum("nab,nb->na", information, _shifts(problem, values))
+
+
+def _turns(problem: AdjustmentProblem, values: Values) -> FloatArray:
+    """Return the rotation vectors from the prior's rotations, (n, 3)."""
+    assert problem.rotation_prior is not None
+    apart = values.rotations @ problem.rotation_prior.rotations.transpose(0, 2, 1)
+    return np.asarray(Rotation.from_matrix(apart).as_rotvec())
+
+
+def _shifts(problem: AdjustmentProblem, values: Values) -> FloatArray:
+    """Return the shifts from the prior's centers, (n, 3)."""
+    assert problem.center_prior is not None
+    return values.centers - problem.center_prior.centers
+
+
+def _inverse_left_jacobians(d: FloatArray) -> FloatArray:
+    angle = np.linalg.norm(d, axis=1)
+    safe = np.maximum(angle, _SMALL_RAD)
+    exact = 1.0 / safe**2 - (1.0 + np.cos(safe)) / (2.0 * safe * np.sin(safe))
+    factor = np.where(angle < _SMALL_RAD, 1.0 / 12.0, exact)
+    cross = cross_matrices(d)
+    jacobians: FloatArray = np.eye(3) - 0.5 * cross + factor[:, None, None] * (cross @ cross)
+    return jacobians
+
+
+def cross_matrices(vectors: FloatArray) -> FloatArray:
+    """Return the matrices [v] with [v] x = v x x, (n, 3, 3)."""
+    out = np.zeros((len(vectors), 3, 3))
+    out[:, 2, 1], out[:, 0, 2], out[:, 1, 0] = vectors.T
+    return out - out.transpose(0, 2, 1)

@@ -1,0 +1,272 @@
+"""What is adjusted: poses, lenses, points and the pixels at which cameras saw them, as plain arrays.
+
+A frame is a body with a pose of its own: a camera, or a rig of several. A camera belongs to a frame and looks
+through a lens, which it may share. A point X of the world has, in a camera of frame f, the coordinates
+
+    x = R_s R_f (X - C_f) + t_s,        (R_s, t_s) = sensor_from_rig, the identity without a rig.
+
+Lens models and the order of their parameters are COLMAP's. All five are cases of OPENCV,
+
+    u = x/z, v = y/z, s = u^2 + v^2,
+    pixel = (fx (u (1 + k1 s + k2 s^2) + 2 p1 u v + p2 (s + 2 u^2)) + cx,
+             fy (v (1 + k1 s + k2 s^2) + 2 p2 u v + p1 (s + 2 v^2)) + cy).
+
+An observation through any other lens (fisheyes among them, in front of the camera) is given undistorted: undo
+the distortion once, and pass focal length times ray as the pixel of a PINHOLE lens with that focal length and
+principal point 0. Its residuals are then those of an ideal camera, not exactly pixels of the image.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import InputError
+
+_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
+NUM_VALUES = 8
+"""Parameters of the OPENCV model: fx, fy, cx, cy, k1, k2, p1, p2."""
+
+# For each model, the place of each of its parameters among OPENCV's; -1 stands for fx and fy at once.
+_PLACES = {
+    "SIMPLE_PINHOLE": (-1, _CX, _CY),
+    "PINHOLE": (_FX, _FY, _CX, _CY),
+    "SIMPLE_RADIAL": (-1, _CX, _CY, _K1),
+    "RADIAL": (-1, _CX, _CY, _K1, _K2),
+    "OPENCV": (_FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2),
+}
+_ORTHONORMAL = 1e-6  # largest entry of R R^T - I
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """The intrinsics that one or several cameras look through."""
+
+    model: str
+    """SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL or OPENCV."""
+    parameters: tuple[float, ...]
+    """In COLMAP's order: focal lengths, principal point, distortion; lengths in pixels."""
+    fixed: bool = False
+    """Whether it stays what it is even where focal lengths or distortion are free."""
+
+    def __post_init__(self) -> None:
+        """Refuse unknown models and impossible parameters."""
+        if self.model not in _PLACES:
+            known = ", ".join(_PLACES)
+            raise InputError(
+                f"lens model {self.model} cannot be adjusted; undistort it, or give one of {known}"
+            )
+        wanted = len(_PLACES[self.model])
+        if len(self.parameters) != wanted or not np.isfinite(self.parameters).all():
+            raise InputError(f"a lens of model {self.model} takes {wanted} finite parameters")
+        if min(self.values()[:2]) <= 0.0:
+            raise InputError("a lens has a focal length that is not positive; correct its parameters")
+
+    def values(self) -> FloatArray:
+        """Return the parameters of the same lens as OPENCV model, (8,)."""
+        values = np.zeros(NUM_VALUES)
+        for place, parameter in zip(_PLACES[self.model], self.parameters, strict=True):
+            values[[_FX, _FY] if place < 0 else place] = parameter
+        return values
+
+    def with_values(self, values: FloatArray) -> "Lens":
+        """Return the lens of this model whose OPENCV parameters are `values`, (8,)."""
+        kept = [float(values[max(place, 0)]) for place in _PLACES[self.model]]
+        return replace(self, parameters=tuple(kept))
+
+    def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
+        """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
+        slots = np.full(NUM_VALUES, -1)
+        if self.fixed:
+            return slots
+        unknown = 0
+        for place in _PLACES[self.model]:
+            if place in (_CX, _CY) or not (focal_lengths if place <= _FY else distortion):
+                continue
+            slots[[_FX, _FY] if place < 0 else place] = unknown
+            unknown += 1
+        return slots
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rig:
+    """Cameras that move together: which frame each belongs to and where in it."""
+
+    frame_of_camera: IntArray
+    """(c,)"""
+    rotations: FloatArray
+    """(c, 3, 3) of sensor_from_rig."""
+    translations: FloatArray
+    """(c, 3) of sensor_from_rig, in units of the world."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RotationPrior:
+    """Rotations measured otherwise: cost 1/2 noise_px^2 d^T Omega d with d = log(R_f R_prior^T)."""
+
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world (rig_from_world for a rig)."""
+    information: FloatArray
+    """(n, 3, 3) inverse covariances in rad^-2, in axes of the camera (the rig); 0 where there is no prior."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CenterPrior:
+    """Centers measured otherwise: cost 1/2 noise_px^2 d^T Omega d with d = C_f - C_prior."""
+
+    centers: FloatArray
+    """(n, 3)"""
+    information: FloatArray
+    """(n, 3, 3) inverse covariances in world axes; 0 where there is no prior."""
+
+
+def isotropic_information(sigmas: FloatArray) -> FloatArray:
+    """Return the information (n, 3, 3) of standard deviations (n,) per axis; infinite ones give 0."""
+    return np.asarray(sigmas, dtype=np.float64)[:, None, None] ** -2.0 * np.eye(3)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AdjustmentProblem:
+    """Poses of n frames, k points, and m observations of points by cameras; checked when it is made.
+
+    Raises:
+        InputError: if shapes do not fit together, an index leaves its range, a number is not finite, or a
+            rotation is none.
+    """
+
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world (rig_from_world for a rig)."""
+    centers: FloatArray
+    """(n, 3) the origin of each frame in the world."""
+    points: FloatArray
+    """(k, 3)"""
+    cameras_seeing: IntArray
+    """(m,) the camera of each observation."""
+    points_seen: IntArray
+    """(m,) the point of each observation."""
+    pixels: FloatArray
+    """(m, 2) where it was seen."""
+    lenses: Sequence[Lens]
+    """What cameras look through."""
+    lens_of_camera: IntArray
+    """(c,)"""
+    rig: Rig | None = None
+    """None if each frame is one camera: c = n."""
+    fixed: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
+    """(n,) frames whose pose stays what it is, to the last bit; none if empty."""
+    rotation_prior: RotationPrior | None = None
+    """Weighs rotations that are not held."""
+    center_prior: CenterPrior | None = None
+    """Weighs centers."""
+
+    def __post_init__(self) -> None:
+        """Bring every array to its type and check it."""
+        n = len(self.centers)
+        self._take("centers", np.float64, (n, 3))
+        self._take("rotations", np.float64, (n, 3, 3))
+        self._take("points", np.float64, (len(self.points), 3))
+        self._take("pixels", np.float64, (len(self.pixels), 2))
+        self._take("lens_of_camera", np.int64, (len(self.lens_of_camera),))
+        self._take("fixed", np.bool_, (n if len(self.fixed) else 0,))
+        for name in ("cameras_seeing", "points_seen"):
+            self._take(name, np.int64, (len(self.pixels),))
+        _check_rotations(self.rotations, "rotation")
+        _check_range(self.points_seen, self.num_points, "point")
+        _check_range(self.lens_of_camera, len(self.lenses), "lens")
+        self._check_rig()
+        _check_range(self.cameras_seeing, self.num_cameras, "camera")
+        self._check_priors()
+
+    @property
+    def num_frames(self) -> int:
+        """Number of poses, n."""
+        return len(self.centers)
+
+    @property
+    def num_cameras(self) -> int:
+        """Number of cameras, c."""
+        return len(self.lens_of_camera)
+
+    @property
+    def num_points(self) -> int:
+        """Number of points, k."""
+        return len(self.points)
+
+    @property
+    def num_observations(self) -> int:
+        """Number of observations, m."""
+        return len(self.pixels)
+
+    def is_fixed(self) -> BoolArray:
+        """Return which frames are fixed, (n,)."""
+        return self.fixed if len(self.fixed) else np.zeros(self.num_frames, np.bool_)
+
+    def with_values(
+        self, rotations: FloatArray, centers: FloatArray, points: FloatArray, lenses: Sequence[Lens]
+    ) -> Self:
+        """Return the problem with the same observations at other values."""
+        return replace(self, rotations=rotations, centers=centers, points=points, lenses=lenses)
+
+    def _take(self, name: str, dtype: type, shape: tuple[int, ...]) -> None:
+        """Store a field as a contiguous array of its type, or refuse it."""
+        array: npt.NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=dtype)
+        if array.shape != shape:
+            raise InputError(f"AdjustmentProblem.{name} has shape {array.shape}, it must be {shape}")
+        if not np.isfinite(array).all():
+            raise InputError(f"AdjustmentProblem.{name} holds a number that is not finite")
+        object.__setattr__(self, name, array)
+
+    def _check_rig(self) -> None:
+        if self.rig is None:
+            if self.num_cameras != self.num_frames:
+                raise InputError(f"{self.num_cameras} cameras have {self.num_frames} poses; give a rig")
+            return
+        c = self.num_cameras
+        shapes = (self.rig.frame_of_camera.shape, self.rig.rotations.shape, self.rig.translations.shape)
+        if shapes != ((c,), (c, 3, 3), (c, 3)):
+            raise InputError(
+                f"the rig's arrays have shapes {shapes}, they must be ({c},), ({c}, 3, 3), ({c}, 3)"
+            )
+        _check_range(self.rig.frame_of_camera, self.num_frames, "frame")
+        _check_rotations(self.rig.rotations, "rotation of a sensor in its rig")
+        if not np.isfinite(self.rig.translations).all():
+            raise InputError("a translation of a sensor in its rig is not finite")
+
+    def _check_priors(self) -> None:
+        n = self.num_frames
+        if self.rotation_prior is not None:
+            if self.rotation_prior.rotations.shape != (n, 3, 3):
+                raise InputError(f"the rotation prior must have {n} rotations")
+            _check_rotations(self.rotation_prior.rotations, "rotation of the prior")
+            _check_information(self.rotation_prior.information, n, "rotation")
+        if self.center_prior is not None:
+            centers = self.center_prior.centers
+            if centers.shape != (n, 3) or not np.isfinite(centers).all():
+                raise InputError(f"the center prior must have {n} finite centers")
+            _check_information(self.center_prior.information, n, "center")
+
+
+def _check_range(indices: IntArray, size: int, what: str) -> None:
+    if indices.size and (indices.min() < 0 or indices.max() >= size):
+        raise InputError(f"a {what} index leaves 0..{size - 1}")
+
+
+def _check_rotations(rotations: FloatArray, what: str) -> None:
+    gram = rotations @ rotations.transpose(0, 2, 1)
+    right = (
+        np.abs(gram - np.eye(3)).max(initial=0.0) <= _ORTHONORMAL and (np.linalg.det(rotations) > 0.0).all()
+    )
+    if not right:  # NaN fails too
+        raise InputError(f"a {what} is not orthonormal with determinant 1")
+
+
+def _check_information(information: FloatArray, n: int, what: str) -> None:
+    if information.shape != (n, 3, 3) or not np.isfinite(information).all():
+        raise InputError(f"the information of the {what} prior must be {n} finite 3 x 3 matrices")
+    scale = np.abs(information).max(axis=(1, 2))
+    uneven = np.abs(information - information.transpose(0, 2, 1)).max(axis=(1, 2))
+    if (uneven > 1e-9 * scale).any() or (np.linalg.eigvalsh(information)[:, 0] < -1e-9 * scale).any():
+        raise InputError(f"the information of the {what} prior must be symmetric and positive semidefinite")

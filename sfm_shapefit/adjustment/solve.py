@@ -1,0 +1,299 @@
+"""Levenberg-Marquardt on poses, lenses and points together; the entry is `adjust`."""
+
+import enum
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge
+from sfm_shapefit.adjustment.layout import Layout, lay_out
+from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
+from sfm_shapefit.adjustment.priors import add_center_prior, add_rotation_prior, sum_priors, turn
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
+from sfm_shapefit.adjustment.residuals import (
+    NormalEquations,
+    Values,
+    linearise,
+    reprojection_residuals,
+    sum_losses,
+)
+from sfm_shapefit.adjustment.schur import eliminate_points, step_points
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.display import Displayed
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.laplacian.operators import Workers
+from sfm_shapefit.settings import merge_options
+
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-12, 1e12
+_LEAST_GAIN = 1e-3  # share of the predicted decrease that makes a step acceptable
+_ROUNDING = 1e-11  # share of the cost: a smaller predicted decrease drowns in its rounding
+_NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, where the loss may bend
+_LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
+_STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
+_EXACT_PX = 1e-10  # rms residual that is rounding
+
+
+class Ending(enum.Enum):
+    """Why an adjustment stopped; the value is the sentence shown to the user."""
+
+    COST = "the last step lowered the cost by less than the tolerance"
+    GRADIENT = "the gradient is zero to its tolerance"
+    STALLED = "no step lowers the cost any more, though the gradient is not zero; start closer"
+    MAX_ITERATIONS = "the iteration limit was reached; raise max_iterations or loosen cost_tolerance"
+    CANCELLED = "on_iteration cancelled the adjustment; these are the best values so far"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Adjusted(Displayed):
+    """An adjustment's answer and how it went."""
+
+    problem: AdjustmentProblem
+    """The same problem at the new rotations, centers, points and lenses."""
+    costs: FloatArray
+    """(s + 1,) cost in px^2 at the start and after each step that lowered it."""
+    gradient_norm: float
+    """Largest cosine between the residuals and a parameter's column of the Jacobian, in [0, 1], at the
+    answer: 0 proves a stationary point."""
+    iterations: int
+    """Linear systems solved, steps that were refused included."""
+    ending: Ending
+    """Why it stopped."""
+
+    @property
+    def converged(self) -> bool:
+        """Whether it stopped at a tolerance, or at rounding."""
+        return self.ending in (Ending.COST, Ending.GRADIENT)
+
+    @property
+    def cost(self) -> float:
+        """The last and least cost, px^2."""
+        return float(self.costs[-1])
+
+    def summary(self) -> dict[str, Any]:
+        """Return how it went in plain values."""
+        return {
+            "num_frames": self.problem.num_frames,
+            "num_points": self.problem.num_points,
+            "num_observations": self.problem.num_observations,
+            "initial_cost_px2": float(self.costs[0]),
+            "final_cost_px2": self.cost,
+            "gradient_norm": self.gradient_norm,
+            "iterations": self.iterations,
+            "converged": self.converged,
+            "ending": self.ending.value,
+        }
+
+    def _headline(self) -> str:
+        frames, state = self.problem.num_frames, "converged" if self.converged else self.ending.name.lower()
+        return f"{frames} frames, cost {self.costs[0]:.6g} to {self.cost:.6g} px^2, {state}"
+
+
+def adjust(
+    problem: AdjustmentProblem,
+    options: AdjustmentOptions | None = None,
+    *,
+    on_iteration: OnIteration | None = None,
+    **overrides: Any,
+) -> Adjusted:
+    """Minimise the reprojection errors over centers, points and what the options free.
+
+    Args:
+        problem: the start; it is not changed.
+        options: settings, see `help(AdjustmentOptions)`; defaults if None.
+        on_iteration: called after each iteration; returning False cancels and returns the best values.
+        **overrides: single options by name: `adjust(problem, hold_rotations=True)`.
+
+    Returns:
+        The adjusted problem. Its gauge, as far as nothing in the problem holds it, is that of the start: the
+        similarity that best maps its centers to the start's is the identity.
+
+    Raises:
+        InputError: if there is no observation.
+    """
+    options = merge_options(options, AdjustmentOptions, overrides)
+    if problem.num_observations == 0:
+        raise InputError("there is no observation, so there is nothing to adjust")
+    run = _Run(problem, options)
+    try:
+        ending = run.iterate(on_iteration)
+        run.linearise()
+    finally:
+        run.workers.close()
+    values = restore_gauge(problem, run.values, free_similarities(problem, options))
+    lenses = [lens.with_values(row) for lens, row in zip(problem.lenses, values.lenses, strict=True)]
+    return Adjusted(
+        problem=problem.with_values(values.rotations, values.centers, values.points, lenses),
+        costs=np.array(run.costs),
+        gradient_norm=run.gradient_norm,
+        iterations=run.iterations,
+        ending=ending,
+    )
+
+
+def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
+    """Return how far each observation misses its pixel, (m,); NaN if its point is behind the camera."""
+    layout = lay_out(problem, AdjustmentOptions())
+    return np.asarray(np.linalg.norm(reprojection_residuals(layout, values_of(problem)), axis=1))
+
+
+def values_of(problem: AdjustmentProblem) -> Values:
+    """Return the numbers of a problem that an adjustment changes."""
+    return Values(
+        rotations=problem.rotations,
+        centers=problem.centers,
+        points=problem.points,
+        lenses=np.array([lens.values() for lens in problem.lenses]).reshape(-1, 8),
+    )
+
+
+def linearise_all(
+    problem: AdjustmentProblem,
+    layout: Layout,
+    values: Values,
+    options: AdjustmentOptions,
+    workers: Workers,
+    least_curvature: float = 1.0,
+) -> NormalEquations:
+    """Return the normal equations of observations and priors; see `linearise`."""
+    normal = linearise(layout, values, options.loss_scale_px, workers, least_curvature)
+    moves = layout.node_of_frame >= 0
+    nodes = layout.node_of_frame[moves]
+    for add, slots in ((add_center_prior, slice(0, 3)), (add_rotation_prior, slice(3, 6))):
+        if slots.start == 3 and options.hold_rotations:
+            continue
+        blocks, gradients = np.zeros((len(moves), 3, 3)), np.zeros((len(moves), 3))
+        add(problem, values, options.noise_px, blocks, gradients)
+        normal.nodes[nodes, slots, slots] += blocks[moves]
+        normal.node_gradients[nodes, slots] += gradients[moves]
+    return normal
+
+
+class _Run:
+    """One adjustment under way."""
+
+    def __init__(self, problem: AdjustmentProblem, options: AdjustmentOptions) -> None:
+        self.problem, self.options = problem, options
+        self.workers = Workers(options.threads)
+        self.layout = lay_out(problem, options)
+        self.factor: ReducedFactor = choose_factor(self.layout, options)
+        self.values = values_of(problem)
+        self.damping, self.growth = _FIRST_DAMPING, 2.0
+        self.costs = [self.cost(self.values)]
+        self.gradient_norm, self.iterations = math.inf, 0
+        self.bends, self.near = False, _NEAR
+
+    def cost(self, values: Values) -> float:
+        """Return the cost of observations and priors."""
+        observed = sum_losses(self.layout, values, self.options.loss_scale_px, self.workers)
+        return observed + sum_priors(self.problem, values, self.options.noise_px)
+
+    def iterate(self, on_iteration: OnIteration | None) -> Ending:
+        """Take steps until a reason to stop."""
+        while True:
+            normal = self.linearise()
+            exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
+            if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
+                return Ending.GRADIENT
+            ending = self.lower(normal, on_iteration)
+            if ending is not None:
+                return ending
+
+    def linearise(self) -> NormalEquations:
+        """Return the normal equations at the best values, and note their gradient."""
+        least = _LEAST_CURVATURE if self.bends else 1.0
+        normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers, least)
+        self.gradient_norm = _gradient_norm(normal, self.costs[-1])
+        return normal
+
+    def lower(self, normal: NormalEquations, on_iteration: OnIteration | None) -> Ending | None:
+        """Raise the damping until a step lowers the cost; return a reason to stop, or None to go on."""
+        while True:
+            if self.iterations >= self.options.max_iterations:
+                return Ending.MAX_ITERATIONS
+            before, bent = self.costs[-1], self.bends
+            predicted, accepted = self.attempt(normal)
+            if not accepted and predicted <= _ROUNDING * before:
+                return Ending.COST if self.gradient_norm <= _STATIONARY else Ending.STALLED
+            step = AdjustmentStep(self.iterations, self.costs[-1], self.damping, accepted)
+            answer = None if on_iteration is None else on_iteration(step)
+            if answer is not None and not answer:  # a numpy False cancels too
+                return Ending.CANCELLED
+            if accepted:
+                small = before - self.costs[-1] <= self.options.cost_tolerance * before
+                return Ending.COST if small else None
+            if bent:
+                return None
+            if self.damping > _MOST_DAMPING:
+                return Ending.STALLED
+
+    def attempt(self, normal: NormalEquations) -> tuple[float, bool]:
+        """Try one step, take it if it lowers the cost; return the decrease predicted, and whether it did."""
+        self.iterations += 1
+        before = self.costs[-1]
+        proposal = self.propose(normal)
+        values, predicted = (self.values, math.inf) if proposal is None else proposal
+        after = before if proposal is None else self.cost(values)
+        accepted = after < before and before - after >= _LEAST_GAIN * predicted
+        if accepted:
+            gain = (before - after) / predicted if predicted > 0.0 else 1.0
+            slower = max(1.0 / 3.0, 1.0 - (2.0 * gain - 1.0) ** 3)
+            self.values, self.damping = values, max(self.damping * slower, _LEAST_DAMPING)
+            self.costs.append(after)
+            self.growth = 2.0
+            is_near = before - after <= self.near * before
+            self.bends = is_near and self.options.loss_scale_px is not None
+        elif self.bends:
+            self.bends, self.near = False, 0.1 * self.near
+        else:
+            self.damping *= self.growth
+            self.growth *= 2.0
+        return predicted, accepted
+
+    def propose(self, normal: NormalEquations) -> tuple[Values, float] | None:
+        """Return the values after a damped step and the decrease predicted; None if it has no solution."""
+        layout = self.layout
+        system = eliminate_points(layout, normal, self.damping, self.workers)
+        try:
+            self.factor.refactor(system)
+        except UnsolvableError:
+            return None
+        steps = self.factor.solve(system.right[:, :, None])[:, :, 0]
+        point_steps = step_points(layout, normal, system.inverses, steps)
+        diagonal = np.einsum("naa->na", normal.nodes)
+        damped = float(np.sum(diagonal * steps**2) + np.sum(normal.points[:, [0, 3, 5]] * point_steps**2))
+        slope = float(np.sum(normal.node_gradients * steps) + np.sum(normal.point_gradients * point_steps))
+        predicted = 0.5 * (self.damping * damped - slope)
+        values = move(layout, self.values, steps, point_steps)
+        return None if values is None or not math.isfinite(predicted) else (values, predicted)
+
+
+def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatArray) -> Values | None:
+    """Return the values after steps of nodes (N, 6) and points (k, 3); None if a focal length is lost."""
+    frames = np.flatnonzero(layout.node_of_frame >= 0)
+    own = steps[layout.node_of_frame[frames]]
+    centers, rotations, lenses = values.centers.copy(), values.rotations, values.lenses.copy()
+    centers[frames] += own[:, :3]
+    if layout.turns:
+        rotations = rotations.copy()
+        rotations[frames] = turn(rotations[frames], own[:, 3:])
+    lens, value = np.nonzero(layout.lens_slots >= 0)
+    lenses[lens, value] += steps[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
+    if (lenses[:, :2] <= 0.0).any():
+        return None
+    return Values(rotations=rotations, centers=centers, points=values.points + point_steps, lenses=lenses)
+
+
+def _gradient_norm(normal: NormalEquations, cost: float) -> float:
+    """Return max_k |g_k| / sqrt(H_kk 2 cost) over all parameters (More 1978, the MINPACK test)."""
+    diagonal = np.concatenate(
+        [np.einsum("naa->na", normal.nodes).ravel(), normal.points[:, [0, 3, 5]].ravel()]
+    )
+    gradient = np.concatenate([normal.node_gradients.ravel(), normal.point_gradients.ravel()])
+    matters = diagonal > 0.0
+    if not matters.any() or cost == 0.0:
+        return 0.0
+    cosines = np.abs(gradient[matters]) / np.sqrt(diagonal[matters] * 2.0 * cost)
+    return float(cosines.max())
