@@ -676,7 +676,8 @@ def test_rays_of_database_matches_are_those_of_its_keypoints(scene, tmp_path):
     model = read_model(scene)
     path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
     for cache_bytes in (0, 10**6):
-        with open_database(path, model, cache_bytes=cache_bytes) as database:
+        with open_database(path, model) as database:
+            database.limit_rays(cache_bytes)
             (batch,) = database.iter_matches(1)
             for p, (i, j) in enumerate(batch.pairs.tolist()):
                 rows = slice(batch.offsets[p], batch.offsets[p + 1])
