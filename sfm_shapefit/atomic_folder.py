@@ -33,10 +33,10 @@ MAP_MARKER = "map.json"
 
 
 def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:
-    """Refuse an output folder that cannot or must not be written; call it before long work.
+    """Refuse an output folder that cannot or must not be written.
 
     Args:
-        out: the folder to be made. Missing parents are fine.
+        out: the folder to be made; missing parents are fine.
         overwrite: accept an existing folder if it is empty or an earlier output (it has a marker).
         protect: files and folders that must survive, such as the input model and its database: `out` may
             neither be one of them nor contain one.
@@ -50,7 +50,8 @@ def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[
         raise InputError(f"{folder} is a symbolic link; give the folder that it stands for")
     if folder.exists():
         _refuse_existing(folder, overwrite=overwrite)
-    parent = _nearest_existing_parent(folder)
+    parents = Path(os.path.abspath(folder)).parents
+    parent = next(parent for parent in parents if os.path.lexists(parent))
     if not parent.is_dir():
         raise InputError(f"{folder} cannot be made because {parent} is not a folder; choose another place")
     if not os.access(parent, os.W_OK | os.X_OK):
@@ -127,9 +128,10 @@ def _claim(folder: Path) -> Iterator[Path]:
     if _claimed.get() == private:
         yield private
         return
-    made_parents = _missing_parents(folder)
     with ExitStack() as resources:
-        resources.callback(_remove_empty, made_parents)
+        for parent in reversed(folder.parents):
+            if not os.path.lexists(parent):
+                resources.callback(_remove_empty, parent)  # the deepest first
         try:
             folder.parent.mkdir(parents=True, exist_ok=True)
             remove_abandoned(folder.parent, ".shapefit-*.partial")
@@ -145,11 +147,10 @@ def _claim(folder: Path) -> Iterator[Path]:
         yield private
 
 
-def _remove_empty(folders: Sequence[Path]) -> None:
-    """Remove folders, the deepest first, unless they are missing or hold what somebody put there."""
-    for folder in folders:
-        with suppress(OSError):
-            folder.rmdir()
+def _remove_empty(folder: Path) -> None:
+    """Remove a folder unless it is missing or holds what somebody put there."""
+    with suppress(OSError):
+        folder.rmdir()
 
 
 @contextmanager
@@ -242,8 +243,7 @@ def _refuse_protected(folder: Path, protect: Sequence[Path | str]) -> None:
     """Refuse a folder that is, or contains, one of the protected paths, however they are spelled."""
     real = Path(os.path.realpath(folder))
     for path in protect:
-        kept = Path(os.path.realpath(path))
-        if real == kept or real in kept.parents:
+        if Path(os.path.realpath(path)).is_relative_to(real):
             raise InputError(
                 f"{folder} is or contains the input {path}; choose another folder for the output"
             )
@@ -264,16 +264,6 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
             f"{folder} holds files but no {MARKER} or {MAP_MARKER}, so it is not overwritten; "
             "choose another folder"
         )
-
-
-def _nearest_existing_parent(folder: Path) -> Path:
-    """Return the closest ancestor that exists."""
-    return next(parent for parent in Path(os.path.abspath(folder)).parents if os.path.lexists(parent))
-
-
-def _missing_parents(folder: Path) -> list[Path]:
-    """Return the ancestors that do not exist yet, the deepest first."""
-    return [parent for parent in folder.parents if not os.path.lexists(parent)]
 
 
 # --- moving ----------------------------------------------------------------------------------------

@@ -33,14 +33,19 @@ def normalized(vectors: FloatArray) -> FloatArray:
     return units
 
 
-def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the angles in degrees between unit vectors, shapes (..., d) and (..., d).
+def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the angles in radians between unit vectors, shapes (..., d) and (..., d).
 
     Uses tan(angle / 2) = |a - b| / |a + b| (Kahan), exact to rounding at 0 and at 180 degrees, where
     arccos of the inner product loses half of the digits.
     """
     half: FloatArray = np.arctan2(np.linalg.norm(a - b, axis=-1), np.linalg.norm(a + b, axis=-1))
-    return np.degrees(2.0 * half)
+    return 2.0 * half
+
+
+def angle_between_deg(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the same angles in degrees."""
+    return np.degrees(angle_between(a, b))
 
 
 def tangent_bases(directions: FloatArray) -> FloatArray:

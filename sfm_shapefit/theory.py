@@ -25,9 +25,11 @@ bracketed: below, since a norm <= 1 is at least its square, by an eigenvalue; ab
 Source: Hand, Lee, Voroninski (2015), arXiv 1506.01437, theorems of sections 2.1 and 3.1.
 """
 
+import itertools
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -152,7 +154,7 @@ def recovery_conditions(locations: FloatArray, edges: IntArray, *, threads: int 
     mean = float(distances[edges[:, 0], edges[:, 1]].mean())
     bound = float(apart.max()) / mean
     exceptions = int(n * min(typicality.p_high, 1.0) / (_EXCEPTIONS * bound))
-    rows = _over_rows(lambda low, high: _least_sines(t, exceptions, low, high), n, threads)
+    rows = _over_rows(partial(_least_sines, t, exceptions), n, threads)
     beta, beta_most, collinear = (np.concatenate(part) for part in zip(*rows, strict=True))
     return RecoveryConditions(
         num_cameras=n,
@@ -205,14 +207,11 @@ def well_distributed(locations: FloatArray, adjacency: BoolArray, *, threads: in
     """
     n, d = locations.shape
     if d == 3:
-        rows = _over_rows(lambda low, high: _spread_in_space(locations, adjacency, low, high), n, threads)
+        rows = _over_rows(partial(_spread_in_space, locations, adjacency), n, threads)
         exact = float(min(part.min() for part in rows))
         return exact, exact
-    brackets = [
-        _spread_bracket(locations, i, j, np.flatnonzero(adjacency[i] & adjacency[j]))
-        for i in range(n)
-        for j in range(i + 1, n)
-    ]
+    pairs = itertools.combinations(range(n), 2)
+    brackets = [_spread_bracket(locations, i, j, adjacency[i] & adjacency[j]) for i, j in pairs]
     return min(low for low, _ in brackets), min(high for _, high in brackets)
 
 
@@ -321,17 +320,15 @@ def _least_sum_of_sines(phi: FloatArray) -> float:
     return max(least, 0.0)
 
 
-def _spread_bracket(t: FloatArray, i: int, j: int, common: IntArray) -> tuple[float, float]:
+def _spread_bracket(t: FloatArray, i: int, j: int, common: BoolArray) -> tuple[float, float]:
     """Bracket the well-distributedness of the cameras `common` with respect to the pair (i, j), any d."""
-    if len(common) == 0:
-        return 1.0, 1.0
     axis = (t[j] - t[i]) / np.linalg.norm(t[j] - t[i])
     offsets = t[common] - t[i]
     heights = offsets - np.outer(offsets @ axis, axis)
     sizes = np.linalg.norm(heights, axis=1)
     off_line = sizes > _COLLINEAR * np.linalg.norm(offsets, axis=1)
     units = heights[off_line] / sizes[off_line][:, None]
-    on_line, k = int((~off_line).sum()), len(common)
+    on_line, k = int((~off_line).sum()), len(offsets)
     if len(units) == 0:
         return 1.0, 1.0
     values, vectors = np.linalg.eigh(units.T @ units)

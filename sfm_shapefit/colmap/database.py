@@ -41,13 +41,13 @@ from sfm_shapefit.geometry import normalized
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
 
-# COLMAP's TwoViewGeometryConfiguration: 0 undefined, 1 degenerate, 2 calibrated, 3 uncalibrated, 4 planar,
-# 5 panoramic, 6 planar or panoramic, 7 watermark, 8 multiple, 9 calibrated rig.
-# What pairs of these configurations list is not verified, or a watermark.
+# COLMAP's TwoViewGeometryConfiguration; what these list is not verified: undefined, degenerate, watermark.
 _CONFIGS_WITHOUT_MATCHES = (0, 1, 7)
-# Of these configurations, 5 is a pure rotation, and 8 several motions, none of them stored.
+# Besides, 5 (panoramic) is a pure rotation, and 8 stands for several motions, none of them stored.
 _CONFIGS_WITHOUT_POSE = (0, 1, 5, 7, 8)
 
+# Limit of the memory for rays of keypoints that may be needed again, unless another is set.
+_CACHE_BYTES = 1_000_000_000
 _SIDECARS = ("-wal", "-journal")
 # Bytes 18 and 19 of the header say so.
 _WAL_VERSION = 2
@@ -89,15 +89,12 @@ def find_database(model_folder: Path) -> Path | None:
 
 
 @contextmanager
-def open_database(
-    path: Path | str, model: PosedModel, *, cache_bytes: int = 1_000_000_000
-) -> Iterator["MatchDatabase"]:
+def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabase"]:
     """Open a COLMAP database for reading; neither it nor its folder is changed.
 
     Args:
         path: the database.
         model: the posed images whose matches are wanted.
-        cache_bytes: limit of the memory for rays of keypoints that may be needed again.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
@@ -108,7 +105,7 @@ def open_database(
         with _sqlite_errors(file):
             connection = stack.enter_context(_readonly_connection(file))
             _check_schema(file, connection)
-            database = MatchDatabase(file, connection, model, cache_bytes)
+            database = MatchDatabase(file, connection, model)
         yield database
 
 
@@ -137,18 +134,16 @@ def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -
 class MatchDatabase:
     """The matches of a database between the images of a model; made by `open_database`."""
 
-    def __init__(
-        self, path: Path, connection: sqlite3.Connection, model: PosedModel, cache_bytes: int
-    ) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, model: PosedModel) -> None:
         self.path = path
         self._connection = connection
         self._model = model
-        self._cache_bytes = cache_bytes
+        self._cache_bytes = _CACHE_BYTES
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._cached_bytes = 0
-        self._index_of_id = _match_names(path, connection, model)
-        self._id_of_index = {index: i for i, index in self._index_of_id.items() if index >= 0}
-        self._pairs = _read_pairs(path, connection, self._index_of_id)
+        index_of_id = _match_names(path, connection, model)
+        self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
+        self._pairs = _read_pairs(path, connection, index_of_id)
 
     @property
     def unmatched_names(self) -> tuple[str, ...]:
@@ -176,34 +171,29 @@ class MatchDatabase:
 
     def num_keypoints(self) -> int:
         """Return the number of keypoints of all images, posed or not; damaged rows do not count."""
+        counts = self._query(
+            "SELECT rows FROM keypoints WHERE typeof(rows) = 'integer' AND rows BETWEEN 0 AND 2147483647"
+        )
+        return sum(count for (count,) in counts)
+
+    def _query(self, query: str, *values: int) -> list[tuple[Any, ...]]:
+        """Return the rows of a query."""
         with _sqlite_errors(self.path):
-            counts = self._connection.execute(
-                "SELECT rows FROM keypoints WHERE typeof(rows) = 'integer' AND rows BETWEEN 0 AND 2147483647"
-            )
-            return sum(count for (count,) in counts)
+            return self._connection.execute(query, values).fetchall()
 
     def keypoints(self, image: int) -> FloatArray:
-        """Return the pixels of the keypoints of one image.
-
-        Args:
-            image: index into `PosedModel.image_ids`.
-
-        Returns:
-            (k, 2) pixels in COLMAP's convention; k = 0 if the database has no keypoints of this image.
+        """Return the pixels (k, 2) of the keypoints of an image by its index; k = 0 if there are none.
 
         Raises:
             InputError: if the row is damaged or a coordinate is not finite.
         """
-        if image not in self._id_of_index:
+        found, name = [], self._model.names[image]
+        if image in self._id_of_index:
+            query = "SELECT rows, cols, data FROM keypoints WHERE image_id = ?"
+            found = self._query(query, self._id_of_index[image])
+        if not found or not found[0][0]:
             return np.zeros((0, 2))
-        with _sqlite_errors(self.path):
-            row = self._connection.execute(
-                "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (self._id_of_index[image],)
-            ).fetchone()
-        if row is None or not row[0]:
-            return np.zeros((0, 2))
-        name = self._model.names[image]
-        rows, cols, data = row
+        rows, cols, data = found[0]
         if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
         with np.errstate(invalid="ignore"):  # a signalling NaN
@@ -233,9 +223,9 @@ class MatchDatabase:
 
         Args:
             min_matches: pairs with fewer matches are left out; at least 1.
-            max_matches_per_batch: bounds the memory; only a single pair may exceed it.
-            among: only pairs of these images, by their index; all if None.
-            part: only this range of the pairs, one of `parts`; all if None.
+            max_matches_per_batch: only a single pair may exceed it.
+            among: only pairs of these images, by their index.
+            part: only this range of the pairs, one of `parts`.
 
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
@@ -287,11 +277,7 @@ class MatchDatabase:
     def _stored(self, pair: int, columns: str) -> tuple[Any, ...]:
         """Return columns of a pair's two-view geometry."""
         query = f"SELECT {columns} FROM two_view_geometries WHERE rowid = ?"
-        with _sqlite_errors(self.path):
-            row: tuple[Any, ...] = self._connection.execute(
-                query, (int(self._pairs.rowids[pair]),)
-            ).fetchone()
-        return row
+        return self._query(query, int(self._pairs.rowids[pair]))[0]
 
     def _stored_pose(self, pair: int) -> FloatArray:
         """Return (qw, qx, qy, qz, tx, ty, tz) of a pair as stored, NaN if it has none."""
@@ -574,10 +560,9 @@ def _read_pairs(path: Path, connection: sqlite3.Connection, index_of_id: dict[in
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     order = order[known[order]]
     pairs = ends[order]
-    repeated = (pairs[1:] == pairs[:-1]).all(axis=1)
-    if repeated.any():
-        pair_id = pair_ids[order][int(np.argmax(repeated))]
-        raise InputError(f"{path}: the two-view geometry of pair {pair_id} stands twice")
+    repeated = pair_ids[order[:-1]][(pairs[1:] == pairs[:-1]).all(axis=1)]
+    if len(repeated):
+        raise InputError(f"{path}: the two-view geometry of pair {repeated[0]} stands twice")
     return _Pairs(pairs, rowids[order], swapped[order], configs[order], num_inliers[order])
 
 
@@ -586,9 +571,9 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
     ids = np.stack(np.divmod(pair_ids, MAX_NUM_IMAGES), axis=1)
     known = np.array(sorted(index_of_id), dtype=np.int64)
     position = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-    bad = (known[position] != ids).any(axis=1) | (ids[:, 0] >= ids[:, 1])
-    if bad.any():
-        a, b = ids[int(np.argmax(bad))]
+    bad = ids[(known[position] != ids).any(axis=1) | (ids[:, 0] >= ids[:, 1])]
+    if len(bad):
+        a, b = bad[0]
         raise InputError(f"{path}: a two-view geometry joins the images with ids {a} and {b}; it is damaged")
     indices = np.array([index_of_id[i] for i in known.tolist()], dtype=np.int64)
     return indices[position]

@@ -22,12 +22,12 @@ import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
 from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
-from sfm_shapefit.colmap.other_programs import camera_of, intrinsics_of, reconstruction_of
+from sfm_shapefit.colmap.other_programs import intrinsics_of, make_camera, reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.models import is_model_file, read_model_file
-from sfm_shapefit.formats.posed_model import Intrinsics
+from sfm_shapefit.formats.posed_model import PosedModelFile
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -88,55 +88,39 @@ class PosedModel:
         return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PosedCameras:
-    """What of a model rays in world axes need, as plain values that other processes understand."""
-
-    names: tuple[str, ...]
-    """Of the n posed images."""
-    rotations: FloatArray
-    """(n, 3, 3) cam_from_world."""
-    focal_lengths_px: FloatArray
-    """(n,)"""
-    cameras: tuple[Intrinsics, ...]
-    """The different cameras."""
-    camera_of: IntArray
-    """(n,) index into `cameras`."""
-
-
-def posed_cameras(model: PosedModel) -> PosedCameras:
-    """Return the posed images without their points and centers."""
-    reconstruction = model.reconstruction
-    ids = [reconstruction.image(i).camera_id for i in model.image_ids.tolist()]
-    different, camera_of = np.unique(ids, return_inverse=True)
-    cameras = [reconstruction.camera(i) for i in different.tolist()]
-    return PosedCameras(
+def posed_cameras(model: PosedModel) -> PosedModelFile:
+    """Return what rays in world axes need as plain values for other processes: no points, no centers."""
+    cameras = [model.camera(index) for index in range(model.num_images)]
+    different, index_of = np.unique([camera.camera_id for camera in cameras], return_inverse=True)
+    return PosedModelFile(
+        cameras=tuple(intrinsics_of(model.reconstruction.camera(i)) for i in different.tolist()),
         names=model.names,
+        camera_of=index_of.astype(np.int64),
         rotations=np.array(model.rotations),
-        focal_lengths_px=np.array(model.focal_lengths_px),
-        cameras=tuple(intrinsics_of(camera) for camera in cameras),
-        camera_of=camera_of.astype(np.int64),
+        centers=np.zeros((model.num_images, 3)),
     )
 
 
-def from_posed_cameras(table: PosedCameras) -> PosedModel:
-    """Return a model of these images: the same rotations to the bit, centers at the origin, no points."""
+def from_posed_cameras(scene: PosedModelFile) -> PosedModel:
+    """Return a model of these images: the same rotations to the bit, no poses in frames, no points."""
     reconstruction = pycolmap.Reconstruction()
-    for camera_id, camera in enumerate(table.cameras, start=1):
-        reconstruction.add_camera_with_trivial_rig(camera_of(camera, camera_id))
-    n = len(table.names)
-    for k, (name, camera) in enumerate(zip(table.names, table.camera_of.tolist(), strict=True)):
-        image = pycolmap.Image(name=name, camera_id=camera + 1, image_id=k + 1)
+    cameras = [make_camera(camera, k) for k, camera in enumerate(scene.cameras, start=1)]
+    for camera in cameras:
+        reconstruction.add_camera_with_trivial_rig(camera)
+    camera_of_image = [cameras[k] for k in scene.camera_of.tolist()]
+    image_ids = np.arange(1, len(scene.names) + 1)
+    for image_id, name, camera in zip(image_ids.tolist(), scene.names, camera_of_image, strict=True):
+        image = pycolmap.Image(name=name, camera_id=camera.camera_id, image_id=image_id)
         reconstruction.add_image_with_trivial_frame(image)
     return PosedModel(
         reconstruction=reconstruction,
-        image_ids=np.arange(1, n + 1),
-        names=table.names,
-        rotations=table.rotations,
-        centers=np.zeros((n, 3)),
-        focal_lengths_px=table.focal_lengths_px,
-        frame_ids=np.arange(1, n + 1),
-        frame_offsets=np.zeros((n, 3)),
+        image_ids=image_ids,
+        names=scene.names,
+        rotations=scene.rotations,
+        centers=scene.centers,
+        focal_lengths_px=_focal_lengths_px("the model", camera_of_image),
+        frame_ids=image_ids,
+        frame_offsets=np.zeros_like(scene.centers),
     )
 
 
@@ -159,7 +143,7 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
     elif is_model_file(source):
         label, reconstruction = str(source), reconstruction_of(read_model_file(source), source)
     else:
-        label, reconstruction = str(source), _load(Path(source))
+        label, reconstruction = str(Path(source)), _load(Path(source))
         is_checked = model_suffix(Path(source)) == ".bin"
     try:
         with quiet_log():

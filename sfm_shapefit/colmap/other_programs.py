@@ -25,7 +25,7 @@ def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reco
         raise InputError(f"{label} has two images of the name {min(repeated)}; rename one")
     model = pycolmap.Reconstruction()
     for k, camera in enumerate(scene.cameras, start=1):
-        made = camera_of(camera, k)
+        made = make_camera(camera, k)
         if not made.verify_params():
             raise InputError(f"{label}: camera {k - 1} has parameters that do not fit {camera.model}")
         model.add_camera_with_trivial_rig(made)
@@ -91,7 +91,7 @@ def intrinsics_of(camera: pycolmap.Camera) -> Intrinsics:
     return Intrinsics(camera.model.name, int(camera.width), int(camera.height), tuple(camera.params.tolist()))
 
 
-def camera_of(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
+def make_camera(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
     """Return a camera of pycolmap's whose focal length is known."""
     return pycolmap.Camera(**intrinsics._asdict(), camera_id=camera_id, has_prior_focal_length=True)
 

@@ -4,11 +4,11 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.kernels import MEASURES, MIN_MATCHES, estimate_pairs
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.directions.options import DirectionOptions
-from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections, first_reasons, is_usable
 from sfm_shapefit.geometry import tangent_bases
 
 
@@ -53,7 +53,7 @@ def _judge(
     inliers, front, behind, voters, rivals, loyal, residual_px, parallax_rad = measures.T
     covariance = _tangent_covariance(directions, moments)
     sigma_deg = np.degrees(np.sqrt(np.linalg.eigvalsh(covariance)[:, -1]))
-    rules = (  # the first that fires names the reason
+    status = first_reasons(
         (num_matches < max(options.min_inliers, MIN_MATCHES), DirectionStatus.TOO_FEW_MATCHES),
         (inliers < options.min_inlier_ratio * num_matches, DirectionStatus.LOW_INLIER_RATIO),
         (inliers < options.min_inliers, DirectionStatus.FEW_INLIERS),
@@ -62,14 +62,11 @@ def _judge(
         (front <= options.min_sign_majority * behind, DirectionStatus.AMBIGUOUS_SIGN),
         (front < options.min_inliers, DirectionStatus.FEW_INLIERS),
     )
-    status = np.full(len(num_matches), DirectionStatus.USABLE, dtype=object)
-    for fired, reason in reversed(rules):
-        status[fired] = reason
-    usable: BoolArray = np.array([value is DirectionStatus.USABLE for value in status], dtype=np.bool_)
+    usable = is_usable(status)
     return PairDirections(
         pairs=matches.pairs,
         directions=np.where(usable[:, None], directions, np.nan),
-        status=list(status),
+        status=status,
         num_matches=np.asarray(num_matches, dtype=np.int64),
         num_inliers=inliers.astype(np.int64),
         num_rivals=rivals.astype(np.int64),

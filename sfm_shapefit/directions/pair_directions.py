@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 
 
 class DirectionStatus(enum.Enum):
@@ -61,7 +61,7 @@ class PairDirections:
 
     def usable(self) -> IntArray:
         """Return the rows that have a direction."""
-        return np.flatnonzero([status is DirectionStatus.USABLE for status in self.status])
+        return np.flatnonzero(is_usable(self.status))
 
     def counts(self) -> dict[DirectionStatus, int]:
         """Return how many pairs have each status, most frequent first."""
@@ -90,14 +90,25 @@ class PairDirections:
         return weights
 
 
+def first_reasons(*rules: tuple[BoolArray, DirectionStatus]) -> list[DirectionStatus]:
+    """Return for each pair the status of the first of the rules (k,) that fires, or USABLE."""
+    status = np.full(len(rules[0][0]), DirectionStatus.USABLE, dtype=object)
+    for fired, reason in reversed(rules):
+        status[fired] = reason
+    return list(status)
+
+
+def is_usable(status: Sequence[DirectionStatus]) -> BoolArray:
+    """Return which pairs have a direction, (k,)."""
+    return np.array([value is DirectionStatus.USABLE for value in status], dtype=np.bool_)
+
+
 def concatenate(parts: Sequence[PairDirections]) -> PairDirections:
     """Return the rows of all parts, in order.
 
     Raises:
         ValueError: if there are no parts.
     """
-    columns: dict[str, Any] = {}
-    for field in fields(PairDirections):
-        columns[field.name] = np.concatenate([getattr(part, field.name) for part in parts])
-    columns["status"] = list(columns["status"])
-    return PairDirections(**columns)
+    names = (field.name for field in fields(PairDirections))
+    columns: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+    return PairDirections(**{**columns, "status": list(columns["status"])})

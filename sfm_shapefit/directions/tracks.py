@@ -29,7 +29,7 @@ _IN_ALL, _PER_CAMERA_OF_FEW = 800, 60
 _MIN_VIEWS = 3
 # So many matches are held at a time, in 0.6 GB.
 _MAX_MATCHES = 10_000_000
-# Rays farther apart than this gain nothing more, and are often wrong.
+# Rays farther apart gain nothing more, and are often wrong.
 _WIDEST_RAD = 0.5
 # No image has so many keypoints.
 _KEYPOINTS = 1 << 32
@@ -84,8 +84,7 @@ def build_tracks(
     share = min(1.0, max_matches / max(float(directions.num_inliers[usable].sum()), 1.0))
     pairs = map(tuple, directions.pairs[usable].tolist())
     rows = dict(zip(pairs, usable.tolist(), strict=True))
-    keys: list[IntArray] = []
-    rays: list[FloatArray] = []
+    keys, rays = [], []
     for batch in batches:
         row = np.array([rows.get(tuple(pair), -1) for pair in batch.pairs.tolist()], dtype=np.int64)
         counts = np.diff(batch.offsets)
@@ -98,7 +97,8 @@ def build_tracks(
         keys.append(batch.pairs[pair[agrees]] * _KEYPOINTS + batch.keypoints[chosen])
         rays.append(np.stack([batch.rays_i[chosen], batch.rays_j[chosen]], axis=1).reshape(-1, 3))
     if not keys:
-        return _no_tracks()
+        zero = np.zeros(1, dtype=np.int64)
+        return Tracks(offsets=zero, cameras=zero[:0], rays=np.zeros((0, 3)))
     return _components(np.concatenate(keys), rays)
 
 
@@ -110,7 +110,7 @@ def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArra
     mixed = (image << np.uint64(32)) + batch.keypoints.astype(np.uint64)
     for shift in (30, 27, 31):  # the finalizer of splitmix64
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * _MIX
-    drawn: BoolArray = (mixed >> np.uint64(11)).astype(np.float64) < share / 2.0 * 2.0**53
+    drawn = (mixed >> np.uint64(11)).astype(np.float64) < share / 2.0 * 2.0**53
     return np.asarray(drawn.any(axis=1))
 
 
@@ -119,12 +119,6 @@ def _sampson_px(a: FloatArray, b: FloatArray, d: FloatArray, pixel_angle: FloatA
     along_a, along_b = np.sum(a * d, axis=1), np.sum(b * d, axis=1)
     gradient = np.sqrt(np.maximum(2.0 - along_a**2 - along_b**2, 1e-12))
     return np.asarray(np.abs(np.sum(np.cross(a, b) * d, axis=1)) / (gradient * pixel_angle))
-
-
-def _no_tracks() -> Tracks:
-    return Tracks(
-        offsets=np.zeros(1, dtype=np.int64), cameras=np.zeros(0, dtype=np.int64), rays=np.zeros((0, 3))
-    )
 
 
 def _components(ends: IntArray, rays: list[FloatArray]) -> Tracks:
@@ -176,8 +170,6 @@ def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None
 
 def _worth(tracks: Tracks) -> FloatArray:
     """Return how much a track says: the root of its length times the widest angle of its rays, limited."""
-    if tracks.num_tracks == 0:
-        return np.zeros(0)
     first = tracks.rays[np.repeat(tracks.offsets[:-1], tracks.lengths())]
     apart = np.linalg.norm(tracks.rays - first, axis=1)
     widest = np.maximum.reduceat(apart, tracks.offsets[:-1])

@@ -11,10 +11,9 @@ shape trouble", CVPR 2018, sections 3 and 4. Written from the paper.
 """
 
 import numpy as np
-import numpy.typing as npt
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import normalized
+from sfm_shapefit.geometry import angle_between, normalized
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -32,8 +31,7 @@ def filter_triangles(
     graph: ViewGraph, threshold_rad: float = _KEPT, iterations: int = _ITERATIONS
 ) -> BoolArray:
     """Return the (m,) pairs whose score, see `triangle_scores`, stays below the threshold."""
-    kept: BoolArray = triangle_scores(graph, iterations) < threshold_rad
-    return kept
+    return np.asarray(triangle_scores(graph, iterations) < threshold_rad)
 
 
 def triangle_scores(graph: ViewGraph, iterations: int = _ITERATIONS) -> FloatArray:
@@ -68,21 +66,13 @@ def _triangles(graph: ViewGraph) -> IntArray:
     found = [np.empty((0, 3), dtype=np.int64)]
     for e, (i, j) in enumerate(graph.edges.tolist()):
         rows = [slice(around.pointers[c], around.pointers[c + 1]) for c in (i, j)]
-        of_i, of_j = _positions_of_common(*(around.neighbours[row] for row in rows))
-        if len(of_i):
-            sides = np.full((len(of_i), 3), e, dtype=np.int64)
-            sides[:, 1] = around.edge_of[rows[0]][of_i]
-            sides[:, 2] = around.edge_of[rows[1]][of_j]
-            found.append(sides)
+        around_i, around_j = (around.neighbours[row] for row in rows)
+        _, of_i, of_j = np.intersect1d(around_i, around_j, assume_unique=True, return_indices=True)
+        sides = np.full((len(of_i), 3), e, dtype=np.int64)
+        sides[:, 1] = around.edge_of[rows[0]][of_i]
+        sides[:, 2] = around.edge_of[rows[1]][of_j]
+        found.append(sides)
     return np.concatenate(found)
-
-
-def _positions_of_common(
-    a: npt.NDArray[np.integer], b: npt.NDArray[np.integer]
-) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-    """Return where the common entries of two lists without repetitions stand in each."""
-    _, in_a, in_b = np.intersect1d(a, b, assume_unique=True, return_indices=True)
-    return in_a, in_b
 
 
 def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:
@@ -99,14 +89,7 @@ def _angles(graph: ViewGraph, sides: IntArray) -> FloatArray:
     reach = np.arctan2(np.sum(b * e2, axis=1), np.sum(a * b, axis=1))  # of the arc, from a to b
     nearest = np.arctan2(along_e, along_a)
     on_arc = (nearest >= 0.0) & (nearest <= reach)
-    to_plane = np.arctan2(
-        np.linalg.norm(x - along_a[:, None] * a - along_e[:, None] * e2, axis=1), np.hypot(along_a, along_e)
-    )
-    angles = np.where(on_arc, to_plane, np.minimum(_angle(x, a), _angle(x, b)))
-    return np.where(_angle(a, -b) < _OPPOSITE_RAD, np.nan, angles)
-
-
-def _angle(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Return the angles between unit vectors in radians."""
-    half = np.arctan2(np.linalg.norm(a - b, axis=1), np.linalg.norm(a + b, axis=1))
-    return np.asarray(2.0 * half)
+    off_plane = x - along_a[:, None] * a - along_e[:, None] * e2
+    to_plane = np.arctan2(np.linalg.norm(off_plane, axis=1), np.hypot(along_a, along_e))
+    angles = np.where(on_arc, to_plane, np.minimum(angle_between(x, a), angle_between(x, b)))
+    return np.where(angle_between(a, -b) < _OPPOSITE_RAD, np.nan, angles)

@@ -63,11 +63,10 @@ def relative_poses_text(poses: EpipolarGeometries) -> str:
     for name in poses.names:
         if len(name.split()) != 1 or "#" in name:
             raise InputError(f"the name {name!r} cannot stand in a file of relative poses; rename the image")
-    lines = []
     quaternions = Rotation.from_matrix(poses.rotations).as_quat(canonical=True)  # x, y, z, w
-    for (i, j), (x, y, z, w), rotation, to_second in zip(
-        poses.pairs.tolist(), quaternions.tolist(), poses.rotations, poses.to_second, strict=True
-    ):
-        numbers = [w, x, y, z, *(-rotation @ to_second).tolist()]
-        lines.append(" ".join([poses.names[i], poses.names[j], *(repr(number + 0.0) for number in numbers)]))
+    translations = [-rotation @ v for rotation, v in zip(poses.rotations, poses.to_second, strict=True)]
+    values = np.column_stack([np.roll(quaternions, 1, axis=1), np.reshape(translations, (-1, 3))]) + 0.0
+    lines = []
+    for (i, j), numbers in zip(poses.pairs.tolist(), values.tolist(), strict=True):
+        lines.append(" ".join([poses.names[i], poses.names[j], *map(repr, numbers)]))
     return "".join(f"{line}\n" for line in lines)

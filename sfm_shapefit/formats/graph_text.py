@@ -63,12 +63,11 @@ def read_graph(path: Path | str) -> ViewGraph:
 def graph_text(graph: ViewGraph) -> str:
     """Return a view graph in the text format that `read_graph` takes; numbers round-trip."""
     ids = graph.names or tuple(str(k) for k in range(graph.num_nodes))
-    weighted = bool(np.any(graph.weights != 1.0))
+    values = graph.directions
+    if np.any(graph.weights != 1.0):
+        values = np.column_stack([values, graph.weights])
     lines = []
-    for (i, j), v, weight in zip(
-        graph.edges.tolist(), graph.directions.tolist(), graph.weights.tolist(), strict=True
-    ):
-        numbers = [*v, weight] if weighted else v
+    for (i, j), numbers in zip(graph.edges.tolist(), values.tolist(), strict=True):
         lines.append(" ".join([ids[i], ids[j], *map(repr, numbers)]))
     return "\n".join(lines) + "\n"
 

@@ -11,6 +11,8 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import text_of
 
+_TOLERANCE = 1e-4
+
 
 def read_json(file: Path) -> Any:
     """Return the content of a JSON file.
@@ -100,6 +102,6 @@ class JsonNode:
         return InputError(f"{self.file}: {self.where.lstrip('/') or 'the file'} {what}")
 
 
-def is_rotation(matrix: FloatArray, tolerance: float = 1e-4) -> bool:
+def is_rotation(matrix: FloatArray) -> bool:
     """Return whether a (3, 3) matrix is a rotation up to what printing with few digits costs."""
-    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= tolerance and np.linalg.det(matrix) > 0.0)
+    return bool(np.abs(matrix @ matrix.T - np.eye(3)).max() <= _TOLERANCE and np.linalg.det(matrix) > 0.0)

@@ -163,8 +163,8 @@ def onedsfm_files(
 
 
 def _text(ids: list[str], values: FloatArray) -> str:
-    lines = [f"{name} {' '.join(map(repr, row))}\n" for name, row in zip(ids, values.tolist(), strict=True)]
-    return "".join(lines)
+    rows = zip(ids, values.tolist(), strict=True)
+    return "".join(f"{name} {' '.join(map(repr, row))}\n" for name, row in rows)
 
 
 def _restrict(found: EpipolarGeometries, component: Path) -> EpipolarGeometries:

@@ -32,9 +32,8 @@ _MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
 
 def is_opensfm(content: object) -> bool:
     """Return whether the content of a JSON file is a list of reconstructions."""
-    return (
-        isinstance(content, list) and bool(content) and isinstance(content[0], dict) and "shots" in content[0]
-    )
+    first = content[0] if isinstance(content, list) and content else None
+    return isinstance(first, dict) and "shots" in first
 
 
 def read_opensfm(file: Path, content: object) -> PosedModelFile:
@@ -91,25 +90,20 @@ def _camera(node: JsonNode) -> Intrinsics:
     def value(key: str) -> float:
         return node.get(key).number() if node.has(key) else 0.0
 
-    two = node.has("focal_x")
-    fx, fy = (
-        node.get(key).number() * size for key in (("focal_x", "focal_y") if two else ("focal", "focal"))
-    )
+    keys = ("focal_x", "focal_y") if node.has("focal_x") else ("focal", "focal")
+    fx, fy = (node.get(key).number() * size for key in keys)
     if fx <= 0.0 or fy <= 0.0:
         raise node.error("has a focal length that is not positive")
     center = (size * value("c_x") + width / 2.0, size * value("c_y") + height / 2.0)
     k1, k2 = value("k1"), value("k2")
-    params: tuple[float, ...]
     if kind == "perspective":
-        model, params = "RADIAL", (fx, *center, k1, k2)
-    elif kind == "fisheye":
-        model, params = "OPENCV_FISHEYE", (fx, fy, *center, k1, k2, 0.0, 0.0)
-    elif kind == "brown":
+        return Intrinsics("RADIAL", width, height, (fx, *center, k1, k2))
+    both = (fx, fy, *center, k1, k2)
+    if kind == "brown":
         extra = (value("p1"), value("p2"), value("k3"), 0.0, 0.0, 0.0)
-        model, params = "FULL_OPENCV", (fx, fy, *center, k1, k2, *extra)
-    else:
-        model, params = "OPENCV", (fx, fy, *center, k1, k2, 0.0, 0.0)
-    return Intrinsics(model, width, height, params)
+        return Intrinsics("FULL_OPENCV", width, height, (*both, *extra))
+    model = "OPENCV_FISHEYE" if kind == "fisheye" else "OPENCV"
+    return Intrinsics(model, width, height, (*both, 0.0, 0.0))
 
 
 def _observations(file: Path, points: list[str], names: list[str]) -> tuple[IntArray, FloatArray]:

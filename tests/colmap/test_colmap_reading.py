@@ -636,7 +636,8 @@ def test_relative_poses_point_from_camera_j_to_camera_i(scene, tmp_path, order):
 def test_rays_of_database_matches_are_those_of_its_keypoints(scene, tmp_path, cache_bytes):
     model = read_model(scene)
     path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
-    with open_database(path, model, cache_bytes=cache_bytes) as database:
+    with open_database(path, model) as database:
+        database.limit_rays(cache_bytes)
         (batch,) = database.iter_matches(1)
         for p, pair in enumerate(batch.pairs.tolist()):
             rows = slice(batch.offsets[p], batch.offsets[p + 1])

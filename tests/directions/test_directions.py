@@ -1,13 +1,14 @@
 """Directions from matches and known rotations, on pairs whose true direction is known."""
 
 import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.matches import RayMatches
+from sfm_shapefit.directions.matches import RayMatches, RelativePoses
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections, concatenate
 from sfm_shapefit.directions.relative_poses import from_relative_poses
@@ -379,18 +380,19 @@ def test_relative_poses_become_directions_with_the_papers_sign():
     translations = -np.einsum("nab,nb->na", rotations, centers)
     relative_rotation = rotations[1] @ rotations[0].T
     relative_translation = translations[1] - relative_rotation @ translations[0]
-    pairs, support = np.array([[0, 1]]), np.array([50])
-
-    poses = (relative_rotation[None], 0.17 * relative_translation[None])  # COLMAP's planar poses are not unit
-    found = from_relative_poses(pairs, poses, rotations, support)
+    poses = RelativePoses(
+        pairs=np.array([[0, 1]]),
+        rotations=relative_rotation[None],
+        translations=0.17 * relative_translation[None],  # COLMAP's planar poses are not unit
+        configs=np.array([2]),
+        num_inliers=np.array([50]),
+    )
+    found = from_relative_poses(poses, rotations)
     assert found.status == [DirectionStatus.USABLE]
     np.testing.assert_allclose(found.directions[0], normalized(centers[0] - centers[1]), atol=1e-14)
 
     turned = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(0.3), -np.sin(0.3)], [0.0, np.sin(0.3), np.cos(0.3)]])
-    contradicting = (turned @ poses[0], poses[1])
-    assert from_relative_poses(pairs, contradicting, rotations, support).status == [
-        DirectionStatus.ROTATION_MISMATCH
-    ]
-    assert from_relative_poses(pairs, poses, rotations, np.array([5])).status == [
-        DirectionStatus.TOO_FEW_MATCHES
-    ]
+    contradicting = replace(poses, rotations=turned @ poses.rotations)
+    assert from_relative_poses(contradicting, rotations).status == [DirectionStatus.ROTATION_MISMATCH]
+    unsupported = replace(poses, num_inliers=np.array([5]))
+    assert from_relative_poses(unsupported, rotations).status == [DirectionStatus.TOO_FEW_MATCHES]

@@ -20,12 +20,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
-from sfm_shapefit.colmap.model import PosedCameras, PosedModel, from_posed_cameras, posed_cameras
+from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
 from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
+from sfm_shapefit.formats.posed_model import PosedModelFile
 
 ExecutorKind = Literal["serial", "processes", "dask"]
 
@@ -44,7 +45,7 @@ class DirectionTask:
     """Its absolute path, the same for all workers."""
     part: tuple[int, int]
     """The range of its pairs."""
-    cameras: PosedCameras
+    cameras: PosedModelFile
     """Of the whole model: the indices of pairs refer to them."""
     options: DirectionOptions
 

@@ -47,13 +47,7 @@ def measure_directions(
         poses = source.database.relative_poses()
         if len(poses.pairs) == 0:
             raise UnsolvableError("the database has no stored relative pose; use directions from matches")
-        return from_relative_poses(
-            poses.pairs,
-            (poses.rotations, poses.translations),
-            model.rotations,
-            poses.num_inliers,
-            options,
-        )
+        return from_relative_poses(poses, model.rotations, options)
     if executor is not None and source.database is not None:
         parts = measure_with_workers(source.database, model, options, executor, clock.advance)
     else:
