@@ -63,18 +63,15 @@ class ApproximateCholesky:
     pivots: FloatArray
     """(n,) weighted degree at elimination; 0 for the last node of each component."""
 
-    @property
-    def num_entries(self) -> int:
-        """Stored entries of F, 8 bytes each."""
-        return len(self.rows)
-
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return F^-T diag(pivots)^-1 F^-1 rhs for each column of rhs, (n, k)."""
-        x = np.ascontiguousarray(rhs[self.permutation], dtype=np.float64)
-        substitute = _substitute_3 if x.shape[1] == 3 else _substitute
-        substitute(self.pointers, self.rows, self.fractions, self.pivots, x)
-        out = np.empty_like(x)
-        out[self.permutation] = x
+        out = np.empty(rhs.shape)
+        x = np.zeros((len(rhs), 3))
+        for k in range(0, rhs.shape[1], 3):
+            width = min(rhs.shape[1] - k, 3)
+            x[:, :width] = rhs[self.permutation, k : k + 3]
+            _substitute(self.pointers, self.rows, self.fractions, self.pivots, x)
+            out[self.permutation, k : k + 3] = x[:, :width]
         return out
 
 
@@ -285,7 +282,7 @@ def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, s
 
 
 @kernel(exact=True)
-def _substitute_3(pointers: Any, rows: Any, fractions: Any, pivots: Any, x: Any) -> None:
+def _substitute(pointers: Any, rows: Any, fractions: Any, pivots: Any, x: Any) -> None:
     """Apply the inverse of the factor to three columns in place."""
     n = len(pivots)
     for k in range(n):
@@ -305,23 +302,6 @@ def _substitute_3(pointers: Any, rows: Any, fractions: Any, pivots: Any, x: Any)
             x1 += f * x[i, 1]
             x2 += f * x[i, 2]
         x[k, 0], x[k, 1], x[k, 2] = x0, x1, x2
-
-
-@kernel(exact=True)
-def _substitute(pointers: Any, rows: Any, fractions: Any, pivots: Any, x: Any) -> None:
-    """Apply the inverse of the factor to each column in place."""
-    n, width = x.shape
-    for k in range(n):
-        scale = 1.0 / pivots[k] if pivots[k] > 0.0 else 0.0
-        for p in range(pointers[k], pointers[k + 1]):
-            for c in range(width):
-                x[rows[p], c] += fractions[p] * x[k, c]
-        for c in range(width):
-            x[k, c] *= scale
-    for k in range(n - 1, -1, -1):
-        for p in range(pointers[k], pointers[k + 1]):
-            for c in range(width):
-                x[k, c] += fractions[p] * x[rows[p], c]
 
 
 @dataclass(frozen=True, slots=True, eq=False)

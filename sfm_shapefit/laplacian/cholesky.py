@@ -109,7 +109,31 @@ class CholeskyFactor:
                 or (b > 1) not rigid under these weights, or a weight is negative or not finite. Use
                 nothing of the factor then.
         """
-        _refactor(self, weights, ground)
+        plan, b = self.symbolic, self.block
+        shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
+        if np.shape(weights) != shape:
+            raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
+        w = np.ascontiguousarray(weights, dtype=np.float64).reshape(plan.num_edges, b * b)
+        panels = _Panels(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, self.panels)
+        arenas = min(self.workers.threads, len(plan.tasks))
+        stack_size = (plan.stack_size + arenas * plan.arena_size) * b * b
+        parts = _Parts(
+            plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
+            plan.edge_index, plan.edge_row, plan.edge_column, w, self._diagonal,
+            np.empty(stack_size, dtype=self.dtype),
+        )  # fmt: skip
+        _sum_at_nodes(panels, parts)
+        traces = self._diagonal[:, :: b + 1]
+        traces[-1] += float(traces.mean()) if ground is None else ground
+        with one_blas_thread():
+            failed, pivot = _factor_all(self, panels, parts, arenas)
+        self.smallest_pivot = float(pivot[0])
+        self.weakest_node = int(plan.permutation[int(pivot[1]) // b])
+        if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps:
+            raise UnsolvableError(
+                f"the Laplacian is singular at node {self.weakest_node} (relative pivot {pivot[0]:.1e}); "
+                "the graph is disconnected or not rigid there, or its weights are not positive"
+            )
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node.
@@ -121,14 +145,22 @@ class CholeskyFactor:
         Returns:
             Float64 of the shape of `rhs`, accurate to the precision of the factor.
         """
-        return _solve(self, rhs)
+        plan, b = self.symbolic, self.block
+        n = plan.num_nodes
+        lead = (n,) if b == 1 else (n, b)
+        if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
+            raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
+        given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
+        x = np.empty((n * b, 3), dtype=self.dtype)
+        out = np.empty_like(given)
+        for k in range(0, given.shape[1], 3):
+            _gather(given[:, k : k + 3], plan.permutation, b, x)
+            _substitute(self, x)
+            _scatter(x, plan.permutation, b, out[:, k : k + 3])
+        return out.reshape(np.shape(rhs))
 
 
-def analyse(
-    num_nodes: int,
-    edges: npt.ArrayLike,
-    ordering: Ordering | IntArray = "auto",
-) -> SymbolicFactor:
+def analyse(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray = "auto") -> SymbolicFactor:
     """Plan the factorization of the Laplacians of a graph, whatever their weights, block size and precision.
 
     Args:
@@ -179,49 +211,11 @@ def factorise(
     return factor
 
 
-def _refactor(factor: CholeskyFactor, weights: FloatArray, ground: float | None) -> None:
-    plan, b = factor.symbolic, factor.block
-    shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
-    if np.shape(weights) != shape:
-        raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
-    w = np.ascontiguousarray(weights, dtype=np.float64).reshape(plan.num_edges, b * b)
-    diagonal = factor._diagonal
-    panels, parts = _panels(factor), _parts(factor, w)
-    _sum_at_nodes(panels, parts)
-    traces = diagonal[:, :: b + 1]
-    grounding = float(traces.mean()) if ground is None else ground
-    traces[-1] += grounding
-    with one_blas_thread():
-        failed, pivot = _factor_all(factor, panels, parts)
-    factor.smallest_pivot = float(pivot[0])
-    factor.weakest_node = int(plan.permutation[int(pivot[1]) // b])
-    if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(factor.dtype).eps:
-        raise UnsolvableError(
-            f"the Laplacian is singular at node {factor.weakest_node} (relative pivot {pivot[0]:.1e}); "
-            "the graph is disconnected or not rigid there, or its weights are not positive"
-        )
-
-
-def _panels(factor: CholeskyFactor) -> _Panels:
-    plan = factor.symbolic
-    return _Panels(factor.block, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels)
-
-
-def _parts(factor: CholeskyFactor, weights: FloatArray) -> _Parts:
-    plan = factor.symbolic
-    arenas = min(factor.workers.threads, len(plan.tasks))
-    stack_size = (plan.stack_size + arenas * plan.arena_size) * factor.block**2
-    return _Parts(
-        plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
-        plan.edge_index, plan.edge_row, plan.edge_column, weights, factor._diagonal,
-        np.empty(stack_size, dtype=factor.dtype),
-    )  # fmt: skip
-
-
-def _factor_all(factor: CholeskyFactor, panels: _Panels, parts: _Parts) -> tuple[bool, FloatArray]:
+def _factor_all(
+    factor: CholeskyFactor, panels: _Panels, parts: _Parts, arenas: int
+) -> tuple[bool, FloatArray]:
     """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
     plan = factor.symbolic
-    arenas = min(factor.workers.threads, len(plan.tasks))
     free = SimpleQueue[int]()
     for k in range(arenas):
         free.put(plan.stack_size + k * plan.arena_size)
@@ -368,29 +362,30 @@ def _assemble_front(s: int, panels: Any, parts: Any, arena: int) -> None:
     panel[:] = 0.0
     _assemble_edges(panel, height, b, s, parts)
     _assemble_diagonal(panel, height, b, panels.first[s], panels.first[s + 1], parts.diagonal)
-    children, relative, offsets, stack = parts.children, parts.relative, parts.update_offsets, parts.stack
-    for c in range(parts.child_pointers[s], parts.child_pointers[s + 1]):
-        child = children[c]
-        there = relative[row_pointers[child] : row_pointers[child + 1]]
-        size = len(there) * b
-        update = stack[(offsets[child] + arena) * b * b :][: size * size]
-        _add_update(update, there, b, 0, width // b, panel, height)
+    _add_children(s, panels, parts, arena, 0, width // b, panel, height)
 
 
 @kernel(exact=True)
 def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
     """Add what the children leave for later fronts to the update of s, which starts at `update`."""
-    b, row_pointers = panels.b, panels.row_pointers
     width = panels.first[s + 1] - panels.first[s]
-    below = row_pointers[s + 1] - row_pointers[s]
-    children, relative, offsets, stack = parts.children, parts.relative, parts.update_offsets, parts.stack
-    mine = stack[update : update + (below * b) ** 2]
+    below = panels.row_pointers[s + 1] - panels.row_pointers[s]
+    leading = below * panels.b
+    mine = parts.stack[update : update + leading**2]
+    _add_children(s, panels, parts, arena, width, width + below, mine, leading)
+
+
+@kernel(exact=True)
+def _add_children(
+    s: int, panels: Any, parts: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
+) -> None:
+    """Add the columns of the children's updates that go to the columns lowest..highest-1 of a front."""
+    b, row_pointers, stack = panels.b, panels.row_pointers, parts.stack
     for c in range(parts.child_pointers[s], parts.child_pointers[s + 1]):
-        child = children[c]
-        there = relative[row_pointers[child] : row_pointers[child + 1]]
-        size = len(there) * b
-        theirs = stack[(offsets[child] + arena) * b * b :][: size * size]
-        _add_update(theirs, there, b, width, width + below, mine, below * b)
+        child = parts.children[c]
+        there = parts.relative[row_pointers[child] : row_pointers[child + 1]]
+        update = stack[(parts.update_offsets[child] + arena) * b * b :][: (len(there) * b) ** 2]
+        _add_update(update, there, b, lowest, highest, target, leading)
 
 
 @kernel(exact=True)
@@ -480,31 +475,17 @@ def _add(target: Any, values: Any) -> None:
         target[i] += values[i]
 
 
-def _solve(factor: CholeskyFactor, rhs: FloatArray) -> FloatArray:
-    plan, b = factor.symbolic, factor.block
-    n = plan.num_nodes
-    lead = (n,) if b == 1 else (n, b)
-    if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
-        raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
-    given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
-    x = np.empty((n * b, 3), dtype=factor.dtype)
-    out = np.empty_like(given)
-    for k in range(0, given.shape[1], 3):
-        _gather(given[:, k : k + 3], plan.permutation, b, x)
-        _substitute(factor, x)
-        _scatter(x, plan.permutation, b, out[:, k : k + 3])
-    return out.reshape(np.shape(rhs))
-
-
 def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
     """Solve L L^T y = x in place for three right-hand sides: the tasks, what is above them, and back."""
     plan, b = factor.symbolic, factor.block
     outer = np.zeros((len(plan.tasks), *x.shape), dtype=x.dtype)  # what each task leaves for rows above it
+    addresses = [leaf_address(leaf, factor.dtype, 3) for leaf in (_subtract_four, _multiply_four)]
+    leaves = np.array(addresses, dtype=np.int64)
 
     def job(kernel: Any, begin: int, end: int, *rest: Any) -> Callable[[], object]:
         return lambda: kernel(
             begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
-            np.empty((3, plan.largest_front * b), x.dtype), _leaves(factor.dtype), np.empty(3, np.int64),
+            np.empty((3, plan.largest_front * b), x.dtype), leaves, np.empty(3, np.int64),
             np.empty(12, x.dtype), *rest,
         )  # fmt: skip
 
@@ -516,12 +497,6 @@ def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
     for run in plan.above[::-1]:
         job(_ascend, *run)()
     factor.workers.run([job(_ascend, *task) for task in plan.tasks])
-
-
-def _leaves(dtype: np.dtype[Any]) -> IntArray:
-    """Return the addresses of `_subtract_four` and `_multiply_four` for float32 or float64."""
-    addresses = [leaf_address(leaf, dtype, 3) for leaf in (_subtract_four, _multiply_four)]
-    return np.array(addresses, dtype=np.int64)
 
 
 @kernel(exact=True)

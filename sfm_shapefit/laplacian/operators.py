@@ -106,11 +106,6 @@ class LaplacianPattern:
     edges: IntArray
     """(m, 2) the edges."""
 
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
-        return len(self.pointers) - 1
-
 
 def laplacian_pattern(num_nodes: int, edges: npt.ArrayLike) -> LaplacianPattern:
     """Find the pattern and the slots of the Laplacian of a graph; repeated edges share their slots.
@@ -157,7 +152,7 @@ def assemble(
         pattern.edges, pattern.diagonal, pattern.upper, pattern.lower,
         w.reshape(len(w), -1), data.reshape(len(data), -1),
     )  # fmt: skip
-    n = pattern.num_nodes * block
+    n = len(pattern.diagonal) * block
     indices = (data, pattern.columns, pattern.pointers)
     return csr_array(indices, shape=(n, n)) if w.ndim == 1 else bsr_array(indices, shape=(n, n))
 
@@ -235,7 +230,7 @@ class LaplacianOperator:
 
     def __init__(self, graph: Adjacency, weights: FloatArray, workers: Workers) -> None:
         """Copy the weights, (m,), to the entries of the adjacency."""
-        self._graph = graph
+        self.graph = graph
         self._entries = np.empty(len(graph.edge_of), np.float32)
         self.reweigh(weights)
         self._workers = workers
@@ -246,24 +241,19 @@ class LaplacianOperator:
 
     def reweigh(self, weights: FloatArray) -> None:
         """Take other weights, (m,), in place of those before."""
-        _write_entries(self._graph.edge_of, weights, self._entries)
-
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
-        return self._graph.num_nodes
+        _write_entries(self.graph.edge_of, weights, self._entries)
 
     def diagonal(self) -> FloatArray:
         """Return the weighted degree of each node, (n,)."""
-        degree = np.empty(self._graph.num_nodes)
-        _degrees(self._graph.pointers, self._entries, degree)
+        degree = np.empty(self.graph.num_nodes)
+        _degrees(self.graph.pointers, self._entries, degree)
         return degree
 
     def __call__(self, x: FloatArray) -> FloatArray:
         """Return L x, (n, k). Each row is one sum in the order of the adjacency, whatever the threads."""
         out = np.empty_like(x, order="C")
         apply = _apply_entries_3 if x.shape[1] == 3 else _apply_entries
-        graph, entries = self._graph, self._entries
+        graph, entries = self.graph, self._entries
 
         def job(first: int, last: int) -> Callable[[], object]:
             return lambda: apply(first, last, graph.pointers, graph.neighbours, entries, x, out)

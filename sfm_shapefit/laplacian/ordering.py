@@ -55,8 +55,10 @@ def metis_order(graph: Adjacency) -> IntArray:
 
     if graph.num_nodes == 0 or len(graph.neighbours) == 0:
         return np.arange(graph.num_nodes)
-    unique = without_repeats(graph)
-    csr = pymetis.CSRAdjacency(unique[0].astype(np.int32), unique[1])
+    entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
+    matrix = csc_array(entries, shape=(graph.num_nodes, graph.num_nodes), copy=True)
+    matrix.sum_duplicates()  # METIS demands each neighbor once
+    csr = pymetis.CSRAdjacency(matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32))
     options = pymetis.Options(niter=_METIS_REFINEMENTS)
     return np.asarray(pymetis.nested_dissection(adjacency=csr, options=options)[0], dtype=np.int64)
 
@@ -88,15 +90,6 @@ def widest_level(graph: Adjacency) -> int:
     last = _distances(graph.pointers, graph.neighbours, 0)[1]
     distance, _ = _distances(graph.pointers, graph.neighbours, last)
     return int(np.bincount(distance[distance >= 0]).max())
-
-
-def without_repeats(graph: Adjacency) -> tuple[IntArray, Any]:
-    """Return row pointers and neighbors with each neighbor once, as METIS demands."""
-    n = graph.num_nodes
-    entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
-    matrix = csc_array(entries, shape=(n, n), copy=True)
-    matrix.sum_duplicates()
-    return matrix.indptr.astype(np.int64), matrix.indices.astype(np.int32)
 
 
 @kernel()

@@ -49,7 +49,10 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
     nodes = np.empty((plan.num_nodes, b, b))
     blocks = np.empty((plan.num_edges, b, b))
     waiting = np.empty((plan.stack_size + plan.arena_size) * b * b)
-    places = _places(plan) * b * b
+    places = plan.update_offsets.copy()
+    for begin, end in plan.tasks.tolist():
+        places[begin : end - 1] += plan.stack_size  # one task at a time has the arena
+    places *= b * b
     with one_blas_thread():
         for s in range(plan.num_supernodes - 1, -1, -1):
             front = _front_inverse(factor, s, int(places[s]), waiting)
@@ -58,14 +61,6 @@ def selected_inverse(factor: CholeskyFactor, edges: IntArray) -> SelectedInverse
     reversed_edges = plan.inverse[edges[:, 0]] < plan.inverse[edges[:, 1]]  # stored: (later, earlier)
     blocks[reversed_edges] = blocks[reversed_edges].transpose(0, 2, 1)
     return SelectedInverse(nodes=nodes, edges=blocks)
-
-
-def _places(plan: SymbolicFactor) -> IntArray:
-    """Return where the block of each supernode waits, (S,): one task at a time has the arena."""
-    places = plan.update_offsets.copy()
-    for begin, end in plan.tasks.tolist():
-        places[begin : end - 1] += plan.stack_size
-    return places
 
 
 def _front_inverse(factor: CholeskyFactor, s: int, start: int, waiting: FloatArray) -> FloatArray:

@@ -48,8 +48,6 @@ class EliminationTree:
 
     permutation: IntArray
     """(n,) the node that is eliminated k-th; every subtree is a contiguous range of k."""
-    inverse: IntArray
-    """(n,) when each node is eliminated."""
     parent: IntArray
     """(n,) parent of each elimination step, -1 at a root."""
     counts: IntArray
@@ -162,7 +160,7 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
     moved = parent[post]
     parent = np.where(moved < 0, -1, rank[moved])
     counts = _column_counts(graph.pointers, graph.neighbours, permutation, inverse, parent)
-    return EliminationTree(frozen(permutation), frozen(inverse), frozen(parent), frozen(counts))
+    return EliminationTree(frozen(permutation), frozen(parent), frozen(counts))
 
 
 def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
@@ -178,17 +176,16 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     inverse = _inverse(permutation)
     row_pointers = np.concatenate([[0], np.cumsum(below)])
     owner = np.repeat(np.arange(len(parent)), np.diff(first))
-    rows = _panel_rows(
-        graph.pointers, graph.neighbours, permutation, inverse, owner, parent, row_pointers
-    )  # fmt: skip
+    rows = _panel_rows(graph.pointers, graph.neighbours, permutation, inverse, owner, parent, row_pointers)
     relative = _relative_positions(first, parent, row_pointers, rows)
     sizes = np.diff(first) * (np.diff(first) + below)
     tasks, above = _tasks(parent, sizes)
     offsets, stack_size, arena_size = _stack_plan(parent, below, tasks)
     children = np.argsort(parent, kind="stable")[int(np.sum(parent < 0)) :]
     child_pointers = np.searchsorted(parent[children], np.arange(len(parent) + 1))
-    slots = _edge_slots(edges, inverse, owner, first, row_pointers, rows)
-    edge_pointers, edge_index, edge_row, edge_column = slots
+    edge_pointers, index, edge_row, edge_column = _edge_slots(
+        edges, inverse, owner, first, row_pointers, rows
+    )
     return SymbolicFactor(
         permutation=frozen(permutation),
         inverse=frozen(inverse),
@@ -207,7 +204,7 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
         arena_size=arena_size,
         largest_front=int(np.max(np.diff(first) + below, initial=0)),
         edge_pointers=frozen(edge_pointers),
-        edge_index=frozen(edge_index),
+        edge_index=frozen(index),
         edge_row=frozen(edge_row),
         edge_column=frozen(edge_column),
         num_nonzeros=tree.num_nonzeros,
@@ -308,10 +305,15 @@ def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: An
 
 def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Return the merged supernodes: column order, first columns (S + 1,), parents (S,), rows below (S,)."""
-    head = _fundamental_heads(parent, counts)
+    nested = (parent[:-1] == np.arange(1, len(parent))) & (counts[:-1] == counts[1:] + 1)
+    head = np.concatenate([[0], np.flatnonzero(~nested) + 1])[: len(parent)]  # of runs of nested columns
+    width, height = np.diff(head, append=len(parent)), counts[head]
+    label = np.repeat(np.arange(len(head)), width)
+    above = parent[head + width - 1]
+    above = np.where(above < 0, -1, label[above])
     limits = np.array([limit for limit, _ in _MERGE_LIMITS], dtype=np.int64)
     shares = np.array([share for _, share in _MERGE_LIMITS])
-    label, tree, width, height = _merge(parent, counts, head, limits, shares, _MERGE_ALWAYS)
+    label, tree, width, height = _merge(label, above, width, height, limits, shares, _MERGE_ALWAYS)
     post = _postorder(tree)
     rank = _inverse(post)
     order = np.argsort(rank[label], kind="stable")
@@ -322,43 +324,13 @@ def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray,
 
 
 @kernel()
-def _fundamental_heads(parent: Any, counts: Any) -> Any:
-    """Return the first column of each maximal run of columns with nested equal structure."""
-    n = len(parent)
-    head = np.zeros(n, np.bool_)
-    for j in range(n):
-        head[j] = j == 0 or parent[j - 1] != j or counts[j - 1] != counts[j] + 1
-    return np.flatnonzero(head)
-
-
-@kernel()
-def _runs(parent: Any, counts: Any, head: Any) -> Any:
-    """Return the supernode of each column, and parent, columns, rows and entries of each supernode."""
-    n, num = len(parent), len(head)
-    label = np.empty(n, np.int64)
-    width, height = np.empty(num, np.int64), np.empty(num, np.int64)
-    for s in range(num):
-        end = head[s + 1] if s + 1 < num else n
-        label[head[s] : end] = s
-        width[s] = end - head[s]
-        height[s] = counts[head[s]]
-    above = np.full(num, -1, np.int64)
-    for s in range(num):
-        last = head[s] + width[s] - 1
-        if parent[last] >= 0:
-            above[s] = label[parent[last]]
-    entries = width * height - width * (width - 1) / 2
-    return label, above, width, height, entries
-
-
-@kernel()
-def _merge(parent: Any, counts: Any, head: Any, limits: Any, shares: Any, always: float) -> Any:
+def _merge(label: Any, above: Any, width: Any, height: Any, limits: Any, shares: Any, always: float) -> Any:
     """Merge children into parents while few zeros arise.
 
-    Returns the supernode of each column, and parent, columns and rows of each supernode.
+    Takes and returns the supernode of each column, and parent, columns and rows of each supernode.
     """
-    label, above, width, height, true_entries = _runs(parent, counts, head)
-    num = len(head)
+    num = len(above)
+    true_entries = width * height - width * (width - 1) / 2
     target = np.arange(num)
     for s in range(num):  # children before parents; a parent has already absorbed its earlier children
         p = above[s]
@@ -432,13 +404,11 @@ def _relative_positions(first: Any, parent: Any, row_pointers: Any, rows: Any) -
 def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
     """Cut the supernodes into tasks and what is above them; see `SymbolicFactor`."""
     num, total = len(parent), int(sizes.sum())
-    none = np.zeros((0, 2), np.int64)
     if total < _WORTH_TASKS:
-        return none, np.array([[0, num]])
+        return np.zeros((0, 2), np.int64), np.array([[0, num]])
     begin, weight = _subtrees(parent, sizes)
     is_root = (parent < 0) | (weight[parent] > _LARGEST_TASK * total)
-    chosen = is_root & (weight <= _LARGEST_TASK * total) & (weight >= _SMALLEST_TASK * total)
-    roots = np.flatnonzero(chosen)
+    roots = np.flatnonzero(is_root & (weight <= _LARGEST_TASK * total) & (weight >= _SMALLEST_TASK * total))
     tasks = np.stack([begin[roots], roots + 1], axis=1)
     edges = np.concatenate([[0], tasks.ravel(), [num]]).reshape(-1, 2)
     return tasks, edges[edges[:, 0] < edges[:, 1]]

@@ -73,23 +73,19 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
         The rigid set that each set lies in, (number of sets,), compact; and whether these sets are
         all that there are. If not, two sets at least were united, and the game has to be played again.
     """
-    start, link_of = _links_at(game.num_nodes, game.ends)
+    n = game.num_nodes
+    links = np.bincount(game.ends.ravel(), minlength=n)
+    marks = list(np.zeros((7, n), dtype=np.int64))
     board = _Board(
-        target=np.full((game.num_nodes, dimension), -1, dtype=np.int64),
-        free=np.full(game.num_nodes, dimension, dtype=np.int64),
-        start=start,
-        link_of=link_of,
-        ends=game.ends,
-        seen=np.zeros(game.num_nodes, dtype=np.int64),
-        came_from=np.zeros(game.num_nodes, dtype=np.int64),
-        came_by=np.zeros(game.num_nodes, dtype=np.int64),
-        queue=np.zeros(game.num_nodes, dtype=np.int64),
-        inside=np.zeros(game.num_nodes, dtype=np.int64),
-        escapes=np.zeros(game.num_nodes, dtype=np.int64),
-        members=np.zeros(game.num_nodes, dtype=np.int64),
-        clock=np.zeros(2, dtype=np.int64),
+        np.full((n, dimension), -1, dtype=np.int64),
+        np.full(n, dimension, dtype=np.int64),
+        np.concatenate([[0], np.cumsum(links)]),
+        np.argsort(game.ends.ravel(), kind="stable") // 2,
+        game.ends,
+        np.zeros(2, dtype=np.int64),
+        *marks,
     )
-    mark = _place_links(board, game.copies, _GAME_WORK * game.num_nodes)
+    mark = _place_links(board, game.copies, _GAME_WORK * n)
     if board.free.sum() == dimension + 1:  # the whole is one rigid set
         united = np.arange(game.num_sets)
         united[game.owner] = game.owner.min()
@@ -97,14 +93,6 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
     if (mark >= 0).any():
         return compact(_sets_by_marks(board, game.owner, game.num_sets, mark)), False
     return compact(_sets_by_search(board, game.owner, game.num_sets)), True
-
-
-def _links_at(num_nodes: int, ends: IntArray) -> tuple[IntArray, IntArray]:
-    """Return the links at each node as a (start, links) list."""
-    order = np.argsort(ends.ravel(), kind="stable")
-    start = np.zeros(num_nodes + 1, dtype=np.int64)
-    start[1:] = np.cumsum(np.bincount(ends.ravel(), minlength=num_nodes))
-    return start, (order // 2).astype(np.int64)
 
 
 class _Board(NamedTuple):
@@ -118,6 +106,8 @@ class _Board(NamedTuple):
     link_of: IntArray
     ends: IntArray
     """Links at each node, and their two ends, placed or not."""
+    clock: IntArray
+    """(2,) the running search, and the running rigid set."""
     seen: IntArray
     came_from: IntArray
     came_by: IntArray
@@ -127,7 +117,6 @@ class _Board(NamedTuple):
     escapes: IntArray
     members: IntArray
     """Marks of the running rigid set, valid where they equal clock[1]; its nodes."""
-    clock: IntArray
 
 
 @kernel()

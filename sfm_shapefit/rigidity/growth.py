@@ -137,24 +137,15 @@ def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
     """Return set labels after growing every set of at least 3 nodes, largest first (step 2)."""
     for _ in range(_GROWTH_ROUNDS):
         num_sets = int(set_of.max(initial=-1)) + 1
-        start, nodes, back_start, rigid_sets = incidence(num_nodes, edges, set_of, num_sets)
         growth = _Growth(
-            start=start,
-            nodes=nodes,
-            back_start=back_start,
-            rigid_sets=rigid_sets,
-            parent=np.arange(num_sets),
-            taken=np.full(num_sets, -1),
-            met=np.full(num_sets, -1),
-            inside=np.full(num_nodes, -1),
-            reached=np.full(num_nodes, -1),
-            reached_by=np.full(num_nodes, -1),
-            reached_at=np.full(num_nodes, -1),
-            queue=np.full(num_nodes, -1),
+            *incidence(num_nodes, edges, set_of, num_sets),
+            np.arange(num_sets),
+            *np.full((2, num_sets), -1),
+            *np.full((5, num_nodes), -1),
         )
-        size = np.diff(start)
-        seeds = np.argsort(-size, kind="stable")[: int((size >= 3).sum())].astype(np.int64)
-        _grow(growth, seeds, _GROWTH_WORK * len(nodes))
+        size = np.diff(growth.start)
+        seeds = np.argsort(-size, kind="stable")[: int((size >= 3).sum())]
+        _grow(growth, seeds, _GROWTH_WORK * len(growth.nodes))
         if (growth.parent == np.arange(num_sets)).all():
             break
         set_of = compact(growth.parent[set_of])

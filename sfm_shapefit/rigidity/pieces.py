@@ -164,23 +164,15 @@ def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
     checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    index = _first_bad_edge(num_nodes, checked)
-    if index < len(checked):
+    outside = ((checked < 0) | (checked >= num_nodes)).any(axis=1)
+    bad = outside | (checked[:, 0] == checked[:, 1])
+    if bad.any():
+        index = int(np.argmax(bad))
         raise InputError(
             f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different cameras "
             f"of 0..{num_nodes - 1}"
         )
     return checked
-
-
-@kernel()
-def _first_bad_edge(num_nodes: int, edges: IntArray) -> int:
-    """Return the first pair that leaves the nodes or joins one with itself; the number of pairs if none."""
-    for e in range(len(edges)):
-        i, j = edges[e, 0], edges[e, 1]
-        if i == j or min(i, j) < 0 or max(i, j) >= num_nodes:
-            return e
-    return len(edges)
 
 
 def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:

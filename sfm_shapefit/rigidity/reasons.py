@@ -26,7 +26,8 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
     degree = graph.degrees()
     component = graph.components()
     main = component[pieces[0].nodes[0]] if pieces else -1
-    neighbour = _a_neighbor(graph)
+    neighbour = np.empty(graph.num_nodes, dtype=np.int64)  # the only one, where there is one
+    neighbour[graph.edges.T] = graph.edges[:, ::-1].T
     home = _large_piece_of(graph.num_nodes, pieces)
 
     reasons: dict[int, str] = {}
@@ -39,21 +40,11 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
             reasons[camera] = f"pendant: joined by a single pair to {_name(graph, int(neighbour[camera]))}"
         else:
             hinges = _hinges_of(camera, int(home[camera]), pieces, placed)
-            names = ", ".join(_name(graph, hinge) for hinge in hinges)
-            reasons[camera] = (
-                f"another rigid piece, hinged at {names}"
-                if names
-                else "not rigidly tied to the largest piece"
-            )
+            reasons[camera] = "not rigidly tied to the largest piece"
+            if hinges:
+                names = ", ".join(_name(graph, hinge) for hinge in hinges)
+                reasons[camera] = f"another rigid piece, hinged at {names}"
     return reasons
-
-
-def _a_neighbor(graph: ViewGraph) -> IntArray:
-    """Return one neighbor of each camera (n,), -1 without any: the neighbor where there is one only."""
-    neighbour = np.full(graph.num_nodes, -1, dtype=np.int64)
-    neighbour[graph.edges[:, 0]] = graph.edges[:, 1]
-    neighbour[graph.edges[:, 1]] = graph.edges[:, 0]
-    return neighbour
 
 
 def _large_piece_of(num_nodes: int, pieces: list[RigidPiece]) -> IntArray:

@@ -88,7 +88,7 @@ class IterativeSolver:
 
 def _diagonal_suffices(operator: LaplacianOperator, jacobi: Preconditioner) -> bool:
     """Return whether the diagonal is so good a preconditioner as only expanders have it."""
-    probe = np.random.default_rng(_SEED).normal(size=(operator.num_nodes, 3))
+    probe = np.random.default_rng(_SEED).normal(size=(operator.graph.num_nodes, 3))
     return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
 
 
