@@ -63,10 +63,8 @@ def test_where_a_part_of_the_pairs_is_wrong_everywhere_nobody_is_blamed():
     rng = np.random.default_rng(3)
     bad = rng.random(len(edges)) < 0.35
     v[bad] = normalized(rng.standard_normal((int(bad.sum()), 3)))
-    assert (
-        assess(MeasuredGraph(ViewGraph(40, edges, v), evidence=make_evidence(len(edges))), t).trust.min()
-        > 0.7
-    )
+    measured = MeasuredGraph(ViewGraph(40, edges, v), evidence=make_evidence(len(edges)))
+    assert assess(measured, t).trust.min() > 0.7
 
 
 def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
