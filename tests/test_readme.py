@@ -61,9 +61,7 @@ def test_examples_and_commands_are_found_on_every_page_that_has_them():
 
 
 @pytest.mark.parametrize(
-    ("page", "number"),
-    EXAMPLES,
-    ids=lambda value: value.name if isinstance(value, Path) else str(value),
+    ("page", "number"), EXAMPLES, ids=lambda value: value.name if isinstance(value, Path) else str(value)
 )
 def test_every_python_example_of_the_docs_runs(page, number):
     process = python("-W", "error", "-c", BLOCK.findall(TEXTS[page])[number])

@@ -21,12 +21,7 @@ from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import (
-    color_points,
-    correspondence_graph,
-    filter_points,
-    triangulate,
-)
+from sfm_shapefit.colmap.structure import color_points, correspondence_graph, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
