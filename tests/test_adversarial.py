@@ -158,7 +158,7 @@ def test_twin_images_stand_at_one_centre_and_their_pair_has_no_parallax(tmp_path
     make_twin(scene / "database.db", of=7, twin=8)
     rotation = pycolmap.Reconstruction(scene / "sparse" / "0").image(7).cam_from_world().rotation
     model = turned_model(scene, 8, rotation)
-    found = sfm_shapefit.locate(model, scene / "database.db", options=LocateOptions(scale="unit"))
+    found = sfm_shapefit.locate(model, scene / "database.db", scale="unit")
     (pair,) = [row for row in found.pairs if (row.name1, row.name2) == ("0007.jpg", "0008.jpg")]
     assert pair.reason.startswith("no parallax")
     rows = {row.name: row for row in found.cameras}

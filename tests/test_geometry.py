@@ -265,14 +265,6 @@ def test_targets_of_which_most_coincide_do_not_break_the_weights():
     assert np.isfinite(fit.apply(target)).all()
 
 
-def test_the_l1_fit_is_the_same_on_every_call():
-    rng = np.random.default_rng(16)
-    source, target = rng.normal(size=(10, 3)), rng.normal(size=(10, 3))
-    first, second = fit_similarity_l1(source, target), fit_similarity_l1(source, target)
-    assert first.scale == second.scale
-    np.testing.assert_array_equal(first.rotation, second.rotation)
-
-
 @pytest.mark.parametrize(
     ("points", "expected"),
     [

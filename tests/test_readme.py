@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 
 from sfm_shapefit.cli import app
-from tests.program import run
+from tests.program import run, run_python
 from tests.scenes import COURTYARD, RING, ROOT
 
 README = ROOT / "README.md"
@@ -26,25 +26,12 @@ def commands_of(page: Path) -> list[str]:
     return COMMAND.findall(page.read_text(encoding="utf-8"))
 
 
-def python(*arguments: str, cwd: Path = ROOT) -> subprocess.Popen[str]:
-    """Start a Python that finds the package."""
-    return subprocess.Popen(
-        [sys.executable, *arguments],
-        cwd=cwd,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 def test_the_readmes_python_example_runs():
     (example,) = BLOCK.findall(README.read_text(encoding="utf-8"))
-    process = python("-W", "error", "-c", example)
-    said, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert re.search(r"^25 cameras, optimal to \d\.\de-\d+$", said, flags=re.MULTILINE)
-    assert float(re.search(r"median error (\S+) mm", said).group(1)) < 5.0
+    done = run_python("-W", "error", "-c", example)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^25 cameras, optimal to \d\.\de-\d+$", done.stdout, flags=re.MULTILINE)
+    assert float(re.search(r"median error (\S+) mm", done.stdout).group(1)) < 5.0
 
 
 TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
@@ -61,21 +48,25 @@ def test_examples_and_commands_are_found_on_every_page_that_has_them():
 
 
 @pytest.mark.parametrize(
-    ("page", "number"),
-    EXAMPLES,
-    ids=lambda value: value.name if isinstance(value, Path) else str(value),
+    ("page", "number"), EXAMPLES, ids=lambda value: value.name if isinstance(value, Path) else str(value)
 )
 def test_every_python_example_of_the_docs_runs(page, number):
-    process = python("-W", "error", "-c", BLOCK.findall(TEXTS[page])[number])
-    said, errors = process.communicate()
-    assert process.returncode == 0, errors
-    assert said
+    done = run_python("-W", "error", "-c", BLOCK.findall(TEXTS[page])[number])
+    assert done.returncode == 0, done.stderr
+    assert done.stdout
 
 
 def viewed(arguments: list[str], folder: Path) -> None:
     """Start the viewer, wait until it serves, and end it as a user does."""
     pytest.importorskip("viser")
-    process = python("-m", "sfm_shapefit.cli", *arguments, cwd=folder)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "sfm_shapefit.cli", *arguments],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     try:
         assert re.match(r"http://127\.0\.0\.1:\d+ ", process.stdout.readline())
         process.send_signal(signal.SIGINT)

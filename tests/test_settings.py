@@ -51,7 +51,7 @@ OUT_OF_RANGE = {
         *(("wrong_match_fraction", 1.5), ("corrupted_pair_fraction", -0.1)),
     ],
     RenderOptions: [
-        *(("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0)),
+        *(("repeated_fraction", 1.1), ("radial_k1", 0.6), ("gray_noise", -1.0), ("jpeg_quality", 0))
     ],
 }
 REFUSED = [

@@ -19,15 +19,13 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,
-    _factor_all,
-    _panels,
-    _parts,
     allocate_factor,
     analyse,
 )
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.selected import selected_inverse
 
+_UNDETERMINED = "the observations do not determine all cameras; fix some, or give priors"
 _DENSE_LIMIT = 3000  # unknowns: 500 free cameras
 
 
@@ -123,16 +121,10 @@ class SparseFactor:
 
     def refactor(self, system: ReducedSystem) -> None:
         """Factor a system."""
-        factor, b = self.factor, self.factor.block
-        plan = factor.symbolic
-        factor._diagonal[:] = system.diagonal[plan.permutation, :b, :b].reshape(-1, b * b)
-        weights = -system.pairs[:, :b, :b]  # the factor subtracts the weights of its edges
-        swapped = plan.inverse[self.pair_nodes[:, 0]] > plan.inverse[self.pair_nodes[:, 1]]
-        weights[swapped] = weights[swapped].transpose(0, 2, 1)
-        parts = _parts(factor, np.ascontiguousarray(weights).reshape(-1, b * b))
-        with one_blas_thread():
-            failed, pivot = _factor_all(factor, _panels(factor), parts)
-        _refuse_singular(failed, pivot[:1])
+        b = self.factor.block
+        diagonal, pairs = system.diagonal[:, :b, :b], system.pairs[:, :b, :b]
+        if not self.factor.refactor_blocks(self.pair_nodes, diagonal, pairs):
+            raise UnsolvableError(_UNDETERMINED)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Solve for right-hand sides (N, 6, r)."""
@@ -153,7 +145,7 @@ def _refuse_singular(failed: bool, pivots: FloatArray) -> None:
     """Raise UnsolvableError if the factorisation failed or a relative pivot is rounding."""
     least = float(pivots.min(initial=1.0))
     if failed or not least > PIVOT_TOLERANCE * np.finfo(np.float64).eps:
-        raise UnsolvableError("the observations do not determine all cameras; fix some, or give priors")
+        raise UnsolvableError(_UNDETERMINED)
 
 
 @kernel(exact=True)

@@ -113,27 +113,58 @@ class CholeskyFactor:
         shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
         if np.shape(weights) != shape:
             raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
-        w = np.ascontiguousarray(weights, dtype=np.float64).reshape(plan.num_edges, b * b)
-        panels = _Panels(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, self.panels)
-        arenas = min(self.workers.threads, len(plan.tasks))
-        stack_size = (plan.stack_size + arenas * plan.arena_size) * b * b
-        parts = _Parts(
-            plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
-            plan.edge_index, plan.edge_row, plan.edge_column, w, self._diagonal,
-            np.empty(stack_size, dtype=self.dtype),
-        )  # fmt: skip
+        panels, parts = self._storage(np.ascontiguousarray(weights, dtype=np.float64))
         _sum_at_nodes(panels, parts)
         traces = self._diagonal[:, :: b + 1]
         traces[-1] += float(traces.mean()) if ground is None else ground
-        with one_blas_thread():
-            failed, pivot = _factor_all(self, panels, parts, arenas)
-        self.smallest_pivot = float(pivot[0])
-        self.weakest_node = int(plan.permutation[int(pivot[1]) // b])
-        if failed or not pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps:
+        if not self._factor(panels, parts):
             raise UnsolvableError(
-                f"the Laplacian is singular at node {self.weakest_node} (relative pivot {pivot[0]:.1e}); "
+                f"the Laplacian is singular at node {self.weakest_node} (relative pivot {self.smallest_pivot:.1e}); "
                 "the graph is disconnected or not rigid there, or its weights are not positive"
             )
+
+    def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
+        """Factor a symmetric matrix with blocks of its own at the nodes and edges, in place.
+
+        Args:
+            edges: (m, 2) those that the factor was planned for.
+            diagonal: (n, b, b) symmetric blocks of the nodes.
+            off_diagonal: (m, b, b) blocks (i, j) of the edges (i, j).
+
+        Returns:
+            Whether it is positive definite to working precision; use nothing of the factor if not.
+        """
+        plan, b = self.symbolic, self.block
+        self._diagonal[:] = diagonal[plan.permutation].reshape(-1, b * b)
+        # Weights are subtracted, with the node that is eliminated first as the column.
+        weights = -off_diagonal
+        i, j = plan.inverse[edges].T
+        weights[i > j] = weights[i > j].transpose(0, 2, 1)
+        return self._factor(*self._storage(np.ascontiguousarray(weights)))
+
+    def _storage(self, weights: FloatArray) -> tuple[_Panels, _Parts]:
+        """Return the panels, and what fronts are assembled from."""
+        plan, b = self.symbolic, self.block
+        panels = _Panels(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, self.panels)
+        stack_size = (plan.stack_size + self._num_arenas * plan.arena_size) * b * b
+        parts = _Parts(
+            plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
+            plan.edge_index, plan.edge_row, plan.edge_column, weights.reshape(plan.num_edges, b * b),
+            self._diagonal, np.empty(stack_size, dtype=self.dtype),
+        )  # fmt: skip
+        return panels, parts
+
+    @property
+    def _num_arenas(self) -> int:
+        return min(self.workers.threads, len(self.symbolic.tasks))
+
+    def _factor(self, panels: _Panels, parts: _Parts) -> bool:
+        """Factor what was assembled; return whether all pivots are positive to working precision."""
+        with one_blas_thread():
+            failed, pivot = _factor_all(self, panels, parts, self._num_arenas)
+        self.smallest_pivot = float(pivot[0])
+        self.weakest_node = int(self.symbolic.permutation[int(pivot[1]) // self.block])
+        return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, with x = 0 at the grounded node.

@@ -200,14 +200,12 @@ def broken_scenes(folder: Path):
             rec.deregister_frame(frame_id)
         rec.write(model)
 
-    def no_pairs(_model, database):
-        execute(database, "DELETE FROM two_view_geometries")
+    def sql(statement):
+        return lambda _, database: execute(database, statement)
 
-    def unusable_pairs(_model, database):
-        execute(database, "UPDATE two_view_geometries SET config = 7")
-
-    def other_scene(_model, database):
-        execute(database, "UPDATE images SET name = 'other/' || name")
+    no_pairs = sql("DELETE FROM two_view_geometries")
+    unusable_pairs = sql("UPDATE two_view_geometries SET config = 7")
+    other_scene = sql("UPDATE images SET name = 'other/' || name")
 
     def no_database(_model, database):
         database.write_bytes(b"not a database" * 100)

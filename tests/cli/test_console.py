@@ -11,7 +11,7 @@ from functools import partial
 
 import pytest
 
-from sfm_shapefit import LocateOptions, MapOptions, locate, map_database
+from sfm_shapefit import MapOptions, locate, map_database
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
 from tests.program import run_python
@@ -52,11 +52,7 @@ def test_locate_counts_pairs_and_images():
 
 
 def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations():
-    stages = stages_of(
-        lambda progress: locate(
-            FACADE / "sparse/0", options=LocateOptions(directions="tracks"), progress=progress
-        )
-    )
+    stages = stages_of(lambda progress: locate(FACADE / "sparse/0", directions="tracks", progress=progress))
     assert_counted_up(stages["directions"], 9)
     iterations = stages["solve"][1:-1]
     assert [done for done, _ in iterations] == list(range(1, len(iterations) + 1))

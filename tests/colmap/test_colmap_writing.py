@@ -5,28 +5,20 @@ import os
 import pickle
 import resource
 import shutil
-import stat
 import subprocess
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import numpy as np
 import pycolmap
 import pytest
 
 from sfm_shapefit import LocateOptions, locate
-from sfm_shapefit import atomic_folder as output
-from sfm_shapefit.atomic_folder import atomic_folder, check_output
+from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
-from sfm_shapefit.colmap.structure import (
-    color_points,
-    correspondence_graph,
-    filter_points,
-    triangulate,
-)
+from sfm_shapefit.colmap.structure import color_points, correspondence_graph, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError, UnsolvableError
@@ -104,11 +96,22 @@ def batch_of(pairs, num_points):
     )
 
 
-def seeded(reconstruction, centers=None, placed=None):
+def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=None):
+    """The seed of a reconstruction at the given centres, or its own, and the graph of its matches."""
     model = read_model(reconstruction)
     placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
-    seed = build_seed(model, placed, model.centers if centers is None else centers)
-    return seed, correspondence_graph(seed, model.image_ids, all_matches())
+    centers = model.centers if centers is None else centers
+    seed = build_seed(model, placed, centers, None if keypoints is None else keypoints.get)
+    return seed, correspondence_graph(seed, model.image_ids, all_matches() if batches is None else batches)
+
+
+SOURCES = pytest.mark.parametrize("source", ["matches", "tracks"])
+
+
+def seeded_with(source, original, centers=None):
+    """The seed, and what its points are triangulated from: all matches, or the model's own tracks."""
+    seed, graph = seeded(original, centers)
+    return seed, graph if source == "matches" else original
 
 
 def dump(reconstruction):
@@ -185,8 +188,7 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
 def test_images_that_had_no_pose_stay_without_one(tmp_path):
     original, _ = ring_model()
     original.deregister_frame(original.image(25).frame_id)
-    model = read_model(original)
-    seed = build_seed(model, np.ones(NUM_IMAGES - 1, dtype=bool), model.centers)
+    seed, _ = seeded(original, batches=[])
     write_model(seed, tmp_path)
     assert 25 not in pycolmap.Reconstruction(tmp_path).reg_image_ids()
     assert seed.num_reg_images() == NUM_IMAGES - 1
@@ -195,11 +197,10 @@ def test_images_that_had_no_pose_stay_without_one(tmp_path):
 @pytest.mark.parametrize("missing", [None, np.zeros((0, 2))], ids=["none", "no rows"])
 def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missing):
     original, _ = ring_model()
-    model = read_model(original)
     xy = np.arange(10.0).reshape(5, 2)
     table = {0: xy, 3: xy + 0.5}
-    keypoints = {index: table.get(index, missing) for index in range(NUM_IMAGES)}.get
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints)
+    keypoints = {index: table.get(index, missing) for index in range(NUM_IMAGES)}
+    seed, _ = seeded(original, keypoints=keypoints, batches=[])
     np.testing.assert_array_equal([p.xy for p in seed.image(5).points2D], xy)
     np.testing.assert_array_equal([p.xy for p in seed.image(35).points2D], xy + 0.5)
     for image_id in (15, 25):
@@ -218,11 +219,10 @@ def test_a_placed_image_without_finite_centre_is_refused_by_name():
 # --- triangulation --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("source", ["matches", "tracks"])
+@SOURCES
 def test_exact_data_give_every_point_back_with_its_colour(source):
     original, points = ring_model()
-    seed, graph = seeded(original)
-    structure = color_points(triangulate(seed, graph if source == "matches" else original), original)
+    structure = color_points(triangulate(*seeded_with(source, original)), original)
     assert structure.num_points3D() == len(points)
     for point in structure.points3D.values():
         truth = original.points3D[original.image(5).point2D(point.track.elements[0].point2D_idx).point3D_id]
@@ -271,11 +271,10 @@ def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
     assert seen[-1] == (len(points), len(points))
 
 
-@pytest.mark.parametrize("source", ["matches", "tracks"])
+@SOURCES
 def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
     original, _ = ring_model(noise_px=3.0)
-    seed, graph = seeded(original, ring_centers() + 0.01)
-    tracks = graph if source == "matches" else original
+    seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
     copied = dump(triangulate(seed, tracks))
     assert seed.num_points3D() == 0
     structure = triangulate(seed, tracks, in_place=True)
@@ -283,14 +282,13 @@ def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
     assert dump(structure) == copied
 
 
-@pytest.mark.parametrize("source", ["matches", "tracks"])
+@SOURCES
 def test_twice_the_same_gives_the_same_bits(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)
 
     def run():
-        seed, graph = seeded(original, ring_centers() + 0.01)
-        tracks = graph if source == "matches" else original
+        seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
         structure = color_points(triangulate(seed, tracks), original)
         return dump(structure), dump(bundle_adjust(seed, tracks).reconstruction)
 
@@ -319,50 +317,37 @@ def reprojection_errors_px(structure):
 
 
 def test_wrong_matches_make_no_point_that_misses_its_observations():
-    original, _ = ring_model(noise_px=0.3)
-    model = read_model(original)
     rng = np.random.default_rng(1)
     batches = all_matches()
     for batch in batches:
         wrong = rng.random(len(batch.keypoints)) < 0.3
         batch.keypoints[wrong, 1] = rng.integers(0, 120, size=wrong.sum())
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
-    structure = triangulate(seed, correspondence_graph(seed, model.image_ids, batches))
+    structure = triangulate(*seeded(ring_model(noise_px=0.3)[0], batches=batches))
     assert structure.num_points3D() >= 120
     assert max(reprojection_errors_px(structure)) <= 4.0
 
 
 def test_of_two_placed_images_every_match_is_kept_because_there_are_no_longer_tracks():
-    original, _ = ring_model(noise_px=0.3)
-    model = read_model(original)
-    seed = build_seed(model, np.arange(NUM_IMAGES) < 2, model.centers)
-    graph = correspondence_graph(seed, model.image_ids, all_matches())
+    seed, graph = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
     assert triangulate(seed, graph).num_points3D() == 120
     assert bundle_adjust(seed, graph).num_points == 120
 
 
 def test_matches_that_only_two_images_share_are_left_out_unless_asked_for():
-    original, _ = ring_model()
-    model = read_model(original)
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
-    graph = correspondence_graph(seed, model.image_ids, [batch_of(np.array([[0, 1]]), 120)])
+    seed, graph = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
     assert triangulate(seed, graph).num_points3D() == 0
     both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
     assert both.num_points3D() == 120
 
 
 def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_its_images():
-    original, _ = ring_model()
-    model = read_model(original)
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers)
     with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
-        correspondence_graph(seed, model.image_ids, [batch_of(np.array([[0, 3]]), 121)])
+        seeded(ring_model()[0], batches=[batch_of(np.array([[0, 3]]), 121)])
 
 
 def test_tracks_of_a_model_with_other_keypoints_are_refused():
     original, _ = ring_model()
-    model = read_model(original)
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, {0: np.ones((5, 2))}.get)
+    seed, _ = seeded(original, keypoints={0: np.ones((5, 2))}, batches=[])
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
 
@@ -399,13 +384,10 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
 
 def test_colours_come_only_from_images_with_the_same_keypoints():
     original, _ = ring_model()
-    model = read_model(original)
-    moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in model.image_ids.tolist()]
+    moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
-        keypoints = {k: moved[k] for k in changed}
-        seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, keypoints.get)
-        graph = correspondence_graph(seed, model.image_ids, all_matches())
-        structure = color_points(triangulate(seed, graph), original)
+        seed_and_graph = seeded(original, keypoints={k: moved[k] for k in changed})
+        structure = color_points(triangulate(*seed_and_graph), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
 
@@ -416,9 +398,8 @@ def test_colours_come_only_from_images_with_the_same_keypoints():
 def with_one_more_point(xyz, image_ids, offset_px=0.0):
     """The exact model plus one point with exact observations (the projection formula also behind cameras)."""
     original, _ = ring_model()
-    model = read_model(original)
     extra = {}
-    for index, image_id in enumerate(model.image_ids.tolist()):
+    for index, image_id in enumerate(sorted(original.images)):
         x = original.image(image_id).cam_from_world() * np.asarray(xyz, dtype=float)
         camera = original.image(image_id).camera
         f, cx, cy = camera.params[:3]
@@ -427,7 +408,7 @@ def with_one_more_point(xyz, image_ids, offset_px=0.0):
             xy = camera.img_from_cam(x)
         own = np.array([p.xy for p in original.image(image_id).points2D])
         extra[index] = np.vstack([own, xy + np.array([offset_px * (image_id == image_ids[0]), 0.0])])
-    seed = build_seed(model, np.ones(NUM_IMAGES, dtype=bool), model.centers, extra.get)
+    seed, _ = seeded(original, keypoints=extra, batches=[])
     for point in original.points3D.values():
         seed.add_point3D(point.xyz, pycolmap.Track(point.track.elements))
     elements = [pycolmap.TrackElement(i, 120) for i in image_ids]
@@ -491,12 +472,11 @@ def test_tracks_shorter_than_asked_for_are_removed():
 # --- bundle adjustment ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("source", ["matches", "tracks"])
+@SOURCES
 def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source):
     original, points = ring_model()
     disturbed = ring_centers() + np.random.default_rng(3).normal(scale=0.03 * RADIUS, size=(NUM_IMAGES, 3))
-    seed, graph = seeded(original, disturbed)
-    adjusted = bundle_adjust(seed, graph if source == "matches" else original)
+    adjusted = bundle_adjust(*seeded_with(source, original, disturbed))
     centers = centers_of(adjusted.reconstruction)
     aligned = fit_similarity_l1(centers, ring_centers()).apply(centers)
     # the solver stops when the cost falls by less than 1e-6 of itself; 0.18 units of disturbance before
@@ -590,14 +570,11 @@ def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name,
 def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):
     original, _ = ring_model()
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(
-        resource.RLIMIT_FSIZE, (4096, hard)
-    )  # a longer file cannot be written, as on a full disk
+    # A longer file cannot be written, as on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    full = pytest.raises(InputError, match="check the free space")
     try:
-        with (
-            pytest.raises(InputError, match="check the free space"),
-            atomic_folder(tmp_path / "out") as partial,
-        ):
+        with full, atomic_folder(tmp_path / "out") as partial:
             write_model(original, partial)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
@@ -637,143 +614,3 @@ def colmap(*arguments):
     )
     assert done.returncode == 0, done.stderr
     return done.stdout + done.stderr
-
-
-# --- folders that appear whole or not at all ------------------------------------------------------------
-
-
-def earlier_output(path):
-    path.mkdir()
-    (path / "locate.json").write_text("{}")
-    (path / "old.bin").write_bytes(b"old")
-    return path
-
-
-def write_and_raise(out, error, overwrite=False):
-    with atomic_folder(out, overwrite=overwrite) as partial:
-        (partial / "locate.json").write_text("new")
-        raise error
-
-
-def test_a_folder_appears_when_the_block_ends_and_not_before(tmp_path):
-    out = tmp_path / "new" / "parents" / "out"
-    with atomic_folder(out) as partial:
-        (partial / "sub").mkdir()
-        (partial / "sub" / "file").write_text("x")
-        assert partial.parent.parent == out.parent
-        assert stat.S_IMODE(partial.parent.stat().st_mode) == 0o700
-        assert not out.exists()
-    assert (out / "sub" / "file").read_text() == "x"
-    assert list(out.parent.iterdir()) == [out]
-
-
-def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path):
-    (tmp_path / "plain").mkdir()
-    with atomic_folder(tmp_path / "out"):
-        pass
-    assert stat.S_IMODE((tmp_path / "out").stat().st_mode) == stat.S_IMODE(
-        (tmp_path / "plain").stat().st_mode
-    )
-
-
-@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
-def test_an_exception_leaves_nothing_behind_not_even_new_parents(tmp_path, error):
-    with pytest.raises(error):
-        write_and_raise(tmp_path / "a" / "b" / "out", error)
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_an_existing_folder_is_refused_and_kept(tmp_path):
-    out = earlier_output(tmp_path / "out")
-    with pytest.raises(
-        InputError, match="exists already; choose another folder, or replace it with --overwrite"
-    ):
-        check_output(out)
-    with pytest.raises(InputError, match="exists already"), atomic_folder(out):
-        pytest.fail("the block must not run")
-    assert (out / "old.bin").read_bytes() == b"old"
-
-
-def test_overwriting_replaces_an_earlier_output_completely(tmp_path):
-    out = earlier_output(tmp_path / "out")
-    with atomic_folder(out, overwrite=True) as partial:
-        (partial / "locate.json").write_text("new")
-        assert (out / "old.bin").exists()
-    assert [p.name for p in out.iterdir()] == ["locate.json"]
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_overwriting_that_fails_keeps_the_earlier_output(tmp_path):
-    out = earlier_output(tmp_path / "out")
-    with pytest.raises(KeyboardInterrupt):
-        write_and_raise(out, KeyboardInterrupt, overwrite=True)
-    assert (out / "old.bin").read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_an_earlier_output_is_put_back_if_the_new_one_cannot_be_moved_in(tmp_path, monkeypatch):
-    out = earlier_output(tmp_path / "out")
-    rename = Path.rename
-
-    def failing(self, target):
-        if self.parent.suffix == ".partial" and self.name == "out":
-            raise OSError(5, "Input/output error")
-        return rename(self, target)
-
-    monkeypatch.setattr(output, "_renamed_at_once", lambda *_: False)  # as on other systems than Linux
-    monkeypatch.setattr(Path, "rename", failing)
-    with pytest.raises(InputError, match="cannot be written"), atomic_folder(out, overwrite=True):
-        pass
-    assert (out / "old.bin").read_bytes() == b"old"
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_overwriting_refuses_what_is_no_earlier_output_but_takes_an_empty_folder(tmp_path):
-    photos = tmp_path / "photos"
-    photos.mkdir()
-    with atomic_folder(photos, overwrite=True) as partial:
-        (partial / "dear.jpg").write_bytes(b"x")
-    with (
-        pytest.raises(InputError, match=r"holds files but no locate\.json or map\.json"),
-        atomic_folder(photos, overwrite=True),
-    ):
-        pytest.fail("the block must not run")
-    assert (photos / "dear.jpg").exists()
-
-
-def test_a_folder_that_came_into_being_meanwhile_is_kept(tmp_path):
-    with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "out"):
-        earlier_output(tmp_path / "out")
-    assert (tmp_path / "out" / "old.bin").exists()
-    assert [p.name for p in tmp_path.iterdir()] == ["out"]
-
-
-@pytest.mark.parametrize("spelling", ["model", "model/../model", ".", "link", "project"])
-def test_the_input_is_never_overwritten_however_it_is_spelled(tmp_path, spelling):
-    model = earlier_output(tmp_path / "model")
-    (tmp_path / "link").symlink_to(model)
-    (tmp_path / "locate.json").write_text("{}")
-    (tmp_path / "project").symlink_to(tmp_path)
-    with pytest.raises(InputError, match="is or contains the input"):
-        check_output(tmp_path / spelling, overwrite=True, protect=[model])
-    check_output(model / "out", protect=[model])
-    check_output(tmp_path / "model2", protect=[model])
-
-
-def test_paths_that_cannot_hold_a_folder_are_refused_in_one_sentence(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("x")
-    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
-    for name, sentence in (("file", "is a file"), ("file/out", "is not a folder"), ("link", "symbolic link")):
-        for overwrite in (False, True):
-            with pytest.raises(InputError, match=sentence) as caught:
-                check_output(tmp_path / name, overwrite=overwrite)
-            assert "\n" not in str(caught.value)
-    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
-    with pytest.raises(InputError, match="is not writable"):
-        check_output(tmp_path / "out")
-
-
-def test_an_error_of_the_file_system_becomes_one_sentence(tmp_path):
-    with pytest.raises(InputError, match=r"out cannot be written \(No space left on device\)"):
-        write_and_raise(tmp_path / "out", OSError(28, "No space left on device"))
-    assert list(tmp_path.iterdir()) == []

@@ -2,15 +2,21 @@
 
 import csv
 import json
+import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pycolmap
 import pytest
 
 import sfm_shapefit
+from scripts.make_data import SCENES  # the one place that knows how a bundled scene was made
 from sfm_shapefit import LocateOptions, UnsolvableError
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.commands.write import write_result
+from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
 
 
@@ -21,9 +27,6 @@ def courtyard():
 
 def true_corruption():
     """Names of the pairs of the courtyard whose stored direction is wrong, drawn again from its seed."""
-    from scripts.make_data import SCENES  # the one place that knows how the scene was made
-    from sfm_shapefit.synthetic import make_scene
-
     scene = make_scene(SCENES["courtyard"].scene)
     wrong = scene.pairs[scene.pair_is_corrupted]
     return {(f"{i + 1:04d}.jpg", f"{j + 1:04d}.jpg") for i, j in wrong.tolist()}
@@ -47,9 +50,8 @@ def test_rotations_and_intrinsics_are_the_inputs(courtyard):
     given = pycolmap.Reconstruction(COURTYARD / "sparse" / "0")
     for image_id, image in given.images.items():
         ours = courtyard.reconstruction.image(image_id)
-        np.testing.assert_array_equal(
-            ours.cam_from_world().rotation.quat, image.cam_from_world().rotation.quat
-        )
+        quaternions = (i.cam_from_world().rotation.quat for i in (ours, image))
+        np.testing.assert_array_equal(*quaternions)
         np.testing.assert_array_equal(ours.camera.params, image.camera.params)
         assert ours.name == image.name
 
@@ -66,10 +68,8 @@ def test_the_inputs_centres_place_nothing(tmp_path):
     moved = sfm_shapefit.locate(model, database, options=options)
     plain = sfm_shapefit.locate(scene / "sparse" / "0", database, options=options)
     for image_id in model.images:
-        np.testing.assert_array_equal(
-            moved.reconstruction.image(image_id).projection_center(),
-            plain.reconstruction.image(image_id).projection_center(),
-        )
+        centers = (m.reconstruction.image(image_id).projection_center() for m in (moved, plain))
+        np.testing.assert_array_equal(*centers)
 
 
 def test_exact_data_give_the_exact_answer_in_the_inputs_scale():
@@ -98,9 +98,6 @@ def test_points_keep_the_inputs_colours():
 
 
 def test_relative_poses_serve_when_asked_for(tmp_path):
-    from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
-    from sfm_shapefit.synthetic.workspace import write_workspace
-
     scene = make_scene(SceneOptions(shape="ring", num_images=8, num_points=1500, seed=3))
     write_workspace(scene, tmp_path / "ring", WorkspaceOptions(relative_poses=True))
     options = LocateOptions(directions="relative-poses")
@@ -113,7 +110,7 @@ def test_relative_poses_serve_when_asked_for(tmp_path):
 
 
 def test_the_same_input_gives_the_same_bits(courtyard):
-    again = sfm_shapefit.locate(COURTYARD / "sparse" / "0", options=LocateOptions(threads=2))
+    again = sfm_shapefit.locate(COURTYARD / "sparse" / "0", threads=2)
     assert again.cameras == courtyard.cameras
     ours, theirs = courtyard.reconstruction.points3D, again.reconstruction.points3D
     assert sorted(ours) == sorted(theirs)
@@ -142,28 +139,23 @@ def test_a_reconstruction_in_memory_is_not_changed():
 PAIRS_ONLY = LocateOptions(points="never")
 
 
-@pytest.mark.parametrize(
-    "kept",
-    [
-        lambda i, j: 1 not in (i, j) or (i, j) == (1, 2),
-        lambda i, j: j - i in (1, 7),
-        lambda i, j: {i, j} <= {1, 2, 3, 4} or {i, j} <= {4, 5, 6, 7, 8},
-    ],
-    ids=["pendant", "ring", "hinge"],
-)
+WANTED = {
+    "pendant": lambda i, j: 1 not in (i, j) or (i, j) == (1, 2),
+    "ring": lambda i, j: j - i in (1, 7),
+    "hinge": lambda i, j: {i, j} <= {1, 2, 3, 4} or {i, j} <= {4, 5, 6, 7, 8},
+}
+
+
+@pytest.mark.parametrize("kept", WANTED)
 def test_points_place_cameras_that_pairs_do_not_determine(tmp_path, kept):
-    scene = copied(RING, tmp_path)
-    keep_pairs(scene / "database.db", kept)
-    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    found = sfm_shapefit.locate(ring_with_pairs(tmp_path, WANTED[kept]))
     errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0").position
     assert found.reconstruction.num_reg_images() == 8
     assert errors.max < 0.02  # of a ring of radius 5; a pair alone leaves the distance free
 
 
 def test_a_camera_that_hangs_by_one_pair_is_left_out_by_name(tmp_path):
-    scene = copied(RING, tmp_path)
-    keep_pairs(scene / "database.db", lambda i, j: 1 not in (i, j) or (i, j) == (1, 2))
-    found = sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
+    found = sfm_shapefit.locate(ring_with_pairs(tmp_path, WANTED["pendant"]), options=PAIRS_ONLY)
     rows = {row.name: row for row in found.cameras}
     assert [name for name, row in rows.items() if not row.placed] == ["0001.jpg"]
     assert rows["0001.jpg"].reason == "pendant: joined by a single pair to 0002.jpg"
@@ -172,18 +164,15 @@ def test_a_camera_that_hangs_by_one_pair_is_left_out_by_name(tmp_path):
 
 
 def test_a_ring_of_single_pairs_determines_nothing(tmp_path):
-    scene = copied(RING, tmp_path)
-    keep_pairs(scene / "database.db", lambda i, j: j - i in (1, 7))
     with pytest.raises(UnsolvableError, match="no three cameras"):
-        sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
+        sfm_shapefit.locate(ring_with_pairs(tmp_path, WANTED["ring"]), options=PAIRS_ONLY)
 
 
 @pytest.fixture(scope="module")
 def hinged(tmp_path_factory):
     """The ring as two groups of cameras, 1 to 4 and 4 to 8, that meet at one camera."""
-    scene = copied(RING, tmp_path_factory.mktemp("hinged"))
-    keep_pairs(scene / "database.db", lambda i, j: {i, j} <= {1, 2, 3, 4} or {i, j} <= {4, 5, 6, 7, 8})
-    return sfm_shapefit.locate(scene / "sparse" / "0", options=PAIRS_ONLY)
+    model = ring_with_pairs(tmp_path_factory.mktemp("hinged"), WANTED["hinge"])
+    return sfm_shapefit.locate(model, options=PAIRS_ONLY)
 
 
 def test_two_groups_joined_at_one_camera_are_two_pieces(hinged):
@@ -223,19 +212,18 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
     assert verdicts["0001.jpg", "0002.jpg"] == "inlier"
 
 
-def keep_pairs(database, wanted):
-    """Delete the two-view geometries of all other pairs from a database of our own."""
-    import sqlite3
-
-    with sqlite3.connect(database) as connection:
+def ring_with_pairs(folder, wanted):
+    """A copy of the ring whose database keeps the two-view geometries of the pairs that are wanted."""
+    scene = copied(RING, folder)
+    with closing(sqlite3.connect(scene / "database.db")) as connection, connection:
         for (pair_id,) in connection.execute("SELECT pair_id FROM two_view_geometries").fetchall():
             if not wanted(*divmod(pair_id, 2147483647)):
                 connection.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id,))
-    connection.close()
+    return scene / "sparse" / "0"
 
 
 def test_bundle_adjustment_from_the_seed_converges_and_stays_there(courtyard):
-    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", options=LocateOptions(bundle_adjust=True))
+    adjusted = sfm_shapefit.locate(COURTYARD / "sparse" / "0", bundle_adjust=True)
     assert adjusted.adjusted is not None
     assert adjusted.adjusted.converged
     assert adjusted.adjusted.final_error_px < adjusted.adjusted.initial_error_px
@@ -276,14 +264,10 @@ def test_the_files_say_what_the_result_says(courtyard, tmp_path):
         pairs = list(csv.DictReader(stream))
     assert len(pairs) == facts["num_pairs"]
     for row in pairs:
-        centers = [
-            courtyard.reconstruction.find_image_with_name(row[k]).projection_center()
-            for k in ("name1", "name2")
-        ]
-        baseline = (centers[0] - centers[1]) / np.linalg.norm(centers[0] - centers[1])
+        images = (courtyard.reconstruction.find_image_with_name(row[k]) for k in ("name1", "name2"))
+        baseline = normalized(np.subtract(*(image.projection_center() for image in images)))
         direction = np.array([float(row[k]) for k in ("vx", "vy", "vz")])
-        angle = np.degrees(np.arctan2(np.linalg.norm(np.cross(direction, baseline)), direction @ baseline))
-        assert angle == pytest.approx(float(row["residual_deg"]), abs=1e-6)
+        assert angle_between_deg(direction, baseline) == pytest.approx(float(row["residual_deg"]), abs=1e-6)
 
 
 def test_standard_deviations_are_in_the_outputs_units(courtyard):

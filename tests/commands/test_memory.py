@@ -73,18 +73,20 @@ def loop_graph(num_nodes=400):
     return ViewGraph(num_nodes, np.sort(edges, axis=1), np.tile([1.0, 0.0, 0.0], (len(edges), 1)))
 
 
+LOOP_WORK = Workload(
+    num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
+)
+
+
 def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it():
     graph = loop_graph()
     plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
     split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
     with_priors = LocateOptions(solver="admm", refine_with_priors=True)
-    small = Workload(
-        num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
-    )
-    assert describe_work(small, plain, split).factor_entries > 0
-    assert not describe_work(small, plain, split).needs_factor
+    assert describe_work(LOOP_WORK, plain, split).factor_entries > 0
+    assert not describe_work(LOOP_WORK, plain, split).needs_factor
     for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
-        work = describe_work(small, measured, options)
+        work = describe_work(LOOP_WORK, measured, options)
         assert work.needs_factor
         peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
         assert peaks[0] == peaks[1]  # so that it is never chosen
@@ -92,15 +94,12 @@ def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it():
 
 def test_where_the_factor_is_given_up_nothing_is_refined_as_is_stated():
     measured = MeasuredGraph(loop_graph())
-    work = Workload(
-        num_images=400, num_keypoints=0, num_pairs=8000, num_matches=0, num_edges=8000, num_nodes=400
-    )
     options = LocateOptions(solver="admm")
-    full = describe_work(work, measured, options)
+    full = describe_work(LOOP_WORK, measured, options)
     least = forecast(full, ECONOMIES[-1]).peak_mb
     assert forecast(full, ECONOMIES[-2]).peak_mb > least
     limited = replace(options, max_memory_mb=int(np.ceil(least)))
-    economy, kept, changed = keep_within_memory(work, measured, limited, ECONOMIES[0])
+    economy, kept, changed = keep_within_memory(LOOP_WORK, measured, limited, ECONOMIES[0])
     assert economy is ECONOMIES[-1]
     assert kept is measured
     assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
@@ -133,10 +132,10 @@ def workspaces(tmp_path_factory):
 @pytest.mark.parametrize("kind", ["plain", "rigs"])
 def test_locate_refuses_a_limit_that_cannot_be_kept_and_keeps_the_one_that_it_names(workspaces, kind):
     with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
-        sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=100))
+        sfm_shapefit.locate(workspaces[kind], max_memory_mb=100)
     needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
     # The counts of the database alone do not know the graph, whose part is a few megabytes here.
-    found = sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=needed + 30))
+    found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=needed + 30)
     usual = sfm_shapefit.locate(workspaces[kind])
     assert len(found.placement.cameras) == len(usual.placement.cameras)
     assert found.placement.refined.is_refined
@@ -145,10 +144,7 @@ def test_locate_refuses_a_limit_that_cannot_be_kept_and_keeps_the_one_that_it_na
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])
 def test_a_limit_that_is_none_changes_nothing(workspaces, kind):
-    usual, limited = (
-        sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=limit))
-        for limit in (0, 9000)
-    )
+    usual, limited = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in (0, 9000))
     np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
     assert limited.warnings == usual.warnings
 
@@ -158,7 +154,7 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind):
     full = sfm_shapefit.inspect(workspaces[kind]).expected
     for limit in range(int(full.peak_mb) - 1, 200, -5):
         try:
-            found = sfm_shapefit.locate(workspaces[kind], options=LocateOptions(max_memory_mb=limit))
+            found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit)
         except InputError:
             break
         statement = next(text for text in found.warnings if text.startswith("to stay below max_memory_mb"))

@@ -18,7 +18,7 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results import pair_rows
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene
+from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene
 from tests.program import run
 from tests.scenes import BUNDLED, real_scene
 
@@ -44,8 +44,7 @@ def worst_error(found, truth):
 
 @pytest.mark.parametrize("averaged", [True, False])
 def test_a_1dsfm_folder_is_placed_from_given_or_averaged_rotations(tmp_path, averaged):
-    rotations, centers = scene(n=9)
-    source = folder_with(tmp_path / "in", EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    source, _, centers = write_scene(tmp_path / "in", n=9)
     given = [] if averaged else ["--rotations", source / "rots.txt"]
     solve(source, tmp_path / "out", *given)
     found = centers_of(tmp_path / "out")
@@ -72,8 +71,7 @@ def test_pairs_whose_rotation_contradicts_the_cameras_are_left_out_and_counted(t
 
 
 def test_what_solve_writes_in_other_formats_can_be_read(tmp_path):
-    rotations, centers = scene(n=9)
-    source = folder_with(tmp_path / "in", EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    source, _, _ = write_scene(tmp_path / "in", n=9)
     out = tmp_path / "out"
     solve(source, out, "--rotations", source / "rots.txt", "--g2o", "--1dsfm")
     assert is_onedsfm(out / "1dsfm")

@@ -150,7 +150,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
     lonely = replace(images, **parts, match_offsets=np.append(0, np.cumsum(counts[kept])))
     out = workspace.parent / "lonely"
     write_workspace(lonely, out, WorkspaceOptions(model="rotations"), rigs)
-    located = sfm_shapefit.locate(out / "sparse" / "0", options=LocateOptions(points="never"))
+    located = sfm_shapefit.locate(out / "sparse" / "0", points="never")
     row = located.cameras[4]
     assert row.placed
     assert row.reason == "placed with its frame; no pair of its own takes part"
@@ -160,9 +160,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
 
 
 def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
-    located = sfm_shapefit.locate(
-        workspace / "sparse" / "0", options=LocateOptions(bundle_adjust=True, points="never")
-    )
+    located = sfm_shapefit.locate(workspace / "sparse" / "0", bundle_adjust=True, points="never")
     assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
     fit = fit_similarity(centres(located.reconstruction)[1], rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
@@ -182,7 +180,7 @@ def test_what_rigs_rule_out_is_said(workspace):
 
 
 def test_inspecting_says_how_many_frames_hang_together(workspace):
-    seen = sfm_shapefit.inspect(workspace / "sparse" / "0", options=LocateOptions(points="never"))
+    seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
     assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
 
@@ -193,7 +191,7 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
         for sensor, pose in rig.non_ref_sensors.items():
             rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
     with pytest.raises(UnsolvableError, match="nothing determines the scale"):
-        sfm_shapefit.locate(model, options=LocateOptions(points="never"))
+        sfm_shapefit.locate(model, points="never")
 
 
 def write_and_return(rigs, folder):
@@ -255,9 +253,7 @@ def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_withou
 
 def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
     model, _, names, all_names = moved_ring
-    solved = sfm_shapefit.locate(
-        model, RING / "database.db", options=LocateOptions(fix=str(names))
-    ).reconstruction
+    solved = sfm_shapefit.locate(model, RING / "database.db", fix=str(names)).reconstruction
     new = all_names[-1]
     for image in list(solved.images.values()):  # one image has never been placed: a rotation, no points
         if image.name == new:
@@ -266,7 +262,7 @@ def test_new_images_join_a_solved_model_without_moving_it(moved_ring):
             frame = solved.frame(image.frame_id)
             frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     given = poses(solved)
-    found = sfm_shapefit.locate(solved, RING / "database.db", options=LocateOptions(fix="solved"))
+    found = sfm_shapefit.locate(solved, RING / "database.db", fix="solved")
     after = poses(found.reconstruction)
     assert found.summary()["rigid_groups"]["num_fixed"] == len(all_names) - 1
     for name in all_names[:-1]:
@@ -278,9 +274,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     model = pycolmap.Reconstruction(workspace / "truth")
     names = tmp_path / "names.txt"
     names.write_text("0008.jpg\n")
-    found = sfm_shapefit.locate(
-        model, workspace / "database.db", options=LocateOptions(fix=str(names), points="never")
-    )
+    found = sfm_shapefit.locate(model, workspace / "database.db", fix=str(names), points="never")
     for image_id in (7, 8, 9):
         np.testing.assert_array_equal(
             found.reconstruction.image(image_id).cam_from_world().matrix(),
@@ -303,7 +297,7 @@ def test_a_file_of_names_that_fits_nothing_is_refused(tmp_path, text, message):
     if text is not None:
         names.write_text(text)
     with pytest.raises(InputError, match=message):
-        sfm_shapefit.locate(RING / "sparse" / "0", options=LocateOptions(fix=str(names)))
+        sfm_shapefit.locate(RING / "sparse" / "0", fix=str(names))
 
 
 def test_fixed_cameras_without_positions_are_refused(tmp_path):
@@ -313,7 +307,7 @@ def test_fixed_cameras_without_positions_are_refused(tmp_path):
     for frame in model.frames.values():
         frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
-        sfm_shapefit.locate(model, RING / "database.db", options=LocateOptions(fix=str(names)))
+        sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
 
 
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):

@@ -43,9 +43,15 @@ def folder_with(path, **files):
     return path
 
 
+def write_scene(path, n=6, num_rotations=None):
+    """Write a scene as a 1DSfM folder, and return it with the rotations and centres."""
+    rotations, centers = scene(n)
+    rots = rots_text(rotations[:num_rotations])
+    return folder_with(path, EGs=egs_text(rotations, centers), rots=rots), rotations, centers
+
+
 def test_directions_in_world_axes_point_from_the_second_to_the_first_camera(tmp_path):
-    rotations, centers = scene()
-    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    folder, _, centers = write_scene(tmp_path)
     found = read_onedsfm(folder)
     known, all_known = read_rotations(folder / "rots.txt", found.names)
     graph = found.view_graph(known, all_known)
@@ -55,8 +61,7 @@ def test_directions_in_world_axes_point_from_the_second_to_the_first_camera(tmp_
 
 
 def test_camera_axes_become_those_of_colmap(tmp_path):
-    rotations, centers = scene()
-    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    folder, rotations, _ = write_scene(tmp_path)
     found = read_onedsfm(folder)
     cam_from_world, _ = read_rotations(folder / "rots.txt", found.names)
     # Bundler's camera looks along -z and its y is up: in COLMAP's axes both turn round.
@@ -68,8 +73,7 @@ def test_camera_axes_become_those_of_colmap(tmp_path):
 
 
 def test_what_is_written_is_what_was_read(tmp_path):
-    rotations, centers = scene()
-    folder = folder_with(tmp_path / "a", EGs=egs_text(rotations, centers), rots=rots_text(rotations))
+    folder, _, centers = write_scene(tmp_path / "a")
     found = read_onedsfm(folder)
     cam_from_world, known = read_rotations(folder / "rots.txt", found.names)
     texts = onedsfm_files(found, cam_from_world, np.arange(1, 6), centers[1:])
@@ -90,8 +94,7 @@ def test_what_is_written_is_what_was_read(tmp_path):
 
 
 def test_cameras_without_rotation_have_no_directions(tmp_path):
-    rotations, centers = scene()
-    folder = folder_with(tmp_path, EGs=egs_text(rotations, centers), rots=rots_text(rotations[:4]))
+    folder, _, _ = write_scene(tmp_path, num_rotations=4)
     found = read_onedsfm(folder)
     graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
     assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]

@@ -1,6 +1,7 @@
 """Which cameras are trusted: against wrong rotations, self-supporting groups, false pairs everywhere."""
 
 import numpy as np
+import pycolmap
 import pytest
 
 import sfm_shapefit
@@ -9,9 +10,9 @@ from sfm_shapefit.judgement.conditioning import condition
 from sfm_shapefit.judgement.trust import PairFit, find_consensus, judge_cameras
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.measured import Evidence, MeasuredGraph
-from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.judgement.evidence import make_evidence
 from tests.scenes import COURTYARD, real_scene
 
 WRONG_OF_LEGO = {f"train_r_{k}.png" for k in (4, 15, 22, 25, 74)}
@@ -25,17 +26,9 @@ def clean(n, seed, density=0.6):
     return t, edges, normalized(differences(t, edges))
 
 
-def supported(count, support=100):
-    """Evidence of equal support without contradictions."""
-    nothing = np.zeros(0, dtype=np.int64)
-    return Evidence(
-        support=np.full(count, support), contradicting=nothing.reshape(0, 2), contradicting_support=nothing
-    )
-
-
 def test_cameras_of_a_clean_graph_are_fully_trusted_without_reasons():
     t, edges, v = clean(20, 0)
-    found = assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=supported(len(edges))), t)
+    found = assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=make_evidence(len(edges))), t)
     assert found.trust.min() > 0.99
     assert set(found.reasons) == {""}
 
@@ -47,11 +40,7 @@ def test_a_group_that_agrees_only_with_itself_is_not_trusted():
     rng = np.random.default_rng(1)
     v[crossing] = normalized(rng.standard_normal((int(crossing.sum()), 3)))
     support = np.where(group.all(axis=1), 1500, 30)  # its own pairs have most of all matches
-    evidence = Evidence(
-        support=support,
-        contradicting=np.zeros((0, 2), dtype=np.int64),
-        contradicting_support=np.zeros(0, dtype=np.int64),
-    )
+    evidence = make_evidence(len(edges), support)
     found = assess(MeasuredGraph(ViewGraph(30, edges, v), evidence=evidence), t)
     assert found.trust[:7].max() < 0.3
     assert found.trust[7:].min() > 0.9
@@ -62,8 +51,7 @@ def test_pairs_without_a_direction_speak_against_their_cameras_too():
     t, edges, v = clean(20, 2)
     against = np.array([(3, k) for k in range(20) if k != 3 and [min(3, k), max(3, k)] not in edges.tolist()])
     own = int(np.sum(edges == 3))
-    heavy = np.full(len(against), 200 * own // len(against))
-    evidence = Evidence(support=np.full(len(edges), 30), contradicting=against, contradicting_support=heavy)
+    evidence = make_evidence(len(edges), 30, against, 200 * own // len(against))
     found = assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=evidence), t)
     assert np.argmin(found.trust) == 3
     assert found.trust[3] < 0.5
@@ -75,18 +63,15 @@ def test_where_a_part_of_the_pairs_is_wrong_everywhere_nobody_is_blamed():
     rng = np.random.default_rng(3)
     bad = rng.random(len(edges)) < 0.35
     v[bad] = normalized(rng.standard_normal((int(bad.sum()), 3)))
-    assert assess(MeasuredGraph(ViewGraph(40, edges, v), evidence=supported(len(edges))), t).trust.min() > 0.7
+    measured = MeasuredGraph(ViewGraph(40, edges, v), evidence=make_evidence(len(edges)))
+    assert assess(measured, t).trust.min() > 0.7
 
 
 def test_false_pairs_between_all_cameras_do_not_drown_the_true_ones():
     t, edges, v = clean(40, 4, density=0.3)
     against = np.sort(np.random.default_rng(4).integers(40, size=(3 * len(edges), 2)), axis=1)
     against = against[against[:, 0] != against[:, 1]]
-    evidence = Evidence(
-        support=np.full(len(edges), 60),
-        contradicting=against,
-        contradicting_support=np.full(len(against), 60),
-    )
+    evidence = make_evidence(len(edges), 60, against, 60)
     assert assess(MeasuredGraph(ViewGraph(40, edges, v), evidence=evidence), t).trust.min() > 0.6
 
 
@@ -122,10 +107,8 @@ def test_one_pair_of_thousands_of_matches_does_not_outvote_the_others():
     v[own[1:]] = normalized(np.random.default_rng(7).standard_normal((len(own) - 1, 3)))
     support = np.full(len(edges), 100)
     support[own[0]] = 100_000
-    assert (
-        assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=supported(len(edges), support)), t).trust[3]
-        < 0.5
-    )
+    evidence = make_evidence(len(edges), support)
+    assert assess(MeasuredGraph(ViewGraph(20, edges, v), evidence=evidence), t).trust[3] < 0.5
 
 
 def test_evidence_follows_its_cameras_and_pairs():
@@ -150,8 +133,6 @@ def test_bodies_join_while_more_speaks_for_it_than_against():
 
 
 def test_turned_cameras_of_a_scene_are_left_out_named_and_can_be_kept():
-    import pycolmap
-
     model = pycolmap.Reconstruction(COURTYARD / "sparse" / "0")
     victim = model.images[sorted(model.reg_image_ids())[5]]
     turned = pycolmap.Rotation3d(np.array([0.0, np.sin(0.2), 0.0, np.cos(0.2)]))  # by 23 degrees
@@ -189,8 +170,6 @@ def test_no_camera_of_a_sound_real_scene_is_blamed(name):
 
 def test_a_floor_of_zero_keeps_every_camera():
     scene = real_scene("lego100")
-    found = sfm_shapefit.locate(
-        scene / "sparse" / "0", scene / "database.db", options=LocateOptions(min_trust=0.0)
-    )
+    found = sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db", min_trust=0.0)
     assert found.kept.all()
     assert any(row.reason for row in found.cameras if row.placed)

@@ -6,9 +6,10 @@ import pytest
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import Looseness
 from sfm_shapefit.judgement.verdicts import Verdict, assess
-from sfm_shapefit.measured import Evidence, MeasuredGraph
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.judgement.evidence import make_evidence
 from tests.problems import all_pairs
 
 SIGMA = 0.01  # rad, per axis
@@ -55,23 +56,16 @@ def test_wrong_and_reversed_directions_are_outliers_and_good_ones_are_not():
     assert found.level_deg == pytest.approx(np.degrees(SIGMA), rel=0.25)  # 66 residuals: 9 % at one sigma
 
 
-def test_a_pair_that_knows_it_is_uncertain_is_not_blamed():
+def test_a_pair_that_knows_it_is_uncertain_is_not_blamed_unless_it_is_reversed():
     t, edges, v = measured(2)
-    off = 0.2  # rad: 20 sigma of an ordinary pair
-    v[3] = normalized(v[3] + off * tangent_bases(v[3:4])[0, :, 0])
-    sure, unsure = covariances(len(edges)), covariances(len(edges))
-    unsure[3] = 0.1**2 * np.eye(2)
-    graph = ViewGraph(12, edges, v)
-    assert not assess(MeasuredGraph(graph, covariance=sure), t).inliers[3]
-    assert assess(MeasuredGraph(graph, covariance=unsure), t).inliers[3]
-
-
-def test_a_reversed_direction_is_an_outlier_however_uncertain_it_is():
-    t, edges, v = measured(2)
-    v[3] = -v[3]
-    unsure = covariances(len(edges))
-    unsure[3] = 2.0**2 * np.eye(2)
-    assert not assess(MeasuredGraph(ViewGraph(12, edges, v), covariance=unsure), t).inliers[3]
+    off, reverse = v.copy(), v.copy()
+    off[3] = normalized(v[3] + 0.2 * tangent_bases(v[3:4])[0, :, 0])  # rad: 20 sigma of an ordinary pair
+    reverse[3] = -v[3]
+    for directions, sigma, agrees in ((off, SIGMA, False), (off, 0.1, True), (reverse, 2.0, False)):
+        stated = covariances(len(edges))
+        stated[3] = sigma**2 * np.eye(2)
+        found = assess(MeasuredGraph(ViewGraph(12, edges, directions), covariance=stated), t)
+        assert found.inliers[3] == agrees
 
 
 def test_unknown_covariances_are_judged_by_the_common_level():
@@ -88,9 +82,8 @@ def test_standard_deviations_cover_the_errors_of_least_squares(stated):
     for seed in range(20):
         t, edges, v = measured(100 + seed, n=14)
         found = fitted(t, edges, v)
-        judged = assess(
-            MeasuredGraph(ViewGraph(14, edges, v), covariance=covariances(len(edges), stated * SIGMA)), found
-        )
+        given = MeasuredGraph(ViewGraph(14, edges, v), covariance=covariances(len(edges), stated * SIGMA))
+        judged = assess(given, found)
         centred, truth = found - found.mean(axis=0), t - t.mean(axis=0)
         errors = centred - truth * np.sum(centred**2) / np.sum(centred * truth)
         within.append(np.abs(errors) < judged.sigmas)
@@ -102,10 +95,12 @@ def test_the_excess_is_what_the_covariances_leave_unexplained():
     t, edges, v = measured(4, n=30)
     t = fitted(t, edges, v)
     graph = ViewGraph(30, edges, v)
-    assert assess(
-        MeasuredGraph(graph, covariance=covariances(len(edges), 0.6 * SIGMA)), t
-    ).excess_deg == pytest.approx(np.degrees(0.8 * SIGMA), rel=0.15)
-    assert assess(MeasuredGraph(graph, covariance=covariances(len(edges), 1.2 * SIGMA)), t).excess_deg < 1e-6
+    less, more = (
+        assess(MeasuredGraph(graph, covariance=covariances(len(edges), share * SIGMA)), t).excess_deg
+        for share in (0.6, 1.2)
+    )
+    assert less == pytest.approx(np.degrees(0.8 * SIGMA), rel=0.15)
+    assert more < 1e-6
 
 
 def test_a_pair_that_no_other_checks_is_undetermined():
@@ -185,14 +180,8 @@ def test_errors_that_pairs_share_widen_the_standard_deviations():
     unit = np.random.default_rng(0).standard_normal((len(edges), 96, 2))
 
     def sigmas(size):
-        evidence = Evidence(
-            support=np.full(len(edges), 50, dtype=np.int64),
-            contradicting=np.zeros((0, 2), dtype=np.int64),
-            contradicting_support=np.zeros(0, dtype=np.int64),
-            errors=size * SIGMA * unit,
-        )
-        return assess(
-            MeasuredGraph(graph, covariance=covariances(len(edges)), evidence=evidence), where
-        ).sigmas
+        evidence = make_evidence(len(edges), 50, errors=size * SIGMA * unit)
+        measured = MeasuredGraph(graph, covariance=covariances(len(edges)), evidence=evidence)
+        return assess(measured, where).sigmas
 
     np.testing.assert_allclose(sigmas(6.0), 3.0 * sigmas(2.0), rtol=0.25)  # 1 if only the excess counted

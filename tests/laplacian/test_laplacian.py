@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse import csc_array, csr_array
 from scipy.sparse.linalg import splu
+from threadpoolctl import threadpool_info
 
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import normalized
 from sfm_shapefit.laplacian import ordering
 from sfm_shapefit.laplacian.approximate import JacobiPreconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyse, factorise
@@ -24,6 +26,7 @@ from sfm_shapefit.laplacian.operators import (
     laplacian_pattern,
 )
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree
+from sfm_shapefit.solver.program import differences
 from tests.graph_families import FAMILIES, random_blocks, random_weights
 from tests.program import run_python
 
@@ -38,6 +41,24 @@ def family(name: str, seed: int = 1) -> tuple[int, npt.NDArray[np.int64], Array]
     edges, t = FAMILIES[name](n, degree, seed)
     chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)  # connects what chance left apart
     return n, np.unique(np.concatenate([edges, chain]), axis=0), t
+
+
+def weights_of(edges, block: int, seed: int) -> Array:
+    return random_weights(len(edges), seed) if block == 1 else random_blocks(len(edges), block, seed)
+
+
+def system(name: str):
+    """Edges of a family, weights, their matrix, and three right-hand sides."""
+    n, edges, _ = family(name)
+    w = random_weights(len(edges), 1)
+    return edges, w, assemble(laplacian_pattern(n, edges), w), balanced_rhs((n, 3), 2)
+
+
+def grid(rows: int, columns: int) -> npt.NDArray[np.int64]:
+    """Edges of a grid whose nodes are numbered row by row."""
+    k = np.arange(rows * columns).reshape(rows, columns)
+    pairs = [(k[:, :-1], k[:, 1:]), (k[:-1], k[1:])]
+    return np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
 
 
 def incidence(n: int, edges: npt.NDArray[np.int64]) -> csr_array:
@@ -57,6 +78,12 @@ def reference_laplacian(n: int, edges: npt.NDArray[np.int64], weights: Array) ->
     for p, q, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
         np.add.at(dense, (p, q), sign * weights)
     return csc_array(dense.transpose(0, 2, 1, 3).reshape(n * b, n * b))
+
+
+def across(v: Array) -> Array:
+    """Projectors across directions."""
+    v = normalized(v)
+    return np.eye(3) - v[:, :, None] * v[:, None, :]
 
 
 def balanced_rhs(shape: tuple[int, ...], seed: int) -> Array:
@@ -82,7 +109,7 @@ def splu_solution(laplacian: csc_array, block: int, rhs: Array) -> Array:
 @pytest.mark.parametrize("block", [1, 2, 3])
 def test_assembly_by_slots_equals_the_product_of_incidence_matrices(block):
     n, edges, _ = family("er")
-    w = random_weights(len(edges), 1) if block == 1 else random_blocks(len(edges), block, 1)
+    w = weights_of(edges, block, 1)
     matrix = assemble(laplacian_pattern(n, edges), w)
     difference = np.abs((csc_array(matrix) - reference_laplacian(n, edges, w)).toarray()).max()
     assert difference <= 50 * EPS * np.abs(matrix.data).max()
@@ -98,15 +125,17 @@ def test_assembly_into_given_memory_forgets_the_old_weights():
     np.testing.assert_array_equal(again.toarray(), assemble(pattern, w).toarray())
 
 
-@pytest.mark.parametrize("edges", [[[0, 3]], [[-1, 1]]])
-def test_an_edge_that_leaves_the_graph_is_refused(edges):
-    with pytest.raises(InputError, match=r"nodes 0\.\.2"):
-        analyse(3, np.array(edges))
-
-
-def test_a_self_loop_is_refused():
-    with pytest.raises(InputError, match="itself"):
-        laplacian_pattern(3, np.array([[0, 1], [2, 2]]))
+@pytest.mark.parametrize(
+    ("build", "edges", "message"),
+    [
+        (analyse, [[0, 3]], r"nodes 0\.\.2"),
+        (analyse, [[-1, 1]], r"nodes 0\.\.2"),
+        (laplacian_pattern, [[0, 1], [2, 2]], "itself"),
+    ],
+)
+def test_an_edge_that_leaves_the_graph_or_is_a_loop_is_refused(build, edges, message):
+    with pytest.raises(InputError, match=message):
+        build(3, np.array(edges))
 
 
 def true_counts(n: int, edges: npt.NDArray[np.int64], order: npt.NDArray[np.int64]) -> list[int]:
@@ -154,7 +183,7 @@ def test_solutions_agree_with_splu_on_any_connected_graph_and_order(seed, n, ext
     kept = rng.uniform(size=len(i)) < extra
     tree = np.stack([np.arange(1, n), rng.integers(np.arange(1, n))], axis=1)
     edges = np.concatenate([tree, np.stack([i[kept], j[kept]], axis=1)])  # some edges repeat: weights add
-    w = random_weights(len(edges), seed) if block == 1 else random_blocks(len(edges), block, seed)
+    w = weights_of(edges, block, seed)
     rhs = balanced_rhs((n, columns) if block == 1 else (n, block, columns), seed)
     x = factorise(analyse(n, edges, rng.permutation(n)), w).solve(rhs)
     # Paths of up to 60 edges with weights within a factor 10: condition below 1e5.
@@ -165,7 +194,7 @@ def test_solutions_agree_with_splu_on_any_connected_graph_and_order(seed, n, ext
 @pytest.mark.parametrize("block", [1, 3])
 def test_every_family_is_solved_to_rounding(name, block):
     n, edges, _ = family(name)
-    w = random_weights(len(edges), 3) if block == 1 else random_blocks(len(edges), block, 3)
+    w = weights_of(edges, block, 3)
     rhs = balanced_rhs((n, 3) if block == 1 else (n, block, 2), 4)
     factor = factorise(analyse(n, edges), w)
     matrix = assemble(laplacian_pattern(n, edges), w)
@@ -226,12 +255,9 @@ def test_a_pendant_camera_makes_the_projected_laplacian_singular_and_is_named():
     n, edges, t = family("geo")
     edges = np.concatenate([edges, [[0, n]]])
     t = np.concatenate([t, [[0.5, 0.5, 1.0]]])
-    d = t[edges[:, 0]] - t[edges[:, 1]]
-    v = d / np.linalg.norm(d, axis=1, keepdims=True)
-    rng = np.random.default_rng(0)
-    v[:-1] += 0.1 * rng.normal(size=v[:-1].shape)  # otherwise t itself is in the null space
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    projectors = np.eye(3) - v[:, :, None] * v[:, None, :]
+    v = normalized(differences(t, edges))
+    v[:-1] += 0.1 * np.random.default_rng(0).normal(size=v[:-1].shape)  # else t itself is in the null space
+    projectors = across(v)
     with pytest.raises(UnsolvableError, match=rf"singular at node {n} "):
         factorise(analyse(n + 1, edges), projectors)
     factorise(analyse(n, edges[:-1]), projectors[:-1])  # without it, all is well
@@ -262,7 +288,7 @@ def test_memory_is_predicted_before_it_is_allocated():
         tracemalloc.start()
         factor = allocate_factor(plan, block, dtype)
         allocated = tracemalloc.get_traced_memory()[0]
-        w = random_blocks(len(edges), block, 1) if block > 1 else random_weights(len(edges), 1)
+        w = weights_of(edges, block, 1)
         tracemalloc.reset_peak()
         before = tracemalloc.get_traced_memory()[0]
         factor.refactor(w)
@@ -287,11 +313,7 @@ def divided(request) -> tuple[npt.NDArray[np.int64], SymbolicFactor]:
 
 
 def test_the_widest_level_of_a_grid_is_its_diagonal_and_of_a_box_about_its_separator():
-    rows, columns = np.divmod(np.arange(20 * 30), 30)
-    nodes = np.arange(600)
-    right, down = nodes[columns < 29], nodes[rows < 19]
-    grid = np.concatenate([np.stack([right, right + 1], axis=1), np.stack([down, down + 30], axis=1)])
-    assert ordering.widest_level(adjacency(600, grid)) == 20  # from a corner, levels are the diagonals
+    assert ordering.widest_level(adjacency(600, grid(20, 30))) == 20  # from a corner, diagonals
     edges, _ = FAMILIES["geo"](6000, 40.0, 1)
     plan = analyse(6000, edges, "metis")
     root = plan.first[-1] - plan.first[-2]
@@ -391,11 +413,7 @@ def test_every_ordering_is_a_permutation_and_beats_a_random_order(name):
 
 
 def test_dissection_halves_a_grid_with_separators_of_about_its_width():
-    side = 40
-    k = np.arange(side * side).reshape(side, side)
-    pairs = [(k[:, :-1], k[:, 1:]), (k[:-1], k[1:])]
-    edges = np.concatenate([np.stack([a.ravel(), b.ravel()], axis=1) for a, b in pairs])
-    graph = adjacency(side * side, edges)
+    graph = adjacency(1600, grid(40, 40))
     tree = elimination_tree(graph, ordering.metis_order(graph))
     # George's dissection has 31/4 n log2(side) entries to first order (7.75 * 1600 * 5.3 = 66,000); the
     # row-by-row order has side^3 = 64,000. Small grids do better than the asymptote.
@@ -434,12 +452,8 @@ def test_metis_gives_a_good_order_of_a_graph_with_repeated_edges():
 
 @pytest.mark.parametrize("name", sorted(FAMILIES))
 def test_approximate_cholesky_needs_few_iterations(name):
-    n, edges, _ = family(name)
-    w = random_weights(len(edges), 1)
-    graph = adjacency(n, edges)
-    matrix = assemble(laplacian_pattern(n, edges), w)
-    rhs = balanced_rhs((n, 3), 2)
-    factor = approximate_cholesky(graph, w, seed=1)
+    edges, w, matrix, rhs = system(name)
+    factor = approximate_cholesky(adjacency(len(rhs), edges), w, seed=1)
     result = conjugate_gradients(lambda x: matrix @ x, factor, rhs, tol=1e-10)
     assert result.converged
     assert result.iterations <= 30  # 25 on sequences of 1e4 nodes, 15-19 elsewhere, at any size
@@ -495,22 +509,17 @@ def test_the_seed_decides_the_sample():
 def test_jacobi_is_enough_on_random_graphs_and_not_on_sequences():
     iterations = {}
     for name in ("er", "seq"):
-        n, edges, _ = family(name)
-        w = random_weights(len(edges), 1)
-        matrix = assemble(laplacian_pattern(n, edges), w)
+        _, _, matrix, rhs = system(name)
         preconditioner = JacobiPreconditioner(matrix.diagonal())
-        result = conjugate_gradients(
-            lambda x, a=matrix: a @ x, preconditioner, balanced_rhs((n, 3), 2), tol=1e-8
-        )
+        result = conjugate_gradients(lambda x, a=matrix: a @ x, preconditioner, rhs, tol=1e-8)
         iterations[name] = result.iterations
     assert iterations["er"] < 40 < iterations["seq"]
 
 
 def test_a_warm_start_saves_iterations_and_can_set_the_scale():
-    n, edges, _ = family("geo")
-    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
-    matrix = assemble(laplacian_pattern(n, edges), w)
-    factor, rhs = approximate_cholesky(graph, w, 0), balanced_rhs((n, 3), 2)
+    edges, w, matrix, rhs = system("geo")
+    n = len(rhs)
+    factor = approximate_cholesky(adjacency(n, edges), w, 0)
 
     def run(**options):
         return conjugate_gradients(lambda x: matrix @ x, factor, rhs, **options)
@@ -526,22 +535,17 @@ def test_a_warm_start_saves_iterations_and_can_set_the_scale():
 
 
 def test_an_iteration_limit_is_reported():
-    n, edges, _ = family("geo")
-    matrix = assemble(laplacian_pattern(n, edges), random_weights(len(edges), 1))
-    rhs = balanced_rhs((n, 3), 2)
-    result = conjugate_gradients(
-        lambda x: matrix @ x, JacobiPreconditioner(matrix.diagonal()), rhs, max_iterations=2
-    )
+    _, _, matrix, rhs = system("geo")
+    preconditioner = JacobiPreconditioner(matrix.diagonal())
+    result = conjugate_gradients(lambda x: matrix @ x, preconditioner, rhs, max_iterations=2)
     assert (result.converged, result.iterations) == (False, 2)
     assert result.residual > 1e-10
 
 
 def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
     n, edges, t = family("geo")
-    d = t[edges[:, 0]] - t[edges[:, 1]]
-    v = d + 0.3 * np.linalg.norm(d, axis=1, keepdims=True) * np.random.default_rng(0).normal(size=d.shape)
-    v /= np.linalg.norm(v, axis=1, keepdims=True)
-    projectors = np.eye(3) - v[:, :, None] * v[:, None, :]
+    v = normalized(differences(t, edges))
+    projectors = across(v + 0.3 * np.random.default_rng(0).normal(size=v.shape))
     plan = analyse(n, edges)
     rhs = balanced_rhs((n, 3), 1)
     matrix = assemble(laplacian_pattern(n, edges), projectors)
@@ -560,6 +564,7 @@ def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
 CHILD = """
 import hashlib, json, sys, time
 import numpy as np
+from sfm_shapefit.solver.program import differences
 from tests.graph_families import geo, random_weights
 from sfm_shapefit.laplacian.cholesky import analyse, factorise
 edges, t = geo(2000, 20.0, 1)
@@ -589,8 +594,6 @@ def test_blas_threads_do_not_change_a_bit(dtype):
 
 
 def test_blas_threads_are_restored_after_nested_limits():
-    from threadpoolctl import threadpool_info
-
     def threads() -> list[int]:  # of scipy's BLAS; other packages of the process may have their own
         blas = [library for library in threadpool_info() if library["user_api"] == "blas"]
         return [library["num_threads"] for library in blas if "scipy" in library["filepath"]]

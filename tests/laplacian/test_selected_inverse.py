@@ -7,11 +7,7 @@ from sfm_shapefit.laplacian.cholesky import analyse, factorise
 from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
-
-
-def blocks(rng, count, b):
-    roots = rng.standard_normal((count, b, b))
-    return roots @ roots.transpose(0, 2, 1) + 0.1 * np.eye(b)
+from tests.graph_families import random_blocks
 
 
 @pytest.mark.parametrize("problem", [box_graph_problem, trajectory_graph_problem])
@@ -20,7 +16,7 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     rng = np.random.default_rng(b)
     n, edges = 150, problem(150, 10.0, seed=b).edges
     edges = np.where(rng.random(len(edges))[:, None] < 0.5, edges, edges[:, ::-1])  # either way round
-    weights = blocks(rng, len(edges), b)
+    weights = random_blocks(len(edges), b, seed=b)
     factor = factorise(analyse(n, edges), weights, ground=7.0)
     found = selected_inverse(factor, edges)
 

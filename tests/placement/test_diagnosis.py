@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import LocateOptions, SolverOptions, UnsolvableError
+from sfm_shapefit import SolverOptions, UnsolvableError
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.judgement.conditioning import direction_spread
 from sfm_shapefit.measured import Evidence, MeasuredGraph
@@ -219,4 +219,4 @@ def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):
 
 def test_a_model_without_usable_directions_is_refused_as_by_locate():
     with pytest.raises(UnsolvableError, match="none of the"):
-        sfm_shapefit.inspect(RING / "sparse" / "0", options=LocateOptions(min_inliers=100_000))
+        sfm_shapefit.inspect(RING / "sparse" / "0", min_inliers=100_000)

@@ -77,11 +77,7 @@ def test_a_known_distance_becomes_true():
     placed = distance_gauge(t, 3, 7, 12.5, "a and b").apply(t)
     assert np.linalg.norm(placed[3] - placed[7]) == pytest.approx(12.5, rel=1e-14)
     np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-13)
-
-
-def test_the_distance_of_cameras_at_one_place_sets_no_scale():
-    t = cameras(2)
-    t[4] = t[5]
+    t[4] = t[5]  # cameras at one place
     with pytest.raises(InputError, match="a and b coincide"):
         distance_gauge(t, 4, 5, 1.0, "a and b")
 
@@ -133,17 +129,17 @@ def test_priors_on_a_line_keep_the_axes_and_say_so():
     assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
 
 
-@pytest.mark.parametrize(("rows", "message"), [([4], "a scale needs two"), ([], "a scale needs two")])
-def test_too_few_priors_are_refused(rows, message):
-    t = cameras(5)
+@pytest.mark.parametrize(
+    ("positions", "rows", "message"),
+    [
+        (cameras(5), [4], "a scale needs two"),
+        (cameras(5), np.zeros(0, dtype=np.int64), "a scale needs two"),
+        (np.full((12, 3), 4.0), None, "coincide"),
+    ],
+)
+def test_too_few_priors_and_those_at_one_place_are_refused(positions, rows, message):
     with pytest.raises(InputError, match=message):
-        prior_gauge(t, priors_of(t, rows=np.array(rows, dtype=np.int64)))
-
-
-def test_priors_at_one_place_are_refused():
-    t = cameras(6)
-    with pytest.raises(InputError, match="coincide"):
-        prior_gauge(t, priors_of(np.full((12, 3), 4.0)))
+        prior_gauge(cameras(5), priors_of(positions, rows=rows))
 
 
 def test_priors_that_have_nothing_to_do_with_the_cameras_are_warned_about():

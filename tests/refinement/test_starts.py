@@ -134,10 +134,8 @@ def test_noise_free_answers_are_exact_and_not_made_worse(d):
     found = refine_starts(MeasuredGraph(graph), certified, PlacementOptions())
     assert shape_error(found.locations, problem.locations) < 1e-9
     # Rounding apart: the certified answer is exact to 1e-9 itself, or better.
-    assert (
-        shape_error(found.locations, problem.locations)
-        <= shape_error(certified.locations, problem.locations) + 1e-12
-    )
+    errors = [shape_error(x.locations, problem.locations) for x in (found, certified)]
+    assert errors[0] <= errors[1] + 1e-12
 
 
 @pytest.mark.parametrize("d", [2, 3])

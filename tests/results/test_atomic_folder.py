@@ -9,9 +9,22 @@ from pathlib import Path
 import pytest
 
 from sfm_shapefit import atomic_folder as output
-from sfm_shapefit.atomic_folder import atomic_folder, claimed_output
+from sfm_shapefit.atomic_folder import atomic_folder, check_output, claimed_output
 from sfm_shapefit.errors import InputError
 from tests.program import run_python
+
+
+def earlier_output(path):
+    path.mkdir()
+    (path / "locate.json").write_text("{}")
+    (path / "old.bin").write_bytes(b"old")
+    return path
+
+
+def write_and_raise(out, error, overwrite=False):
+    with atomic_folder(out, overwrite=overwrite) as partial:
+        (partial / "locate.json").write_text("new")
+        raise error
 
 
 def test_a_second_run_into_the_same_place_is_told_so_and_the_first_goes_on(tmp_path):
@@ -54,11 +67,8 @@ def test_a_folder_of_somebody_else_that_looks_abandoned_is_left_alone(tmp_path):
     assert (tmp_path / "target").is_dir()
 
 
-def test_an_earlier_output_is_replaced_in_one_step(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    out.mkdir()
-    (out / "locate.json").write_text("old")
-    seen = []
+def test_an_earlier_output_is_replaced_completely_and_in_one_step(tmp_path, monkeypatch):
+    out, seen = earlier_output(tmp_path / "out"), []
     real = output._renamed_at_once
 
     def watched(source, target, how):
@@ -69,9 +79,11 @@ def test_an_earlier_output_is_replaced_in_one_step(tmp_path, monkeypatch):
     monkeypatch.setattr(output, "_renamed_at_once", watched)
     with atomic_folder(out, overwrite=True) as partial:
         (partial / "locate.json").write_text("new")
+        assert (out / "old.bin").exists()
     if sys.platform == "linux":
-        assert seen == [("new", "old")]
+        assert seen == [("new", "{}")]
     assert (out / "locate.json").read_text() == "new"
+    assert [path.name for path in out.iterdir()] == ["locate.json"]
     assert list(tmp_path.iterdir()) == [out]
 
 
@@ -109,3 +121,113 @@ def test_an_interrupt_while_a_claim_is_made_or_removed_leaves_nothing(tmp_path, 
     assert list(tmp_path.iterdir()) == []
     with output.locked_folder(tmp_path / "claim"):  # its lock is free again
         pass
+
+
+def test_a_folder_appears_when_the_block_ends_and_not_before(tmp_path):
+    out = tmp_path / "new" / "parents" / "out"
+    with atomic_folder(out) as partial:
+        (partial / "sub").mkdir()
+        (partial / "sub" / "file").write_text("x")
+        assert partial.parent.parent == out.parent
+        assert stat.S_IMODE(partial.parent.stat().st_mode) == 0o700
+        assert not out.exists()
+    assert (out / "sub" / "file").read_text() == "x"
+    assert list(out.parent.iterdir()) == [out]
+
+
+def test_the_folder_has_the_permissions_of_any_new_folder(tmp_path):
+    (tmp_path / "plain").mkdir()
+    with atomic_folder(tmp_path / "out"):
+        pass
+    modes = {stat.S_IMODE((tmp_path / name).stat().st_mode) for name in ("out", "plain")}
+    assert len(modes) == 1
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError, KeyboardInterrupt, SystemExit])
+def test_an_exception_leaves_nothing_behind_not_even_new_parents_and_keeps_an_earlier_output(tmp_path, error):
+    with pytest.raises(error):
+        write_and_raise(tmp_path / "a" / "b" / "out", error)
+    assert list(tmp_path.iterdir()) == []
+    out = earlier_output(tmp_path / "out")
+    with pytest.raises(error):
+        write_and_raise(out, error, overwrite=True)
+    assert (out / "old.bin").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_an_existing_folder_is_refused_and_kept(tmp_path):
+    out = earlier_output(tmp_path / "out")
+    advice = "exists already; choose another folder, or replace it with --overwrite"
+    with pytest.raises(InputError, match=advice):
+        check_output(out)
+    with pytest.raises(InputError, match="exists already"), atomic_folder(out):
+        pytest.fail("the block must not run")
+    assert (out / "old.bin").read_bytes() == b"old"
+
+
+def test_an_earlier_output_is_put_back_if_the_new_one_cannot_be_moved_in(tmp_path, monkeypatch):
+    out = earlier_output(tmp_path / "out")
+    rename = Path.rename
+
+    def failing(self, target):
+        if self.parent.suffix == ".partial" and self.name == "out":
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    monkeypatch.setattr(output, "_renamed_at_once", lambda *_: False)  # as on other systems than Linux
+    monkeypatch.setattr(Path, "rename", failing)
+    with pytest.raises(InputError, match="cannot be written"), atomic_folder(out, overwrite=True):
+        pass
+    assert (out / "old.bin").read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_overwriting_refuses_what_is_no_earlier_output_but_takes_an_empty_folder(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    with atomic_folder(photos, overwrite=True) as partial:
+        (partial / "dear.jpg").write_bytes(b"x")
+    with (
+        pytest.raises(InputError, match=r"holds files but no locate\.json or map\.json"),
+        atomic_folder(photos, overwrite=True),
+    ):
+        pytest.fail("the block must not run")
+    assert (photos / "dear.jpg").exists()
+
+
+def test_a_folder_that_came_into_being_meanwhile_is_kept(tmp_path):
+    with pytest.raises(InputError, match="exists already"), atomic_folder(tmp_path / "out"):
+        earlier_output(tmp_path / "out")
+    assert (tmp_path / "out" / "old.bin").exists()
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+@pytest.mark.parametrize("spelling", ["model", "model/../model", ".", "link", "project"])
+def test_the_input_is_never_overwritten_however_it_is_spelled(tmp_path, spelling):
+    model = earlier_output(tmp_path / "model")
+    (tmp_path / "link").symlink_to(model)
+    (tmp_path / "locate.json").write_text("{}")
+    (tmp_path / "project").symlink_to(tmp_path)
+    with pytest.raises(InputError, match="is or contains the input"):
+        check_output(tmp_path / spelling, overwrite=True, protect=[model])
+    check_output(model / "out", protect=[model])
+    check_output(tmp_path / "model2", protect=[model])
+
+
+def test_paths_that_cannot_hold_a_folder_are_refused_in_one_sentence(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("x")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for name, sentence in (("file", "is a file"), ("file/out", "is not a folder"), ("link", "symbolic link")):
+        for overwrite in (False, True):
+            with pytest.raises(InputError, match=sentence) as caught:
+                check_output(tmp_path / name, overwrite=overwrite)
+            assert "\n" not in str(caught.value)
+    monkeypatch.setattr(os, "access", lambda *_: False)  # root may write everywhere
+    with pytest.raises(InputError, match="is not writable"):
+        check_output(tmp_path / "out")
+
+
+def test_an_error_of_the_file_system_becomes_one_sentence(tmp_path):
+    with pytest.raises(InputError, match=r"out cannot be written \(No space left on device\)"):
+        write_and_raise(tmp_path / "out", OSError(28, "No space left on device"))
+    assert list(tmp_path.iterdir()) == []

@@ -8,12 +8,7 @@ import pytest
 from sfm_shapefit import rigidity
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.laplacian.operators import adjacency
-from sfm_shapefit.rigidity import (
-    is_parallel_rigid,
-    left_out_reasons,
-    parallel_rigid_pieces,
-    rigid_pieces,
-)
+from sfm_shapefit.rigidity import is_parallel_rigid, left_out_reasons, parallel_rigid_pieces, rigid_pieces
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
 
@@ -449,12 +444,7 @@ def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
     seen, place = [], rigidity.game._place_links
     monkeypatch.setattr(rigidity.game, "_place_links", lambda *given: seen.append(place(*given)) or seen[-1])
     game = rigidity.game.Game(
-        num_nodes=4,
-        ends=ends,
-        copies=np.ones(6, np.int64),
-        owner=np.arange(6),
-        num_sets=6,
-        is_whole=False,
+        num_nodes=4, ends=ends, copies=np.ones(6, np.int64), owner=np.arange(6), num_sets=6, is_whole=False
     )
     united, is_final = rigidity.game.play(game, 2)
     assert is_final

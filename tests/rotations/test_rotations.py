@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from peers.colmap import average_rotations
-from sfm_shapefit import LocateOptions
 from sfm_shapefit.colmap.model import read_model, with_turned_cameras
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.geometry import normalized, rotation_angles_deg
@@ -203,7 +202,7 @@ def turned_courtyard():
 
 
 def located(model, **options):
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", options=LocateOptions(**options))
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", **options)
     return found, sfm_shapefit.evaluate(found.reconstruction, COURTYARD / "truth")
 
 
@@ -241,18 +240,17 @@ def test_the_models_own_tracks_serve_as_well():
     model = read_model(RING / "sparse" / "0")
     turned = with_turned_cameras(model, random_turns(model.num_images, 0.2, 1)).reconstruction
     options = {"directions": "tracks"}
-    plain = sfm_shapefit.locate(turned, options=LocateOptions(**options))
-    refined = sfm_shapefit.locate(turned, options=LocateOptions(refine_rotations=True, **options))
-    before, after = (
-        sfm_shapefit.evaluate(one.reconstruction, RING / "sparse" / "0") for one in (plain, refined)
-    )
+    plain = sfm_shapefit.locate(turned, **options)
+    refined = sfm_shapefit.locate(turned, refine_rotations=True, **options)
+    truth = RING / "sparse" / "0"
+    before, after = (sfm_shapefit.evaluate(one.reconstruction, truth) for one in (plain, refined))
     assert after.rotation_deg.median < 0.25 * before.rotation_deg.median
 
 
 def test_averaged_rotations_of_a_real_scene_get_better():
     scene = real_scene("fountain-P11")
     model = average_rotations(scene / "database.db", scene / "sparse" / "0")
-    found = sfm_shapefit.locate(model, scene / "database.db", options=LocateOptions(refine_rotations=True))
+    found = sfm_shapefit.locate(model, scene / "database.db", refine_rotations=True)
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
     assert errors.position.median < 0.003
     assert errors.position.max < 0.008

@@ -6,6 +6,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from scripts.make_data import SCENES, write_scene
 from sfm_shapefit import evaluate, locate
 from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.errors import InputError
@@ -213,8 +214,6 @@ def test_images_to_mapping_to_locate_to_bundle_adjustment_ends_at_the_truth(draw
 
 
 def test_repeated_houses_make_verified_pairs_that_are_really_wrong():
-    from scripts.make_data import SCENES
-
     bundled = SCENES["photographed"]
     judged = judge_matches(make_rendered_scene(bundled.scene, bundled.render), PHOTOGRAPHED / "database.db")
     wrong = np.flatnonzero(judged.pair_is_wrong)
@@ -244,8 +243,6 @@ def test_rotations_averaged_from_the_photographs_alone_place_the_median_camera()
 
 @pytest.mark.slow
 def test_the_bundled_photographed_scene_is_what_its_command_makes(tmp_path):
-    from scripts.make_data import write_scene
-
     write_scene("photographed", tmp_path / "made")
     files = [
         sorted(p.relative_to(root) for p in root.rglob("*")) for root in (tmp_path / "made", PHOTOGRAPHED)

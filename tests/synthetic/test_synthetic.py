@@ -1,18 +1,19 @@
 """Synthetic scenes are what they say: visible, noisy and wrong exactly where and as much as asked."""
 
 import contextlib
-import importlib.util
 import shutil
 import sqlite3
 from dataclasses import fields, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pycolmap
 import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
+from scripts.make_data import SCENES, write_scene
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import (
@@ -33,8 +34,8 @@ from sfm_shapefit.synthetic import (
     trajectory_graph_problem,
 )
 from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.scenes import BUNDLED
 
-ROOT = Path(__file__).parents[2]
 SHAPES = ("ring", "facade", "drive", "cloud", "courtyard")
 
 
@@ -107,12 +108,8 @@ def test_no_keypoint_lies_outside_its_image_even_with_noise_and_corruption(shape
 
 def test_pixel_noise_has_the_size_asked_for():
     scene = scene_of("facade", pixel_noise_px=0.5)
-    errors = np.concatenate(
-        [
-            xy - pinhole(scene, image, scene.points[points])[0]
-            for image, (xy, points) in enumerate(zip(scene.keypoints, scene.keypoint_points, strict=True))
-        ]
-    )
+    shown = enumerate(zip(scene.keypoints, scene.keypoint_points, strict=True))
+    errors = np.concatenate([xy - pinhole(scene, k, scene.points[points])[0] for k, (xy, points) in shown])
     # More than 5000 draws: the standard error of the standard deviation is below 1 %.
     assert errors.size > 5000
     assert errors.std() == pytest.approx(0.5, rel=0.05)
@@ -340,10 +337,7 @@ def test_model_points_have_the_tracks_and_colours_of_the_scene(tmp_path):
     for point_id, point in model.points3D.items():
         np.testing.assert_array_equal(point.xyz, scene.points[point_id - 1])
         np.testing.assert_array_equal(point.color, scene.colors[point_id - 1])
-        shown_as = [
-            scene.keypoint_points[element.image_id - 1][element.point2D_idx]
-            for element in point.track.elements
-        ]
+        shown_as = [scene.keypoint_points[e.image_id - 1][e.point2D_idx] for e in point.track.elements]
         assert shown_as == [point_id - 1] * seen[point_id - 1]
     # Mean length of a two-dimensional normal error of 0.5 px: 0.5 sqrt(pi / 2) = 0.63 px.
     assert model.compute_mean_reprojection_error() == pytest.approx(0.627, rel=0.1)
@@ -373,44 +367,34 @@ def test_stored_e_and_f_annul_the_true_matches_and_poses_are_null_by_default(tmp
         np.testing.assert_allclose(np.linalg.svd(essential)[1], [1.0, 1.0, 0.0], atol=1e-12)
 
 
-def test_a_rotations_model_has_all_centres_at_the_origin_no_points_and_the_truth_beside_it(tmp_path):
-    scene = scene_of("courtyard", rotation_noise_deg=0.5)
-    write_workspace(scene, tmp_path / "out", WorkspaceOptions(model="rotations"))
-    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    truth = pycolmap.Reconstruction(tmp_path / "out/truth")
-    assert model.num_points3D() == 0
+@pytest.mark.parametrize(
+    ("shape", "options"),
+    [("courtyard", WorkspaceOptions(model="rotations")), ("facade", WorkspaceOptions(database=False))],
+    ids=["rotations", "full"],
+)
+def test_a_perturbed_model_has_the_truth_beside_it_and_of_rotations_only_no_points(tmp_path, shape, options):
+    scene = scene_of(shape, rotation_noise_deg=0.5)
+    write_workspace(scene, tmp_path / "out", options)
+    model, truth = (pycolmap.Reconstruction(tmp_path / "out" / name) for name in ("sparse/0", "truth"))
     assert model.num_reg_images() == truth.num_reg_images() == scene.num_images
     for index in range(scene.num_images):
-        pose, exact = (m.images[index + 1].cam_from_world() for m in (model, truth))
-        np.testing.assert_array_equal(pose.translation, 0.0)
-        np.testing.assert_allclose(pose.rotation.matrix(), scene.stated_rotations[index], atol=1e-14)
-        np.testing.assert_allclose(exact.rotation.matrix(), scene.rotations[index], atol=1e-14)
-        center = truth.images[index + 1].projection_center()
-        np.testing.assert_allclose(center, scene.centers[index], atol=1e-12)
-
-
-def test_a_perturbed_full_model_keeps_centres_and_points_and_has_the_truth_beside_it(tmp_path):
-    scene = scene_of("facade", rotation_noise_deg=0.5)
-    write_workspace(scene, tmp_path / "out", WorkspaceOptions(database=False))
-    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    truth = pycolmap.Reconstruction(tmp_path / "out/truth")
-    for index in range(scene.num_images):
-        image = model.images[index + 1]
-        np.testing.assert_allclose(image.projection_center(), scene.centers[index], atol=1e-12)
-        rotation = image.cam_from_world().rotation.matrix()
-        np.testing.assert_allclose(rotation, scene.stated_rotations[index], atol=1e-14)
-    assert set(model.points3D) == set(truth.points3D)
-    assert model.compute_mean_reprojection_error() > 3.0 * truth.compute_mean_reprojection_error()
+        image, exact = (m.images[index + 1] for m in (model, truth))
+        rotations = [i.cam_from_world().rotation.matrix() for i in (image, exact)]
+        expected = [scene.stated_rotations[index], scene.rotations[index]]
+        np.testing.assert_allclose(rotations, expected, atol=1e-14)
+        np.testing.assert_allclose(exact.projection_center(), scene.centers[index], atol=1e-12)
+        if options.model == "rotations":
+            np.testing.assert_array_equal(image.cam_from_world().translation, 0.0)
+        else:
+            np.testing.assert_allclose(image.projection_center(), scene.centers[index], atol=1e-12)
+    if options.model == "rotations":
+        assert model.num_points3D() == 0
+    else:
+        assert set(model.points3D) == set(truth.points3D)
+        assert model.compute_mean_reprojection_error() > 3.0 * truth.compute_mean_reprojection_error()
 
 
 # --- bundled scenes --------------------------------------------------------------------------------------
-
-
-def make_data() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("make_data", ROOT / "scripts/make_data.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
 
 
 def assert_models_equal(made: Path, bundled: Path) -> None:
@@ -421,9 +405,8 @@ def assert_models_equal(made: Path, bundled: Path) -> None:
         other = two.images[image_id]
         assert image.name == other.name
         # Another processor may round the last bits of a matrix product differently.
-        np.testing.assert_allclose(
-            image.cam_from_world().matrix(), other.cam_from_world().matrix(), rtol=0.0, atol=1e-10
-        )
+        poses = (m.cam_from_world().matrix() for m in (image, other))
+        np.testing.assert_allclose(*poses, rtol=0.0, atol=1e-10)
         assert [p.point3D_id for p in image.points2D] == [p.point3D_id for p in other.points2D]
         xy, other_xy = (np.array([p.xy for p in m.points2D]).reshape(-1, 2) for m in (image, other))
         np.testing.assert_allclose(xy, other_xy, rtol=0.0, atol=1e-8)
@@ -455,8 +438,8 @@ def assert_databases_equal(made: Path, bundled: Path) -> None:
 
 @pytest.mark.parametrize("name", ["courtyard", "ring8", "facade9"])
 def test_a_bundled_scene_is_what_its_command_makes(name, tmp_path):
-    bundled = ROOT / "data_synthetic" / name
-    make_data().write_scene(name, tmp_path / name)
+    bundled = BUNDLED / name
+    write_scene(name, tmp_path / name)
     files = [sorted(p.relative_to(r) for p in r.rglob("*")) for r in (tmp_path / name, bundled)]
     assert files[0] == files[1]
     assert (bundled / "SOURCE.md").read_text() == (tmp_path / name / "SOURCE.md").read_text()
@@ -469,12 +452,12 @@ def test_a_bundled_scene_is_what_its_command_makes(name, tmp_path):
 
 
 def test_bundled_scenes_stay_under_five_megabytes():
-    files = [path for path in (ROOT / "data_synthetic").rglob("*") if path.is_file()]
+    files = [path for path in BUNDLED.rglob("*") if path.is_file()]
     assert sum(path.stat().st_size for path in files) < 5e6
 
 
 def test_the_noise_free_ring_is_bundled_with_enough_pairs_to_be_rigid():
-    scene = make_scene(make_data().SCENES["ring8"].scene)
+    scene = make_scene(SCENES["ring8"].scene)
     # A direction in space is two equations; n positions up to shift and scale are 3 n - 4 unknowns.
     assert 2 * scene.num_pairs >= 3 * scene.num_images - 4
     assert np.bincount(scene.pairs.ravel()).min() >= 3
@@ -494,14 +477,14 @@ def test_500_cameras_and_20000_points_make_a_workspace(tmp_path):
 
 
 FAMILIES = {
-    "random": lambda **kw: random_graph_problem(120, p=0.5, **kw),
-    "box": lambda **kw: box_graph_problem(500, degree=20.0, **kw),
-    "trajectory": lambda **kw: trajectory_graph_problem(500, degree=20.0, **kw),
-    "varying speed": lambda **kw: trajectory_graph_problem(500, degree=20.0, speed_ratio=4.0, **kw),
-    "ring": lambda **kw: ring_graph_problem(300, degree=20.0, **kw),
-    "lawn": lambda **kw: lawn_graph_problem(500, degree=20.0, **kw),
-    "corridor": lambda **kw: corridor_graph_problem(500, degree=20.0, **kw),
-    "community": lambda **kw: community_graph_problem(1200, degree=30.0, **kw),
+    "random": partial(random_graph_problem, 120, p=0.5),
+    "box": partial(box_graph_problem, 500, degree=20.0),
+    "trajectory": partial(trajectory_graph_problem, 500, degree=20.0),
+    "varying speed": partial(trajectory_graph_problem, 500, degree=20.0, speed_ratio=4.0),
+    "ring": partial(ring_graph_problem, 300, degree=20.0),
+    "lawn": partial(lawn_graph_problem, 500, degree=20.0),
+    "corridor": partial(corridor_graph_problem, 500, degree=20.0),
+    "community": partial(community_graph_problem, 1200, degree=30.0),
 }
 
 
@@ -519,15 +502,8 @@ def test_graph_problems_are_simple_connected_and_exact_without_noise(family):
     # Normalised twice: a few roundings.
     np.testing.assert_allclose(problem.directions, true_directions(problem), rtol=0.0, atol=1e-15)
     assert not problem.corrupted.any()
-    reached = np.zeros(len(problem.locations), dtype=bool)
-    reached[0] = True
-    for _ in range(len(reached)):
-        before = reached.sum()
-        touching = reached[i] | reached[j]
-        reached[i[touching]] = reached[j[touching]] = True
-        if reached.sum() == before:
-            break
-    assert reached.all()
+    n = len(problem.locations)
+    assert connected_components(coo_array((np.ones(len(i)), (i, j)), shape=(n, n)), directed=False)[0] == 1
 
 
 @pytest.mark.parametrize("family", FAMILIES)
