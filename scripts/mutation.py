@@ -75,9 +75,6 @@ def files_of(group: str) -> list[str]:
     return [path.relative_to(PACKAGE).as_posix() for path in found]
 
 
-# --- mutants ------------------------------------------------------------------------------------
-
-
 class Mutant(NamedTuple):
     """One change of one file."""
 
@@ -184,9 +181,6 @@ def sample(group: str, count: int, seed: int) -> list[Mutant]:
     return [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
 
 
-# --- plain Python in place of kernels, and changed code in place of the old -----------------------
-
-
 def interpret_kernels(group: str) -> None:
     """Let the kernels of a group be plain functions; call before they are imported."""
     compiled = jit.kernel
@@ -245,9 +239,6 @@ def _rebind(name: str, old: Any, new: Any) -> None:
             setattr(module, name, new)
 
 
-# --- which tests reach what ---------------------------------------------------------------------
-
-
 def place_of(mutant: Mutant) -> str:
     """Return the function that must run for a test to notice: the innermost around, else any of the file."""
     tree = ast.parse((PACKAGE / mutant.path).read_text())
@@ -265,9 +256,6 @@ def places_of(codes: set[CodeType]) -> list[str]:
     prefix = f"{PACKAGE}/"
     names = {f"{code.co_filename}:{code.co_name}" for code in codes if code.co_filename.startswith(prefix)}
     return sorted(name.removeprefix(prefix) for name in names)
-
-
-# --- running ------------------------------------------------------------------------------------
 
 
 class TooSlow(BaseException):

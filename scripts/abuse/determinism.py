@@ -59,8 +59,6 @@ def run(args: argparse.Namespace) -> int:
     return int(failed)
 
 
-# --- the same input --------------------------------------------------------------------------------------
-
 VARIANTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     "again": (("--threads", "1"), {"PYTHONHASHSEED": "0"}),
     "two threads": (("--threads", "2"), {"PYTHONHASHSEED": "0"}),
@@ -111,9 +109,6 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
         check=True,
     )
     return out
-
-
-# --- reordered input -------------------------------------------------------------------------------------
 
 
 def measure_reordering(scene: Path, work: Path, seed: int) -> float:

@@ -148,9 +148,6 @@ class Bench:
             yield f"the output is not whole: {error}"
 
 
-# --- signals ---------------------------------------------------------------------------------------------
-
-
 def signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Problems:
     """Send a signal at random moments of a run; every other run replaces an earlier output."""
     for k, moment in enumerate(moments.tolist()):
@@ -211,9 +208,6 @@ def _after_signal(
         run_forked(bench.locate("-q", out="place/later"), bench.folder, [bench.folder, *caches()])
         shutil.rmtree(bench.folder / "place" / "later")
         yield from (f"after the next run: {problem}" for problem in bench.problems())
-
-
-# --- limits ----------------------------------------------------------------------------------------------
 
 
 def _limit_resource(main: Callable[[], None], what: int, value: int) -> None:
@@ -277,9 +271,6 @@ def little_memory(bench: Bench) -> Problems:
 def _with_memory(main: Callable[[], None], extra: int) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     _limit_resource(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
-
-
-# --- others ----------------------------------------------------------------------------------------------
 
 
 def rivals(bench: Bench, rounds: int) -> Problems:

@@ -113,9 +113,6 @@ def run(args: argparse.Namespace) -> int:
     return int(failed > 0)
 
 
-# --- sound input -----------------------------------------------------------------------------------------
-
-
 def make_base(folder: Path) -> Path:
     """Write a small sound scene in every form that is read, of COLMAP and of others."""
     import pycolmap
@@ -193,9 +190,6 @@ def _command(*arguments: str) -> None:
         result = CliRunner().invoke(app, list(arguments))
     if result.exit_code:
         raise RuntimeError(f"{' '.join(arguments)} failed: {result.output} {result.exception!r}")
-
-
-# --- cases -----------------------------------------------------------------------------------------------
 
 
 def reports(

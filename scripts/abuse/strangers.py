@@ -34,9 +34,6 @@ _TEXT_WAYS: tuple[Callable[[bytes, Generator], bytes], ...] = (
 Damage = tuple[str, tuple[str, ...]]
 
 
-# --- sound files -----------------------------------------------------------------------------------------
-
-
 def write_models(model: Any, folder: Path) -> None:
     """Write a pycolmap reconstruction of pinhole cameras as openMVG, OpenSfM and Bundler do."""
     (camera,) = model.cameras.values()
@@ -146,9 +143,6 @@ def _rotation_vector(quaternion_xyzw: np.ndarray) -> np.ndarray:
 
 def _words(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
-
-
-# --- damage ----------------------------------------------------------------------------------------------
 
 
 def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:

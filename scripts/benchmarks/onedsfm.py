@@ -99,7 +99,6 @@ def checks(_one: Outcome) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Outcome], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield next(iter(measured.values())).source
     yield PUBLISHED
     yield table_of(

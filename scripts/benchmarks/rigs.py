@@ -55,7 +55,6 @@ class Drives:
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `rigs`."""
     parser.add_argument("--images", type=positive, default=90, help="of a drive, six per metre and a half")
 
 
@@ -138,7 +137,6 @@ def checks(_one: Drives) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Drives], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         f"Two vehicles with three cameras each, {args.images} images, {args.repeats} drives: medians over"
         " these, and the worst camera of all. No position is given to anyone; `locate` is given rotations."

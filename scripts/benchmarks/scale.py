@@ -157,11 +157,7 @@ def find_settled(values: Sequence[float], limit: float) -> int | None:
     return first if first <= len(values) else None
 
 
-# --- the cases -------------------------------------------------------------------------------------
-
-
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `scale`."""
     parser.add_argument("--million", action="store_true", help="also a geometric graph of 1e6 cameras")
     parser.add_argument("--plot", type=Path, help="the plot's file (docs/scale.png)")
 
@@ -178,9 +174,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         family, n = name.split("-")
         found[f"rigid {name}"] = partial(search, GraphSpec(family=family, n=int(n), degree=degree))
     return found
-
-
-# --- measuring -------------------------------------------------------------------------------------
 
 
 def save_problem(spec: GraphSpec, file: Path) -> None:
@@ -274,9 +267,6 @@ def draw_edges(spec: GraphSpec) -> object:
     return draw(spec).edges
 
 
-# --- what is to be reached -------------------------------------------------------------------------
-
-
 def checks(one: Measured | Search) -> list[Check]:
     """Return the limits of one case; of solves, only `auto` has any."""
     if isinstance(one, Search):
@@ -316,11 +306,7 @@ def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> l
     return sorted(chosen, key=lambda one: one.problem.spec.n)
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section, and draw the plot."""
     solves = [one for one in measured.values() if isinstance(one, Measured)]
     searches = [one for one in measured.values() if isinstance(one, Search)]
     if solves:

@@ -174,9 +174,6 @@ def first_solve() -> float:
     return time.perf_counter() - start
 
 
-# --- measuring -------------------------------------------------------------------------------------
-
-
 def solve_ours(graph: "ViewGraph", tol: float, method: str = "newton") -> "SolverResult":
     """Solve and certify with our solver."""
     return ours.solve(graph, solver=method, tol=tol)
@@ -318,9 +315,6 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     )
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(one: Compared | RealGraph | FirstSolve) -> list[Check]:
     """Return the limits of one case."""
     if isinstance(one, RealGraph):
@@ -351,7 +345,6 @@ def real_checks(one: RealGraph) -> list[Check]:
 def tables(
     measured: Mapping[str, Compared | RealGraph | FirstSolve], _args: argparse.Namespace
 ) -> Iterator[str]:
-    """Yield the parts of the section."""
     compared = [one for one in measured.values() if isinstance(one, Compared)]
     real = [one for one in measured.values() if isinstance(one, RealGraph)]
     for one in measured.values():

@@ -108,9 +108,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     return found
 
 
-# --- calibration -----------------------------------------------------------------------------------
-
-
 def calibrate_graph(name: str, wrong: float, seeds: int) -> Calibration:
     """Compare errors with standard deviations on graphs of one kind."""
     ratios = [graph_ratios(GRAPHS[name](seed, wrong)) for seed in range(seeds)]
@@ -166,9 +163,6 @@ def scene_ratios(shape: str, seed: int) -> "FloatArray":
     return _placement_ratios(found.placement, scene.centers)
 
 
-# --- ranking ---------------------------------------------------------------------------------------
-
-
 def rank(name: str, seeds: int) -> Ranking:
     """Rank the cameras of spoiled graphs by their trust."""
     found = [rank_graph(SPOILED[name](seed)) for seed in range(seeds)]
@@ -196,9 +190,6 @@ def rank_graph(graph: Graph) -> tuple[float, int]:
     errors = np.linalg.norm(fit_similarity_l1(found, truth, rotate=False).apply(found) - truth, axis=1)
     bad = errors > BAD * np.median(errors)
     return area_under_curve(placement.assessment.trust, bad) if bad.any() else 0.0, int(bad.sum())
-
-
-# --- synthetic problems ----------------------------------------------------------------------------
 
 
 def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
@@ -294,9 +285,6 @@ SPOILED: dict[str, Callable[[int], Graph]] = {
 }
 
 
-# --- real scenes -----------------------------------------------------------------------------------
-
-
 def flag(folder: Path) -> Flagged:
     """Locate the cameras of a set and compare those left out with the wrong rotations."""
     import sfm_shapefit
@@ -331,9 +319,6 @@ def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray
     return errors
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
     """Return the limits of one case; sets whose truth gives their rotations have none."""
     if isinstance(one, Calibration):
@@ -356,7 +341,6 @@ def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
 def tables(
     measured: Mapping[str, Calibration | Ranking | Flagged], _args: argparse.Namespace
 ) -> Iterator[str]:
-    """Yield the parts of the section."""
     found = list(measured.values())
     yield "## Standard deviations"
     yield table_of(

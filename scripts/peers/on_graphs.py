@@ -86,9 +86,6 @@ class Compared:
     answers: tuple[Answer, ...]
 
 
-# --- running ---------------------------------------------------------------------------------------
-
-
 def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
     """Return a contender's answer, or why there is none."""
     empty = Answer(name=contender.name, ours=contender.package is None)
@@ -107,8 +104,6 @@ def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
         return replace(empty, note=f"failed: {reason}")
     return replace(empty, error=error, seconds=seconds, cpu_s=cpu_s, note=note, peak_mb=peak_mb)
 
-
-# --- the contenders --------------------------------------------------------------------------------
 
 Solver = Callable[[], tuple["FloatArray", str]]
 """Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
@@ -218,9 +213,6 @@ CONTENDERS = (
 )
 
 
-# --- measuring -------------------------------------------------------------------------------------
-
-
 def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float]:
     """Return error, seconds, CPU seconds, note and peak memory; to be called once per process."""
     contender = next(one for one in CONTENDERS if one.name == name)
@@ -271,9 +263,6 @@ def _silence() -> Iterator[None]:
             os.dup2(descriptor, target)
             os.close(descriptor)
         os.close(nowhere)
-
-
-# --- what is to be reached -------------------------------------------------------------------------
 
 
 def best_of_ours(one: Compared) -> Answer | None:
