@@ -21,23 +21,8 @@ _COLUMNS = {
     "two_view_geometries": ("pair_id", "rows", "cols", "data", "config", "qvec", "tvec"),
 }
 ODD_VALUES = (
-    None,
-    -1,
-    0,
-    1,
-    2**31,
-    2**62,
-    2**63 - 1,
-    -(2**63),
-    0.5,
-    2.0,
-    1e308,
-    float("inf"),
-    "",
-    "x",
-    "2",
-    b"",
-    b"\0",
+    *(None, -1, 0, 1, 2**31, 2**62, 2**63 - 1, -(2**63), 0.5, 2.0, 1e308, float("inf")),
+    *("", "x", "2", b"", b"\0"),
 )
 
 # Which columns two_view_geometries had in which release; all have been read in the wild.
