@@ -20,7 +20,7 @@ from pathlib import Path
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case, if_there
-from harness.metrics import Check, Quantity, median, number, numbers, ratio, verdict
+from harness.metrics import Check, Quantity, check_all, median, number, numbers, ratio, verdict
 from harness.process import peak_memory_mb
 from harness.record import table_of
 
@@ -226,12 +226,8 @@ def compare(reconstruction: object, truth: Path) -> Errors:
 
 def _error_checks(errors: Errors, limits: tuple[float, float] | None) -> list[Check]:
     """Return the checks of median and mean, if they have limits."""
-    if limits is None:
-        return []
-    return [
-        Check(name="median", value=errors.median, limit=limits[0]),
-        Check(name="mean", value=errors.mean, limit=limits[1]),
-    ]
+    values = {"median": errors.median, "mean": errors.mean}
+    return check_all(values, dict(zip(values, limits or (), strict=False)))
 
 
 def adjusted_checks(one: Measured) -> list[Check]:
