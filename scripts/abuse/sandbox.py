@@ -78,12 +78,8 @@ def start_forked(
 ) -> Child:
     """Call a function in a forked child, and return as soon as it is called.
 
-    Args:
-        function: SystemExit gives the exit code; any other exception a traceback on stderr and code 1.
-        work: an existing folder that becomes the working directory; what the child prints is kept beside it.
-        writable: folders in which the child may change files.
-        encoding: of the child's standard streams.
-        logs: distinguishes children at work at the same time.
+    SystemExit gives the exit code, any other exception a traceback on stderr and code 1. The folder `work`
+    becomes the working directory; what the child prints is kept beside it, and `logs` tells children apart.
     """
     kinds = ("stdout", "stderr", "deeds")
     paths = tuple(work.parent / f"{work.name}.{logs}.{kind}" for kind in kinds)
