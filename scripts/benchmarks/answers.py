@@ -163,11 +163,9 @@ def _model(folder: Path) -> dict[str, Any]:
 def _table(path: Path) -> dict[str, list[str]]:
     """Return the columns of a table, numbers as they are written."""
     with path.open(encoding="utf-8", newline="") as stream:
-        reader = csv.reader(stream)
-        header = next(reader)
-        columns = dict(zip(header, map(list, zip(*reader, strict=True)), strict=False))
-    wanted = _PAIR_COLUMNS if path.name == "pairs.csv" else set(header)
-    return {name: columns.get(name, []) for name in header if name in wanted}
+        header, *rows = csv.reader(stream)
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
+    return {k: v for k, v in columns.items() if path.name != "pairs.csv" or k in _PAIR_COLUMNS}
 
 
 def _digest(path: Path) -> str:
