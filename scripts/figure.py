@@ -24,7 +24,8 @@ def main(argv: Sequence[str] | None = None) -> None:
             add("--trials", type=int, default=5 if name == "theory_plot" else 10, help="problems per setting")
             add("--processes", type=int, default=2, help="worker processes, one thread each")
             add("--cache", type=Path, help="npz that keeps results between runs")
-            module.add_arguments(subparser)
+            if hasattr(module, "add_arguments"):
+                module.add_arguments(subparser)
     args = parser.parse_args(words)
     module.run(args)
 

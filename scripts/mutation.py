@@ -18,6 +18,7 @@ Outcomes are kept in FOLDER, and what is there is not run again.
 
 import argparse
 import ast
+import difflib
 import hashlib
 import importlib
 import inspect
@@ -28,11 +29,10 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from types import FrameType, FunctionType
-from typing import Any
+from types import CodeType, FrameType, FunctionType
+from typing import Any, NamedTuple
 
 from harness.process import thread_environment
 
@@ -75,11 +75,7 @@ def files_of(group: str) -> list[str]:
     return [path.relative_to(PACKAGE).as_posix() for path in found]
 
 
-# --- mutants ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Mutant:
+class Mutant(NamedTuple):
     """One change of one file."""
 
     path: str
@@ -88,9 +84,7 @@ class Mutant:
     line: int
     column: int
 
-    @property
-    def name(self) -> str:
-        """Its name in the record."""
+    def __str__(self) -> str:
         return f"{self.path}:{self.line}:{self.column} {self.operator} {self.occurrence}"
 
 
@@ -140,9 +134,10 @@ def _operators() -> dict[str, Operator]:
 class _Positions(Visitor):  # type: ignore[misc]
     """Lists where an operator can act."""
 
-    def __init__(self, operator: Operator) -> None:
+    def __init__(self, operator: Operator, tree: Any) -> None:
         self.operator = operator
         self.found: list[tuple[int, int]] = []
+        self.walk(tree)
 
     def visit(self, node: Any) -> Any:
         """Note the node's positions."""
@@ -157,13 +152,10 @@ def mutants_of(path: str) -> list[list[Mutant]]:
     tree = get_ast(source)
     places: dict[tuple[str, int, int], list[Mutant]] = {}
     for name, operator in _operators().items():
-        positions = _Positions(operator)
-        positions.walk(tree)
-        kind = name.partition("_")[0]
-        for occurrence, (line, column) in enumerate(positions.found):
+        for occurrence, (line, column) in enumerate(_Positions(operator, tree).found):
             if not any(first <= (line, column) < last for first, last in quiet):
                 mutant = Mutant(path, name, occurrence, line, column)
-                places.setdefault((kind, line, column), []).append(mutant)
+                places.setdefault((name.partition("_")[0], line, column), []).append(mutant)
     return list(places.values())
 
 
@@ -187,9 +179,6 @@ def sample(group: str, count: int, seed: int) -> list[Mutant]:
     rng = random.Random(f"{seed} {group}")
     places = [place for path in files_of(group) for place in mutants_of(path)]
     return [rng.choice(place) for place in rng.sample(places, min(count, len(places)))]
-
-
-# --- plain Python in place of kernels, and changed code in place of the old -----------------------
 
 
 def interpret_kernels(group: str) -> None:
@@ -250,45 +239,23 @@ def _rebind(name: str, old: Any, new: Any) -> None:
             setattr(module, name, new)
 
 
-# --- which tests reach what ---------------------------------------------------------------------
-
-
-def functions_of(path: str) -> list[tuple[int, int, int, str]]:
-    """Return (first line of its code, first line, last line, name) of each function of a file."""
-    tree = ast.parse((PACKAGE / path).read_text())
-    return [
-        (min([n.lineno, *(d.lineno for d in n.decorator_list)]), n.lineno, n.end_lineno or n.lineno, n.name)
-        for n in ast.walk(tree)
-        if isinstance(n, ast.FunctionDef)
+def place_of(mutant: Mutant) -> str:
+    """Return the function that must run for a test to notice: the innermost around, else any of the file."""
+    tree = ast.parse((PACKAGE / mutant.path).read_text())
+    around = [
+        (node.lineno, node.name)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.FunctionDef)
+        and min([node.lineno, *(d.lineno for d in node.decorator_list)]) <= mutant.line <= node.end_lineno
     ]
+    return f"{mutant.path}:{max(around, default=(0, ''))[1]}"
 
 
-def places_reached_by(mutant: Mutant) -> set[str]:
-    """Return the functions of which one must run for a test to notice: that around, else all of the file."""
-    functions = functions_of(mutant.path)
-    around = [f for f in functions if f[0] <= mutant.line <= f[2]]
-    chosen = [max(around)] if around else functions
-    return {f"{mutant.path}:{name}" for *_, name in chosen}
-
-
-class _Observer:
-    """Notes which functions of the mutated packages run."""
-
-    def __init__(self) -> None:
-        self.codes: set[Any] = set()
-
-    def __call__(self, frame: FrameType, event: str, _argument: Any) -> None:
-        if event == "call":
-            self.codes.add(frame.f_code)
-
-    def places(self) -> list[str]:
-        """Return them as FILE:FUNCTION."""
-        prefix = str(PACKAGE) + "/"
-        codes = [code for code in self.codes if code.co_filename.startswith(prefix)]
-        return sorted({f"{code.co_filename.removeprefix(prefix)}:{code.co_name}" for code in codes})
-
-
-# --- running ------------------------------------------------------------------------------------
+def places_of(codes: set[CodeType]) -> list[str]:
+    """Return the functions of the package among these, as FILE:FUNCTION."""
+    prefix = f"{PACKAGE}/"
+    names = {f"{code.co_filename}:{code.co_name}" for code in codes if code.co_filename.startswith(prefix)}
+    return sorted(name.removeprefix(prefix) for name in names)
 
 
 class TooSlow(BaseException):
@@ -301,8 +268,8 @@ class Runner:
     def __init__(self, args: argparse.Namespace) -> None:
         self.args = args
         self.failed = False
-        self.state: Path = args.state
-        self.state.mkdir(parents=True, exist_ok=True)
+        self.items: dict[str, Any] = {}
+        args.state.mkdir(parents=True, exist_ok=True)
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Note a failure."""
@@ -310,32 +277,47 @@ class Runner:
 
     def pytest_runtestloop(self, session: Any) -> bool:
         """Time the tests, then run the mutants."""
-        baseline = self._baseline(session.items)
-        usable = {key: row for key, row in baseline.items() if row["passed"]}
-        print(f"{len(usable)} of {len(session.items)} tests are quick enough and pass uncompiled", flush=True)
-        items = {item.nodeid: item for item in session.items}
-        self._run_group(self.args.group, items, usable)
+        self.items = {item.nodeid: item for item in session.items}
+        usable = {key: row for key, row in self._time_tests().items() if row["passed"]}
+        print(f"{len(usable)} of {len(self.items)} tests are quick enough and pass uncompiled", flush=True)
+        self._run_mutants(self._keep_sound(usable))
         return True
 
-    def _baseline(self, items: list[Any]) -> dict[str, Any]:
-        record = self.state / f"tests_{self.args.group}.json"
+    def _keep(self, name: str, keys: Sequence[str], ask: Callable[[str], Any]) -> dict[str, Any]:
+        """Return the answer of each key: what a file of the state has, or what is asked and put there."""
+        record = self.args.state / f"{name}.json"
         known = json.loads(record.read_text()) if record.exists() else {}
-        sources = "".join((PACKAGE / path).read_text() for path in files_of(self.args.group))
-        for item in items:
-            text = sources + inspect.getsource(item.function)
-            key = hashlib.sha256(text.encode()).hexdigest()[:12]
-            if known.get(item.nodeid, {}).get("key") != key:
-                seen = self._observe(item)
-                if not seen["passed"] and seen["seconds"] > LONGEST_TEST_S:
-                    # What it had to load or compile is there now.
-                    seen = self._observe(item)
-                known[item.nodeid] = {"key": key, **seen}
+        for key in keys:
+            if key not in known:
+                known[key] = ask(key)
                 record.write_text(json.dumps(known, indent=0))
-        return {item.nodeid: known[item.nodeid] for item in items}
+        return {key: known[key] for key in keys}
+
+    def _time_tests(self) -> dict[str, Any]:
+        """Observe every test that is not recorded for these sources."""
+        sources = "".join((PACKAGE / path).read_text() for path in files_of(self.args.group))
+        of_key = {}
+        for name, item in self.items.items():
+            text = sources + inspect.getsource(item.function)
+            of_key[f"{name} {hashlib.sha256(text.encode()).hexdigest()[:12]}"] = item
+
+        def observe(key: str) -> dict[str, Any]:
+            seen = self._observe(of_key[key])
+            # What it had to load or compile is there now.
+            is_late = not seen["passed"] and seen["seconds"] > LONGEST_TEST_S
+            return self._observe(of_key[key]) if is_late else seen
+
+        rows = self._keep(f"tests_{self.args.group}", [*of_key], observe)
+        return {of_key[key].nodeid: row for key, row in rows.items()}
 
     def _observe(self, item: Any) -> dict[str, Any]:
         """Run one test with an observer."""
-        observer, self.failed = _Observer(), False
+        codes: set[CodeType] = set()
+        self.failed = False
+
+        def note(frame: FrameType, event: str, _argument: Any) -> None:
+            if event == "call":
+                codes.add(frame.f_code)
 
         def too_slow(*_: Any) -> None:
             raise TooSlow
@@ -343,7 +325,7 @@ class Runner:
         signal.signal(signal.SIGVTALRM, too_slow)
         signal.setitimer(signal.ITIMER_VIRTUAL, LONGEST_TEST_S)
         start = time.process_time()
-        sys.setprofile(observer)
+        sys.setprofile(note)
         try:
             item.ihook.pytest_runtest_protocol(item=item, nextitem=None)
         except TooSlow:
@@ -353,56 +335,45 @@ class Runner:
             signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
         seconds = time.process_time() - start
         print(f"{seconds:6.2f} s {'-' if self.failed else '+'} {item.nodeid}", flush=True)
-        return {"seconds": seconds, "passed": not self.failed, "places": observer.places()}
+        return {"seconds": seconds, "passed": not self.failed, "places": places_of(codes)}
 
-    def _run_group(self, group: str, items: dict[str, Any], usable: dict[str, Any]) -> None:
-        record = self.state / f"{group}.json"
-        known = json.loads(record.read_text()) if record.exists() else {}
-        mutants = sample(group, self.args.per_group, self.args.seed)
-        usable = self._keep_sound(items, usable)
-        for mutant in mutants:
-            outcome = known.get(mutant.name)
-            if outcome is None:
-                known[mutant.name] = outcome = self._try(mutant, items, usable)
-                record.write_text(json.dumps(known, indent=0))
-                print(f"{outcome[0]:9}{mutant.name}  {outcome[1]}", flush=True)
-        outcomes = [known[mutant.name][0] for mutant in mutants]
-        survived = outcomes.count("survived")
-        print(
-            f"{group}: {len(outcomes) - survived} of {len(outcomes)} found, "
-            f"{outcomes.count('endless')} by time"
-        )
-        for mutant in mutants:
-            if known[mutant.name][0] == "survived":
-                print(f"\n{mutant.name}\n{known[mutant.name][2]}", flush=True)
+    def _run_mutants(self, usable: dict[str, Any]) -> None:
+        """Try every mutant that has no outcome yet, and print what survives."""
+        mutants = {str(one): one for one in sample(self.args.group, self.args.per_group, self.args.seed)}
+        outcomes = self._keep(self.args.group, [*mutants], lambda key: self._try(mutants[key], usable))
+        survived = [name for name, outcome in outcomes.items() if outcome[0] == "survived"]
+        print(f"{self.args.group}: {len(outcomes) - len(survived)} of {len(outcomes)} found")
+        for name in survived:
+            print(f"\n{name}\n{outcomes[name][2]}", flush=True)
 
-    def _keep_sound(self, items: dict[str, Any], usable: dict[str, Any]) -> dict[str, Any]:
+    def _keep_sound(self, usable: dict[str, Any]) -> dict[str, Any]:
         """Return the tests that pass in a fork with unchanged code in place; others would find anything."""
         sources = {path: (PACKAGE / path).read_text() for path in files_of(self.args.group)}
-        usable = dict(usable)
         while True:
             seconds = sum(row["seconds"] for row in usable.values())
-            verdict, by = self._run_forked(sources, [items[key] for key in usable], seconds)
+            verdict, by = self._run_forked(sources, [self.items[key] for key in usable], seconds)
             if verdict == "survived":
                 return usable
             if by not in usable:
                 raise RuntimeError(f"unchanged code is {verdict} {by}")
             print(f"{by} fails in a fork with unchanged code, and is left out", flush=True)
-            del usable[by]
+            usable = {key: row for key, row in usable.items() if key != by}
 
-    def _try(self, mutant: Mutant, items: dict[str, Any], usable: dict[str, Any]) -> list[str]:
+    def _try(self, mutant: Mutant, usable: dict[str, Any]) -> list[str]:
         """Return (found, endless or survived; by which test; the changed line) of a mutant."""
         source = (PACKAGE / mutant.path).read_text()
         changed = mutate_code(source, _operators()[mutant.operator], mutant.occurrence)
-        places = places_reached_by(mutant)
-        reaching = [key for key in usable if places.intersection(usable[key]["places"])]
+        place = place_of(mutant)
+        # A place without a function is reached by all that runs in the file.
+        reaching = [row | {"key": key} for key, row in usable.items() if _reaches(row["places"], place)]
         chosen, seconds = [], 0.0
-        for key in sorted(reaching, key=lambda k: float(usable[k]["seconds"])):
-            if seconds + usable[key]["seconds"] <= BUDGET_S:
-                chosen.append(items[key])
-                seconds += usable[key]["seconds"]
-        verdict, by = self._run_forked({mutant.path: changed}, chosen, seconds)
-        return [verdict, by, _difference(source, changed)]
+        for row in sorted(reaching, key=lambda row: float(row["seconds"])):
+            if seconds + row["seconds"] <= BUDGET_S:
+                chosen.append(self.items[row["key"]])
+                seconds += row["seconds"]
+        outcome = [*self._run_forked({mutant.path: changed}, chosen, seconds), _difference(source, changed)]
+        print(f"{outcome[0]:9}{mutant}  {outcome[1]}", flush=True)
+        return outcome
 
     def _run_forked(self, sources: dict[str, str], chosen: list[Any], seconds: float) -> tuple[str, str]:
         read, write = os.pipe()
@@ -438,12 +409,15 @@ class Runner:
         return ""
 
 
+def _reaches(places: Sequence[str], place: str) -> bool:
+    """Return whether a function ran, or, of a place that is a file alone, any of that file."""
+    return place in places or (place.endswith(":") and any(one.startswith(place) for one in places))
+
+
 def _difference(before: str, after: str) -> str:
     """Return the lines that differ."""
-    old, new = before.splitlines(), after.splitlines()
-    if len(old) != len(new):
-        return "(several lines)"
-    return "\n".join(f"- {a.strip()}\n+ {b.strip()}" for a, b in zip(old, new, strict=True) if a != b)
+    changes = difflib.ndiff(before.splitlines(), after.splitlines())
+    return "\n".join(line for line in changes if line.startswith(("- ", "+ ")))
 
 
 def main() -> int:

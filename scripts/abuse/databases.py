@@ -21,23 +21,8 @@ _COLUMNS = {
     "two_view_geometries": ("pair_id", "rows", "cols", "data", "config", "qvec", "tvec"),
 }
 ODD_VALUES = (
-    None,
-    -1,
-    0,
-    1,
-    2**31,
-    2**62,
-    2**63 - 1,
-    -(2**63),
-    0.5,
-    2.0,
-    1e308,
-    float("inf"),
-    "",
-    "x",
-    "2",
-    b"",
-    b"\0",
+    *(None, -1, 0, 1, 2**31, 2**62, 2**63 - 1, -(2**63), 0.5, 2.0, 1e308, float("inf")),
+    *("", "x", "2", b"", b"\0"),
 )
 
 # Which columns two_view_geometries had in which release; all have been read in the wild.
@@ -176,11 +161,8 @@ def _change_blob(data: bytes, column: str, is_float: bool, rng: Generator) -> by
             return change_bytes(data, rng)
         case _:
             layout = "<f4" if is_float else "<u4" if column == "data" else "<f8"
-            odd = (
-                (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0)
-                if layout != "<u4"
-                else (0, 2**31, 2**32 - 1, 10**6)
-            )
+            floats = (np.nan, np.inf, -np.inf, 3e38, -3e38, 0.0)
+            odd = floats if layout != "<u4" else (0, 2**31, 2**32 - 1, 10**6)
             values = np.frombuffer(data[: len(data) // 8 * 8], dtype=layout).copy()
             values[rng.random(len(values)) < pick(rng, (0.01, 0.3, 1.0))] = pick(rng, odd)
             return values.tobytes()

@@ -59,8 +59,6 @@ def run(args: argparse.Namespace) -> int:
     return int(failed)
 
 
-# --- the same input --------------------------------------------------------------------------------------
-
 VARIANTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
     "again": (("--threads", "1"), {"PYTHONHASHSEED": "0"}),
     "two threads": (("--threads", "2"), {"PYTHONHASHSEED": "0"}),
@@ -113,9 +111,6 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
     return out
 
 
-# --- reordered input -------------------------------------------------------------------------------------
-
-
 def measure_reordering(scene: Path, work: Path, seed: int) -> float:
     """Return by how much of the extent positions move when everything is listed in another order."""
     from sfm_shapefit.commands.locate import locate
@@ -143,12 +138,7 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     source, model = scene / "sparse" / "0", target / "sparse" / "0"
     model.mkdir(parents=True)
     data = {name: (source / f"{name}.bin").read_bytes() for name in MODEL_FILES}
-    images = _values(
-        data["images"], [f for f in binary_fields("images", data["images"]) if f.meaning == "id"]
-    )
-    points = _values(
-        data["points3D"], [f for f in binary_fields("points3D", data["points3D"]) if f.meaning == "id"]
-    )
+    images, points = (_ids(data[name], name) for name in ("images", "points3D"))
     image_ids = dict(zip(images, (1 + rng.permutation(2 * len(images)))[: len(images)].tolist(), strict=True))
     point_ids = dict(zip(points, (1 + rng.permutation(len(points))).tolist(), strict=True))
     for name in MODEL_FILES:
@@ -158,8 +148,12 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     return target
 
 
-def _values(data: bytes, fields: list[Field]) -> list[int]:
-    return [int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0]) for field in fields]
+def _ids(data: bytes, name: str) -> list[int]:
+    return [_value(data, field) for field in binary_fields(name, data) if field.meaning == "id"]
+
+
+def _value(data: bytes, field: Field) -> int:
+    return int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0])
 
 
 def _reorder_file(
@@ -176,7 +170,7 @@ def _reorder_file(
     fields, changed = binary_fields(name, data), bytearray(data)
     for field in fields:
         if (name, field.meaning) in maps:
-            (value,) = _values(data, [field])
+            value = _value(data, field)
             renamed = maps[name, field.meaning].get(value, value)  # no point: stays
             struct.pack_into(f"<{field.kind}", changed, field.offset, renamed)
     starts = [field.offset for field in fields if field.meaning == "id"]

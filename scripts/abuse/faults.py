@@ -24,7 +24,7 @@ import numpy as np
 
 from abuse import verdicts
 from abuse.fuzz import caches, command_line, make_base, warm
-from abuse.sandbox import Outcome, run_forked, start_forked
+from abuse.sandbox import Child, Outcome, run_forked, start_forked
 
 HELP = "signals, full disks, little memory, rivals and locks while a command runs"
 _PROJECT = Path(__file__).resolve().parents[2]
@@ -54,14 +54,10 @@ def run(args: argparse.Namespace) -> int:
         rng = np.random.default_rng(args.seed)
         checks: dict[str, Callable[[], Problems]] = {
             **{
-                f"{number.name} at {args.moments} moments": partial(
-                    signals, bench, number, rng.random(args.moments)
-                )
-                for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-            },
-            **{
-                f"{number.name} at {args.cold} moments of a cold process": partial(
-                    cold_signals, bench, number, rng.random(args.cold)
+                f"{number.name} at {count} moments{words}": partial(check, bench, number, rng.random(count))
+                for check, count, words in (
+                    (signals, args.moments, ""),
+                    (cold_signals, args.cold, " of a cold process"),
                 )
                 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
             },
@@ -98,7 +94,7 @@ class Bench:
     def _sound_run_s(self) -> float:
         self.prepare()
         start = time.perf_counter()
-        outcome = run_forked(self.locate(), self.folder, [self.folder, *caches()])
+        outcome = run_forked(self.locate(), self.folder, self.writable())
         if outcome.code:
             raise RuntimeError(f"the sound run failed: {outcome.stderr}")
         return time.perf_counter() - start
@@ -119,6 +115,22 @@ class Bench:
     def locate(self, *extra: str, out: str = "place/out") -> Callable[[], None]:
         """Return the command as a function for a child."""
         return partial(command_line, self.arguments(*extra, out=out), self.folder / "tmp")
+
+    def start(self, *extra: str, logs: str = "log") -> Child:
+        """Start the command in a child."""
+        return start_forked(self.locate(*extra), self.folder, self.writable(), logs=logs)
+
+    def writable(self) -> list[Path]:
+        """Return where a child may write."""
+        return [self.folder, *caches()]
+
+    def judge(self, main: Callable[[], None], label: str, cut: int | None = None) -> Problems:
+        """Run a disturbed command: it must succeed or say one sentence, of which `cut` bytes may be kept."""
+        outcome = self.note(run_forked(main, self.folder, self.writable()))
+        is_cut = cut is not None and len(outcome.stderr) >= cut
+        if outcome.code not in (0, 3) or (outcome.stderr.count("\n") != outcome.code // 3 and not is_cut):
+            yield f"{label}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
+        yield from self.problems()
 
     def note(self, outcome: Outcome) -> Outcome:
         """Count how a run ended."""
@@ -148,9 +160,6 @@ class Bench:
             yield f"the output is not whole: {error}"
 
 
-# --- signals ---------------------------------------------------------------------------------------------
-
-
 def signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Problems:
     """Send a signal at random moments of a run; every other run replaces an earlier output."""
     for k, moment in enumerate(moments.tolist()):
@@ -159,7 +168,7 @@ def signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Proble
         if overwrite:
             run_forked(bench.locate(), bench.folder, [bench.folder])
         extra = ("--overwrite",) if overwrite else ()
-        child = start_forked(bench.locate(*extra), bench.folder, [bench.folder, *caches()])
+        child = bench.start(*extra)
         time.sleep(moment * 1.05 * bench.duration_s)
         os.kill(child.pid, number)
         outcome = bench.note(child.finish())
@@ -208,12 +217,9 @@ def _after_signal(
         yield "the earlier output is gone"
     yield from bench.problems(strays=killed or code < 0)
     if killed:
-        run_forked(bench.locate("-q", out="place/later"), bench.folder, [bench.folder, *caches()])
+        run_forked(bench.locate("-q", out="place/later"), bench.folder, bench.writable())
         shutil.rmtree(bench.folder / "place" / "later")
         yield from (f"after the next run: {problem}" for problem in bench.problems())
-
-
-# --- limits ----------------------------------------------------------------------------------------------
 
 
 def _limit_resource(main: Callable[[], None], what: int, value: int) -> None:
@@ -226,14 +232,8 @@ def small_files(bench: Bench) -> Problems:
     for size in _FILE_SIZES:
         bench.prepare()
         main = partial(_limit_resource, bench.locate("-q"), resource.RLIMIT_FSIZE, size)
-        child = start_forked(main, bench.folder, [bench.folder, *caches()])
-        os.waitid(os.P_PID, child.pid, os.WEXITED | os.WNOWAIT)
-        outcome = bench.note(child.finish())
         # What the child prints goes into files too, and is cut.
-        cut = len(outcome.stderr) >= size
-        if outcome.code not in (0, 3) or (outcome.stderr.count("\n") != outcome.code // 3 and not cut):
-            yield f"{size} bytes: exit {outcome.code}, {outcome.stderr[-300:]!r}"
-        yield from bench.problems()
+        yield from bench.judge(main, f"{size} bytes", cut=size)
 
 
 def full_disk(bench: Bench) -> Problems:
@@ -244,10 +244,7 @@ def full_disk(bench: Bench) -> Problems:
             if not mounted:
                 bench.endings["left out: no file system can be mounted here"] += 1
                 return
-            outcome = bench.note(run_forked(bench.locate("-q"), bench.folder, [bench.folder, *caches()]))
-            if outcome.code not in (0, 3) or outcome.stderr.count("\n") != outcome.code // 3:
-                yield f"{pages} pages: exit {outcome.code}, {outcome.stderr[-300:]!r}"
-            yield from bench.problems()
+            yield from bench.judge(bench.locate("-q"), f"{pages} pages")
 
 
 @contextmanager
@@ -267,11 +264,7 @@ def little_memory(bench: Bench) -> Problems:
     for megabytes in _EXTRA_MEMORY_MB:
         bench.prepare()
         main = partial(_with_memory, bench.locate("-q"), megabytes * 1_000_000)
-        outcome = bench.note(run_forked(main, bench.folder, [bench.folder, *caches()]))
-        lines = outcome.stderr.count("\n")
-        if outcome.code not in (0, 3) or lines != outcome.code // 3:
-            yield f"{megabytes} MB: exit {outcome.code}, {outcome.stderr[-300:]!r}"
-        yield from bench.problems()
+        yield from bench.judge(main, f"{megabytes} MB")
 
 
 def _with_memory(main: Callable[[], None], extra: int) -> None:
@@ -279,18 +272,12 @@ def _with_memory(main: Callable[[], None], extra: int) -> None:
     _limit_resource(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
 
 
-# --- others ----------------------------------------------------------------------------------------------
-
-
 def rivals(bench: Bench, rounds: int) -> Problems:
     """Two runs into the same OUT: one wins, the other says so."""
     for k in range(rounds):
         bench.prepare()
         extra = ("--overwrite", "-q") if k % 2 else ("-q",)
-        children = [
-            start_forked(bench.locate(*extra), bench.folder, [bench.folder, *caches()], logs=str(side))
-            for side in range(2)
-        ]
+        children = [bench.start(*extra, logs=str(side)) for side in range(2)]
         outcomes = [bench.note(child.finish()) for child in children]
         codes = sorted(outcome.code for outcome in outcomes)
         if codes != [0, 3]:
@@ -310,7 +297,7 @@ def read_only_input(bench: Bench) -> Problems:
             bench.endings[f"left out: others may not enter {parent}"] += 1
             return
     main = partial(_as_nobody, bench.locate("-q"))
-    outcome = bench.note(run_forked(main, bench.folder, [bench.folder, *caches()]))
+    outcome = bench.note(run_forked(main, bench.folder, bench.writable()))
     if outcome.code:
         yield f"exit {outcome.code}: {outcome.stderr[-300:]}"
     yield from bench.problems()
@@ -337,8 +324,5 @@ def lock_database(bench: Bench) -> Problems:
                     connection.execute("PRAGMA cache_size = 1")  # so that it reaches the file
                     connection.execute("UPDATE keypoints SET data = zeroblob(100000)")
                 bench.before = verdicts.snapshot(bench.folder)
-                outcome = bench.note(run_forked(bench.locate("-q"), bench.folder, [bench.folder, *caches()]))
-                if outcome.code not in (0, 3) or outcome.stderr.count("\n") != outcome.code // 3:
-                    yield f"{mode}, {begin}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
-                yield from bench.problems()
+                yield from bench.judge(bench.locate("-q"), f"{mode}, {begin}")
                 connection.execute("ROLLBACK")

@@ -23,16 +23,8 @@ MEMORY_LIMIT_BYTES = 2_000_000_000
 
 _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 _CHANGING = (
-    "os.mkdir",
-    "os.rename",
-    "os.remove",
-    "os.rmdir",
-    "os.truncate",
-    "os.link",
-    "os.symlink",
-    "os.chmod",
-    "os.chown",
-    "os.utime",
+    *("os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate", "os.link", "os.symlink"),
+    *("os.chmod", "os.chown", "os.utime"),
 )
 _FORBIDDEN = ("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "pickle.find")
 _HARMLESS = ("/dev/null", "/dev/tty")
@@ -86,12 +78,8 @@ def start_forked(
 ) -> Child:
     """Call a function in a forked child, and return as soon as it is called.
 
-    Args:
-        function: SystemExit gives the exit code; any other exception a traceback on stderr and code 1.
-        work: an existing folder that becomes the working directory; what the child prints is kept beside it.
-        writable: folders in which the child may change files.
-        encoding: of the child's standard streams.
-        logs: distinguishes children at work at the same time.
+    SystemExit gives the exit code, any other exception a traceback on stderr and code 1. The folder `work`
+    becomes the working directory; what the child prints is kept beside it, and `logs` tells children apart.
     """
     kinds = ("stdout", "stderr", "deeds")
     paths = tuple(work.parent / f"{work.name}.{logs}.{kind}" for kind in kinds)

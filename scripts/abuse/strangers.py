@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from scipy.spatial.transform import Rotation
 
 from abuse import databases, mutations
 
@@ -32,9 +33,6 @@ _TEXT_WAYS: tuple[Callable[[bytes, Generator], bytes], ...] = (
 )
 
 Damage = tuple[str, tuple[str, ...]]
-
-
-# --- sound files -----------------------------------------------------------------------------------------
 
 
 def write_models(model: Any, folder: Path) -> None:
@@ -95,7 +93,7 @@ def _openmvg(model: Any, images: list[Any], f: float, width: int, height: int) -
 def _opensfm(model: Any, images: list[Any], f: float, width: int, height: int) -> str:
     shots = {
         image.name: {
-            "rotation": _rotation_vector(image.cam_from_world().rotation.quat).tolist(),
+            "rotation": Rotation.from_quat(image.cam_from_world().rotation.quat).as_rotvec().tolist(),
             "translation": image.cam_from_world().translation.tolist(),
             "camera": "c",
         }
@@ -138,17 +136,8 @@ def _observations(model: Any, point: Any) -> list[tuple[int, int, list[float]]]:
     return [(i, k, model.images[i].points2D[k].xy.tolist()) for i, k in elements]
 
 
-def _rotation_vector(quaternion_xyzw: np.ndarray) -> np.ndarray:
-    x, y, z, w = quaternion_xyzw
-    length = float(np.linalg.norm([x, y, z]))
-    return np.array([x, y, z]) * (2.0 * np.arctan2(length, w) / max(length, 1e-300))
-
-
 def _words(values: np.ndarray) -> str:
     return " ".join(map(repr, values.tolist()))
-
-
-# --- damage ----------------------------------------------------------------------------------------------
 
 
 def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
@@ -163,14 +152,12 @@ def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
         way = mutations.pick(rng, _TEXT_WAYS)
         label, data = way.__name__, way(path.read_bytes(), rng)
     path.write_bytes(data)
-    command = mutations.pick(
-        rng,
-        (
-            *[("locate", source, "out", "--threads", "1")] * 3,
-            *(("convert", source, "out"), ("convert", source, "out.json"), ("convert", source, "out.csv")),
-            *(("inspect", source), ("evaluate", source, "truth")),
-        ),
+    commands = (
+        *[("locate", source, "out", "--threads", "1")] * 3,
+        *(("convert", source, out) for out in ("out", "out.json", "out.csv")),
+        *(("inspect", source), ("evaluate", source, "truth")),
     )
+    command = mutations.pick(rng, commands)
     if command[0] == "evaluate":
         shutil.copytree(base / "truth", folder / "truth")
     return f"stranger: {target} {label}", command

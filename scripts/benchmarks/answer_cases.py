@@ -8,10 +8,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from benchmarks.answer_inputs import MADE, truth_of
+from benchmarks.answer_inputs import MADE, MADRID, truth_of
 
 BUNDLED = ("courtyard", "facade9", "photographed", "ring8")
-MADRID = "1dsfm-Madrid_Metropolis"
 _SETS = (
     *("Herz-Jesus-P25", "Herz-Jesus-P8", "brighton-beach", "castle-P19", "castle-P30", "fountain-P11"),
     *("kerry-park", "kitti-turn", "lego100", "liberty", "liberty-calibrated", "robots-1"),
@@ -36,31 +35,27 @@ class Case:
     quick: bool = False
 
 
+def _name_flags(*lines: str) -> dict[str, str]:
+    """Return flags by names made of them: "--points never" is "points-never"."""
+    return {line.removeprefix("--").replace(" --", "-").replace(" ", "-"): line for line in lines}
+
+
 _PLACEMENT = {
-    **{f"objective-{name}": f"--objective {name}" for name in ("shapefit", "lud", "least-squares", "linf")},
-    **{f"solver-{name}": f"--solver {name}" for name in ("newton", "admm", "conic")},
-    **{f"filter-{name}": f"--filter {name}" for name in ("1dsfm", "triangles")},
+    **_name_flags(*(f"--objective {name}" for name in ("shapefit", "lud", "least-squares", "linf"))),
+    **_name_flags(*(f"--solver {name}" for name in ("newton", "admm", "conic"))),
+    **_name_flags("--filter 1dsfm", "--filter triangles", "--no-refine", "--factor-memory 1"),
     "filter-triangles-least-squares": "--filter triangles --objective least-squares",
-    "no-refine": "--no-refine",
-    "factor-memory-1": "--factor-memory 1",
     "tol": "--tol 1e-5",
 }
 """Flags of variants that `locate` and `solve` have in common; `solve` calls --solver --method."""
 
 _LOCATE = {
     **_PLACEMENT,
-    "min-trust-0": "--min-trust 0",
-    "points-never": "--points never",
-    "points-always": "--points always",
-    "scale-unit": "--scale unit",
-    "scale-input": "--scale input",
-    "scale-prior": "--scale prior",
+    **_name_flags("--min-trust 0", "--points never", "--points always", "--threads 1", "--scene"),
+    **_name_flags("--scale unit", "--scale input", "--scale prior", "--refine-rotations", "--bundle-adjust"),
+    **_name_flags("--directions tracks", "--directions relative-poses", "--fix solved"),
     "known-distance": "--known-distance 0001.jpg 0003.jpg 2.5",
     "config": "--config known.toml",
-    "refine-rotations": "--refine-rotations",
-    "bundle-adjust": "--bundle-adjust",
-    "directions-tracks": "--directions tracks",
-    "directions-relative-poses": "--directions relative-poses",
     "fix-names": "--fix scenes/{scene}/fixed.txt",
     "fix-solved": "--fix solved",
     "fix-solved-bundle-adjust": "--fix solved --bundle-adjust",
@@ -71,10 +66,8 @@ _LOCATE = {
     "gps": "--priors scenes/{scene}/gps.csv",
     "gps-refine": "--priors scenes/{scene}/gps.csv --refine-with-priors",
     "thresholds": "--min-inliers 40 --inlier-threshold-px 1 --max-reprojection-error-px 2",
-    "threads-1": "--threads 1",
     "processes": "--executor processes --threads 2",
     "max-memory": "--max-memory 1",
-    "scene": "--scene",
 }
 _FIXED = ("fix-solved-bundle-adjust", "fix-solved-shapefit")
 _OF_ALL = " ".join(sorted({*_LOCATE} - {"min-trust-0", "scale-prior", "gps", "gps-refine"} - {*_FIXED}))
@@ -106,13 +99,8 @@ _LOCATED = {
 
 _MAP = {
     "default": "--json",
-    "bundle-adjust": "--bundle-adjust",
-    "min-trust-0": "--min-trust 0",
-    "relative-stored": "--relative stored",
-    "min-matches-30": "--min-matches 30",
-    "min-model-size-20": "--min-model-size 20",
-    "no-refine-rotations": "--no-refine-rotations",
-    "points-never": "--points never",
+    **_name_flags("--bundle-adjust", "--min-trust 0", "--relative stored", "--min-matches 30"),
+    **_name_flags("--min-model-size 20", "--no-refine-rotations", "--points never"),
     "shapefit": "--objective shapefit",
 }
 _MAPPED = {
@@ -126,9 +114,7 @@ _SOLVE = {
     **{name: flags.replace("--solver", "--method") for name, flags in _PLACEMENT.items()},
     "default": "--json",
     "formats": "--g2o --1dsfm",
-    "g2o": "--g2o",
-    "reverse": "--reverse",
-    "scene": "--scene",
+    **_name_flags("--g2o", "--reverse", "--scene"),
     "rotations-txt": "--rotations graphs/1dsfm/rots.txt",
     "rotations-g2o": "--rotations graphs/poses.g2o",
     "max-rotation-error": "--max-rotation-error 0.3",

@@ -17,7 +17,8 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-_TRUTHS = ("gt", "truth", "sparse/0")
+MADRID = "1dsfm-Madrid_Metropolis"
+TRUTHS = ("gt", "truth", "sparse/0")
 _PARTS = ("sparse/0", "database.db", "gt", "truth", "gps.csv")
 _PAIR_BASE = 2147483647  # COLMAP's pair_id is id1 * this + id2
 _PRUNED: dict[str, Callable[[int, int], bool]] = {
@@ -39,8 +40,13 @@ def truth_of(folder: Path) -> str:
 
 def make_inputs(work: Path, scenes: Mapping[str, Path]) -> None:
     """Copy scenes given by name and folder, and make everything else; the bundled must be among them."""
+    (work / "graphs").mkdir()
     for name, folder in scenes.items():
-        _copy(folder, work / "scenes" / name)
+        if name == MADRID:
+            shutil.copytree(folder, work / "graphs" / name, copy_function=shutil.copyfile)
+        else:
+            _copy(folder, work / "scenes" / name)
+    shutil.copyfile(scenes["ring8"].with_name("graph40.txt"), work / "graphs" / "graph40.txt")
     for name, kept in _PRUNED.items():
         _copy(scenes["ring8"], work / "scenes" / name)
         _keep_pairs(work / "scenes" / name / "database.db", kept)
@@ -50,7 +56,6 @@ def make_inputs(work: Path, scenes: Mapping[str, Path]) -> None:
     _make_rig(work / "scenes" / "rig")
     for folder in sorted((work / "scenes").iterdir()):
         _write_tables(folder)
-    (work / "graphs").mkdir()
     _write_graphs(work / "graphs")
     _write_relative_poses(work / "graphs")
     (work / "known.toml").write_text('min_trust = 0.0\nknown_distance = ["0001.jpg", "0003.jpg", 2.5]\n')

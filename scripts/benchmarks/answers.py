@@ -25,7 +25,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,14 +33,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from benchmarks.answer_cases import BUNDLED, MADRID, Case, all_cases
+from benchmarks.answer_cases import BUNDLED, Case, all_cases
 from benchmarks.answer_differences import compare, report
-from benchmarks.answer_inputs import MADE, make_inputs
+from benchmarks.answer_inputs import MADE, MADRID, make_inputs
 from harness.driver import DATA, ROOT
 
 LIMIT_S = 300
 """Seconds after which a case is ended; its exit code is then recorded as "timeout"."""
-
 _VARIABLE = {"timings_s", "seconds", "versions", "expected"}
 """Keys of JSON objects that are not kept, wherever they stand."""
 _PAIR_COLUMNS = {"name1", "name2", "support", "residual_deg", "verdict", "reason"}
@@ -58,7 +56,6 @@ class Runner:
 
     package: Path
     work: Path
-    limit_s: float = LIMIT_S
 
     def ask(self, case: Case) -> dict[str, Answer]:
         """Return the answers of a case and of those that follow it, by name."""
@@ -98,7 +95,7 @@ class Runner:
             start_new_session=True,
         )
         try:
-            stdout, stderr = process.communicate(timeout=self.limit_s)
+            stdout, stderr = process.communicate(timeout=LIMIT_S)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.communicate()
@@ -167,11 +164,9 @@ def _model(folder: Path) -> dict[str, Any]:
 def _table(path: Path) -> dict[str, list[str]]:
     """Return the columns of a table, numbers as they are written."""
     with path.open(encoding="utf-8", newline="") as stream:
-        reader = csv.reader(stream)
-        header = next(reader)
-        columns = dict(zip(header, map(list, zip(*reader, strict=True)), strict=False))
-    wanted = _PAIR_COLUMNS if path.name == "pairs.csv" else set(header)
-    return {name: columns.get(name, []) for name in header if name in wanted}
+        header, *rows = csv.reader(stream)
+    columns = {name: [row[k] for row in rows] for k, name in enumerate(header)}
+    return {k: v for k, v in columns.items() if path.name != "pairs.csv" or k in _PAIR_COLUMNS}
 
 
 def _digest(path: Path) -> str:
@@ -188,7 +183,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--only", default="", help="cases whose name contains this")
     parser.add_argument("--quick", action="store_true", help="a few cases on bundled scenes")
     parser.add_argument("--jobs", type=int, default=2, help="cases side by side")
-    parser.add_argument("--strict-words", action="store_true", help="changed wording counts as a difference")
     parser.add_argument("--package", type=Path, default=ROOT, help="root of the checkout whose code runs")
     parser.add_argument("--data", type=Path, default=DATA, help="folder of the real sets")
 
@@ -199,7 +193,7 @@ def run(args: argparse.Namespace) -> int:
     _write(args.out, recorded)
     if old is None:
         return 0
-    text, is_equal = compare_recordings(old, recorded, strict_words=args.strict_words)
+    text, is_equal = compare_recordings(old, recorded)
     print(text)
     return 0 if is_equal else 1
 
@@ -218,11 +212,17 @@ def record(
     present = [c for c in chosen if c not in missing]
     for case in missing:
         print(f"{case.name}: skipped, {case.scene} is not at hand", file=sys.stderr)
-    with tempfile.TemporaryDirectory() as name:
+    answers: dict[str, Answer] = {}
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(jobs) as pool:
         runner = Runner(package.resolve(), Path(name).resolve())
         runner.check()
-        _make(runner.work, folders, {case.scene for case in present})
-        answers = dict(_ask(runner, present, jobs))
+        wanted = {*BUNDLED, *(case.scene for case in present)}
+        make_inputs(runner.work, {name: folders[name] for name in folders if name in wanted})
+        for found in pool.map(runner.ask, present):
+            answers |= found
+            print(
+                *(f"{k}: {a['exit']}, {a['seconds']} s" for k, a in found.items()), sep="; ", file=sys.stderr
+            )
     return {"answers": answers, "skipped": [case.name for case in missing]}
 
 
@@ -235,38 +235,14 @@ def _folders(data: Path) -> dict[str, Path]:
     return found
 
 
-def _make(work: Path, folders: Mapping[str, Path], scenes: set[str]) -> None:
-    """Make the inputs; of the real sets those that are asked for."""
-    wanted = {name: folders[name] for name in folders if name in scenes or name in BUNDLED}
-    madrid = wanted.pop(MADRID, None)
-    make_inputs(work, wanted)
-    shutil.copyfile(ROOT / "data_synthetic" / "graph40.txt", work / "graphs" / "graph40.txt")
-    if madrid:
-        shutil.copytree(madrid, work / "graphs" / MADRID, copy_function=shutil.copyfile)
-
-
-def _ask(runner: Runner, cases: list[Case], jobs: int) -> Iterator[tuple[str, Answer]]:
-    """Yield the answers as they come, and say so."""
-    with ThreadPoolExecutor(jobs) as pool:
-        for k, answers in enumerate(pool.map(runner.ask, cases)):
-            for name, answer in answers.items():
-                print(
-                    f"{k + 1}/{len(cases)} {name}: {answer['exit']}, {answer['seconds']} s", file=sys.stderr
-                )
-                yield name, answer
-
-
-def compare_recordings(
-    old: dict[str, Any], new: dict[str, Any], *, strict_words: bool = False
-) -> tuple[str, bool]:
+def compare_recordings(old: dict[str, Any], new: dict[str, Any]) -> tuple[str, bool]:
     """Return what is to be said of two recordings, and whether the cases that both have are equal."""
-    names = [name for name in new["answers"] if name in old["answers"]]
-    differences = [d for name in names for d in compare(name, old["answers"][name], new["answers"][name])]
-    text, is_equal = report(differences, len(names), strict_words)
-    for words, more, less in (("only before", old, new), ("only now", new, old)):
-        alone = [name for name in more["answers"] if name not in less["answers"]]
-        text += f"\n{words}, not compared: {len(alone)} cases ({', '.join(alone[:5])} ...)" if alone else ""
-    return text, is_equal and bool(names)
+    before, now = old["answers"], new["answers"]
+    differences = {name: compare(before[name], now[name]) for name in now if name in before}
+    text, is_equal = report(differences)
+    for words, alone in (("only before", before.keys() - now), ("only now", now.keys() - before)):
+        text += f"\n{words}, not compared: {len(alone)} cases, {sorted(alone)[:5]}" if alone else ""
+    return text, is_equal and bool(differences)
 
 
 def _read(path: Path) -> dict[str, Any]:

@@ -119,7 +119,6 @@ def breaking_share(errors: Mapping[float, float]) -> float | None:
 
 
 def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         "All wrong pairs agree on one second configuration of the cameras. At q = 0.5 it is as good an answer"
         " as the truth, which is the limit of every method."

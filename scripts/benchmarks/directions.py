@@ -111,7 +111,6 @@ Measured = Speed | Calibration | weights.Comparison
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `directions`."""
     parser.add_argument("--pairs", type=positive, default=1_000_000, help="pairs in batches")
     parser.add_argument("--draws", type=positive, default=2000, help="pairs per calibration case")
 
@@ -246,9 +245,6 @@ def measure_processes(pairs: int) -> Speed:
     )
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(one: Measured) -> list[Check]:
     """Return the limits of one case; a comparison of weights has none of its own."""
     if isinstance(one, weights.Comparison):
@@ -271,7 +267,6 @@ def checks(one: Measured) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     found = list(measured.values())
     calibrations = [one for one in found if isinstance(one, Calibration)]
     yield f"## Speed, {MATCHES} matches per pair, batches of {BATCH} pairs"

@@ -92,7 +92,6 @@ class Stages:
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `endtoend`."""
     parser.add_argument("--images", type=positive, nargs="*", default=[2500, LARGEST], help="of made scenes")
     parser.add_argument("--folder", type=Path, help="where scenes are kept (default: a temporary folder)")
 
@@ -190,7 +189,6 @@ def checks(one: Located) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Located], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield table_of(
         measured.values(),
         {

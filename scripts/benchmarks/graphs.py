@@ -148,9 +148,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     return found
 
 
-# --- measuring -------------------------------------------------------------------------------------
-
-
 def draw_graph(problem: Problem, seed: int, data: Path = DATA) -> Drawn:
     """Return the problem's graph for a seed."""
     import numpy as np
@@ -276,9 +273,6 @@ def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
         right = left
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(found: Trials) -> list[Check]:
     """Return the limits of one problem: of medians, and of the worst mean over median."""
     problem, limits = found.problem, []
@@ -295,7 +289,6 @@ def checks(found: Trials) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         "Problems have a fifth of wrong directions and noise of 0.01 unless they say otherwise; those of"
         " 5,000 nodes or more, one seed."

@@ -129,7 +129,6 @@ def checks(runs: Sequence[Outcome]) -> list[Check]:
 
 
 def tables(measured: Mapping[str, Sequence[Outcome]], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         f"The limit is {LARGEST_RATIO} times the mean error of the better of pycolmap's mappers at its better"
         f" setting. The ring: {RING['num_images']} images with a share of {RING['wrong_match_fraction']} of"

@@ -19,7 +19,7 @@ from typing import Any
 
 from harness import ours
 from harness.driver import NOT_FOUND, ROOT, Benchmark, Case
-from harness.metrics import Check, Quantity, number, numbers
+from harness.metrics import Quantity, number, numbers
 from harness.record import table_of
 
 SCENE = "1dsfm-Madrid_Metropolis"
@@ -93,13 +93,7 @@ def measure(name: str, source: Path) -> Outcome:
     )
 
 
-def checks(_one: Outcome) -> list[Check]:
-    """Return nothing: there is no truth and no limit."""
-    return []
-
-
 def tables(measured: Mapping[str, Outcome], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield next(iter(measured.values())).source
     yield PUBLISHED
     yield table_of(
@@ -121,7 +115,6 @@ BENCHMARK = Benchmark(
     name="onedsfm",
     title="1DSfM: Madrid Metropolis",
     cases=cases,
-    checks=checks,
     tables=tables,
     quantities=(
         Quantity(

@@ -33,7 +33,6 @@ class OnScene:
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `peers`."""
     parser.add_argument(
         "--cpu-limit", type=positive, default=CPU_LIMIT_S, help="seconds of CPU time per answer"
     )
@@ -78,7 +77,6 @@ def checks(one: on_graphs.Compared | OnScene) -> list[Check]:
 
 
 def tables(measured: Mapping[str, on_graphs.Compared | OnScene], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         f"A fresh process each on one thread, ended after {args.cpu_limit} s of CPU time, imports included;"
         " our code is warmed up first, so that nothing is compiled while the clock runs. Graphs: our best"

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case, if_there
-from harness.metrics import Check, Quantity, median, number, numbers, ratio, verdict
+from harness.metrics import Check, Quantity, check_all, median, number, numbers, ratio, verdict
 from harness.process import peak_memory_mb
 from harness.record import table_of
 
@@ -128,7 +128,6 @@ class Measured:
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `real`."""
     parser.add_argument("--bundle-adjust", action="store_true", help="also run with bundle adjustment, once")
     parser.add_argument(
         "--averaged",
@@ -145,9 +144,6 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         name: if_there(args.data / name, partial(measure, scene, args.data / name, args))
         for name, scene in SCENES.items()
     }
-
-
-# --- measuring -------------------------------------------------------------------------------------
 
 
 def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> Measured:
@@ -228,17 +224,10 @@ def compare(reconstruction: object, truth: Path) -> Errors:
     )
 
 
-# --- what is to be reached -------------------------------------------------------------------------
-
-
 def _error_checks(errors: Errors, limits: tuple[float, float] | None) -> list[Check]:
     """Return the checks of median and mean, if they have limits."""
-    if limits is None:
-        return []
-    return [
-        Check(name="median", value=errors.median, limit=limits[0]),
-        Check(name="mean", value=errors.mean, limit=limits[1]),
-    ]
+    values = {"median": errors.median, "mean": errors.mean}
+    return check_all(values, dict(zip(values, limits or (), strict=False)))
 
 
 def adjusted_checks(one: Measured) -> list[Check]:
@@ -256,15 +245,10 @@ def time_checks(one: Measured) -> list[Check]:
 
 
 def checks(one: Measured) -> list[Check]:
-    """Return every check of one set on its own rotations."""
     return _error_checks(one.errors, one.scene.limits) + adjusted_checks(one) + time_checks(one)
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     found = list(measured.values())
     yield "Errors are in the set's unit; a limit is compared with the unrounded value."
     yield "## Before bundle adjustment"

@@ -22,13 +22,11 @@ def subcommands() -> dict[str, ModuleType]:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the subcommands and their arguments."""
     subparsers = parser.add_subparsers(dest="subcommand", required=True)
     for name, module in subcommands().items():
         module.add_arguments(subparsers.add_parser(name, help=module.HELP, description=module.HELP))
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run a subcommand; its exit code is 1 if anything failed."""
     code: int = subcommands()[args.subcommand].run(args)
     return code

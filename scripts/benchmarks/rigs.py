@@ -19,7 +19,7 @@ import numpy as np
 
 from harness import ours
 from harness.driver import Benchmark, Case, positive
-from harness.metrics import Check, Quantity
+from harness.metrics import Quantity
 from harness.record import table_of
 
 if TYPE_CHECKING:
@@ -55,7 +55,6 @@ class Drives:
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `rigs`."""
     parser.add_argument("--images", type=positive, default=90, help="of a drive, six per metre and a half")
 
 
@@ -132,13 +131,7 @@ def compare(scene: "RigScene", model: "pycolmap.Reconstruction", wall_s: float) 
     return Outcome(num_images=len(ids), scale_error=1.0 / fit.scale - 1.0, errors_m=errors, wall_s=wall_s)
 
 
-def checks(_one: Drives) -> list[Check]:
-    """Return nothing: the table compares, and has no limit."""
-    return []
-
-
 def tables(measured: Mapping[str, Drives], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section."""
     yield (
         f"Two vehicles with three cameras each, {args.images} images, {args.repeats} drives: medians over"
         " these, and the worst camera of all. No position is given to anyone; `locate` is given rotations."
@@ -161,7 +154,6 @@ BENCHMARK = Benchmark(
     name="rigs",
     title="Rigs",
     cases=cases,
-    checks=checks,
     tables=tables,
     flags=flags,
     packages=("pycolmap", "numpy"),

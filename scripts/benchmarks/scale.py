@@ -20,15 +20,15 @@ import statistics
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, number, verdict
+from harness.metrics import Check, Quantity, check_all, number, verdict
 from harness.process import call, peak_memory_mb, reset_peak, resident_memory_mb
 from harness.record import table, table_of
 
@@ -40,69 +40,63 @@ CLOSE = 1e-4
 FAMILIES = {"geo": "geometric", "comm": "community", "er": "random of degree 40", "seq": "trajectory"}
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Problem:
-    """A problem, the gap asked for, and what is to be reached."""
+    """A problem of `solve`, the gap asked for, and what is to be reached."""
 
     spec: GraphSpec
     tol: float
     reference_tol: float | None = None
     """Of the second run that knows the objective better; None for none."""
-    close_s: float | None = None
-    certified_s: float | None = None
-    memory_mb: float | None = None
-    error: float | None = None
-    gap: float | None = None
+    limits: Mapping[str, float] = field(default_factory=dict)
+    """By the names in `checks`."""
 
     @property
     def name(self) -> str:
-        return f"{self.spec.family} {self.spec.n:.0e}".replace("e+0", "e") + (
-            ", noiseless" if self.spec.sigma == 0.0 else ""
-        )
+        return f"{self.spec.family} {_show_size(self.spec.n)}{', noiseless' * (self.spec.sigma == 0.0)}"
+
+
+def _show_size(n: float) -> str:
+    return f"{n:.0e}".replace("e+0", "e")
 
 
 def _spec(family: str, n: int, degree: float, sigma: float = 0.01) -> GraphSpec:
     return GraphSpec(family=family, n=n, degree=degree, sigma=sigma)
 
 
+CLOSE_S, CERTIFIED_S, MEMORY_MB = "to 1e-4, s", "certified, s", "memory, MB"
 PROBLEMS = (
-    Problem(spec=_spec("geo", 1_000, 40.0), tol=1e-6, reference_tol=1e-8),
+    Problem(_spec("geo", 1_000, 40.0), 1e-6, 1e-8),
+    Problem(_spec("geo", 10_000, 40.0), 1e-6, 1e-7, {CLOSE_S: 0.5, CERTIFIED_S: 3.0, "gap": 1e-6}),
+    Problem(_spec("geo", 10_000, 40.0, sigma=0.0), 3e-12, limits={"error": 1e-12, "gap": 1e-10}),
     Problem(
-        spec=_spec("geo", 10_000, 40.0), tol=1e-6, reference_tol=1e-7, close_s=0.5, certified_s=3.0, gap=1e-6
+        *(_spec("geo", 100_000, 60.0), 1e-4, 1e-6),
+        {CLOSE_S: 14.0, CERTIFIED_S: 30.0, MEMORY_MB: 1300.0, "gap": 1e-4},
     ),
-    Problem(spec=_spec("geo", 10_000, 40.0, sigma=0.0), tol=3e-12, error=1e-12, gap=1e-10),
-    Problem(
-        spec=_spec("geo", 100_000, 60.0),
-        tol=1e-4,
-        reference_tol=1e-6,
-        close_s=14.0,
-        certified_s=30.0,
-        memory_mb=1300.0,
-        gap=1e-4,
-    ),
-    Problem(spec=_spec("comm", 1_000, 67.0), tol=1e-4, reference_tol=1e-7),
-    Problem(spec=_spec("comm", 10_000, 67.0), tol=1e-4, reference_tol=1e-6),
+    Problem(_spec("comm", 1_000, 67.0), 1e-4, 1e-7),
+    Problem(_spec("comm", 10_000, 67.0), 1e-4, 1e-6),
     # Of 1e-4 the splitting would stop short, relatively; a run that knows the optimum would take an hour.
-    Problem(spec=_spec("comm", 100_000, 67.0), tol=3e-5, close_s=40.0, memory_mb=2000.0),
-    Problem(spec=_spec("er", 1_000, 40.0), tol=1e-4, reference_tol=1e-7),
-    Problem(spec=_spec("er", 10_000, 40.0), tol=1e-4, reference_tol=1e-6),
-    Problem(spec=_spec("er", 100_000, 40.0), tol=1e-4, reference_tol=1e-5, close_s=14.0, memory_mb=600.0),
-    Problem(spec=_spec("seq", 1_000, 20.0), tol=1e-4, reference_tol=1e-7),
-    Problem(spec=_spec("seq", 10_000, 20.0), tol=1e-4, reference_tol=1e-6),
-    Problem(spec=_spec("seq", 100_000, 20.0), tol=1e-4, reference_tol=1e-5),
+    Problem(_spec("comm", 100_000, 67.0), 3e-5, limits={CLOSE_S: 40.0, MEMORY_MB: 2000.0}),
+    Problem(_spec("er", 1_000, 40.0), 1e-4, 1e-7),
+    Problem(_spec("er", 10_000, 40.0), 1e-4, 1e-6),
+    Problem(_spec("er", 100_000, 40.0), 1e-4, 1e-5, {CLOSE_S: 14.0, MEMORY_MB: 600.0}),
+    Problem(_spec("seq", 1_000, 20.0), 1e-4, 1e-7),
+    Problem(_spec("seq", 10_000, 20.0), 1e-4, 1e-6),
+    Problem(_spec("seq", 100_000, 20.0), 1e-4, 1e-5),
 )
-MILLION = Problem(spec=_spec("geo", 1_000_000, 38.0), tol=1e-4, close_s=300.0, memory_mb=6000.0)
-QUICK = Problem(spec=_spec("seq", 200, 20.0), tol=1e-4)
+MILLION = Problem(_spec("geo", 1_000_000, 38.0), 1e-4, limits={CLOSE_S: 300.0, MEMORY_MB: 6000.0})
+QUICK = Problem(_spec("seq", 200, 20.0), 1e-4)
 BESIDE_UP_TO = 10_000
 """Cameras, for ADMM beside another choice of `auto`."""
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trace:
-    """The objective and the clock after each iteration."""
-
-    objectives: tuple[float, ...]
-    seconds: tuple[float, ...]
+RIGID = {"geo-10000": 32.0, "seq-10000": 36.0, "comm-10000": 45.0, "er-10000": 20.0} | {
+    "geo-100000": 53.0,
+    "seq-100000": 60.0,
+    "comm-100000": 62.0,
+}
+"""Graphs in 3D whose pieces are sought, and their mean degrees; er-10000 has few triangles."""
+RIGID_LIMITS = {10_000: {"seconds": 0.5}, 100_000: {"seconds": 20.0, "peak": 1000.0}}
+RIGID_REPEATS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,19 +106,16 @@ class Measured:
     problem: Problem
     asked: str
     num_edges: int
-    method: str
-    reason: str
-    status: str
-    trace: Trace
+    solved: Mapping[str, Any]
+    """What `SolverResult.summary` says."""
+    trace: Sequence[tuple[float, float]]
+    """The objective and the clock after each iteration."""
     best_objective: float
     """The lowest known, over both runs."""
     bound: float
     """The highest rigorous bound known, over both runs."""
     total_s: float
     cpu_s: float
-    objective: float
-    gap: float
-    equality_residual: float
     error: float
     before_mb: float
     """Resident before the solve: interpreter, libraries, the warm-up's leftovers and the problem."""
@@ -133,17 +124,30 @@ class Measured:
     @property
     def certificate_s(self) -> float:
         """What came after the last iteration; NaN if there was none."""
-        return self.total_s - self.trace.seconds[-1] if self.trace.seconds else math.nan
+        return self.total_s - self.trace[-1][1] if self.trace else math.nan
 
     @property
     def close_at(self) -> int | None:
         """The iteration from which the objective stays within CLOSE of the best, from 1."""
-        return find_settled(self.trace.objectives, self.best_objective * (1.0 + CLOSE))
+        return find_settled([value for value, _ in self.trace], self.best_objective * (1.0 + CLOSE))
 
     @property
     def close_s(self) -> float:
         """The seconds until then; NaN if never."""
-        return math.nan if self.close_at is None else self.trace.seconds[self.close_at - 1]
+        return math.nan if self.close_at is None else self.trace[self.close_at - 1][1]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Search:
+    """What finding the rigid pieces of one graph gave and took."""
+
+    spec: GraphSpec
+    num_pairs: int
+    num_pieces: int
+    num_single_pairs: int
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
 
 
 def find_settled(values: Sequence[float], limit: float) -> int | None:
@@ -153,51 +157,7 @@ def find_settled(values: Sequence[float], limit: float) -> int | None:
     return first if first <= len(values) else None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigidProblem:
-    """A graph in 3D, and what finding its pieces may take."""
-
-    spec: GraphSpec
-    seconds: float | None = None
-    peak_mb: float | None = None
-
-
-RIGID_PROBLEMS = {
-    **{
-        f"{family}-10000": RigidProblem(spec=GraphSpec(family=family, n=10_000, degree=degree), seconds=0.5)
-        for family, degree in (("geo", 32.0), ("seq", 36.0), ("comm", 45.0))
-    },
-    "er-10000, few triangles": RigidProblem(spec=GraphSpec(family="er", n=10_000, degree=20.0)),
-    **{
-        f"{family}-100000": RigidProblem(
-            spec=GraphSpec(family=family, n=100_000, degree=degree), seconds=20.0, peak_mb=1000.0
-        )
-        for family, degree in (("geo", 53.0), ("seq", 60.0), ("comm", 62.0))
-    },
-}
-QUICK_RIGID = RigidProblem(spec=GraphSpec(family="geo", n=200, degree=20.0))
-RIGID_REPEATS = 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
-    """What finding the rigid pieces of one graph gave and took."""
-
-    name: str
-    problem: RigidProblem
-    num_pairs: int
-    num_pieces: int
-    num_single_pairs: int
-    wall_s: float
-    cpu_s: float
-    peak_mb: float
-
-
-# --- the cases -------------------------------------------------------------------------------------
-
-
 def flags(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `scale`."""
     parser.add_argument("--million", action="store_true", help="also a geometric graph of 1e6 cameras")
     parser.add_argument("--plot", type=Path, help="the plot's file (docs/scale.png)")
 
@@ -210,11 +170,10 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         found[problem.name] = partial(measure, problem, "auto", args.threads)
         if problem.spec.n <= BESIDE_UP_TO:
             found[f"{problem.name} (admm)"] = partial(measure, problem, "admm", args.threads)
-    rigid = {"geo-200": QUICK_RIGID} if args.quick else RIGID_PROBLEMS
-    return found | {f"rigid {name}": partial(search, name, problem) for name, problem in rigid.items()}
-
-
-# --- measuring -------------------------------------------------------------------------------------
+    for name, degree in ({"geo-200": 20.0} if args.quick else RIGID).items():
+        family, n = name.split("-")
+        found[f"rigid {name}"] = partial(search, GraphSpec(family=family, n=int(n), degree=degree))
+    return found
 
 
 def save_problem(spec: GraphSpec, file: Path) -> None:
@@ -242,26 +201,21 @@ def measure(problem: Problem, asked: str, threads: int) -> Measured:
     reset_peak()
     run = ours.time_call(lambda: _trace(graph, asked, problem.tol, threads))
     (found, trace), peak_mb = run.found, peak_memory_mb()
-    best, bound = min([found.objective, *trace.objectives]), found.dual_bound
+    objectives, bound = [found.objective, *(value for value, _ in trace)], found.dual_bound
     if problem.reference_tol is not None:
         again, longer = _trace(graph, asked, problem.reference_tol, threads)
-        best = min([best, again.objective, *longer.objectives])
+        objectives += [again.objective, *(value for value, _ in longer)]
         bound = max(bound, again.dual_bound)
     return Measured(
         problem=problem,
         asked=asked,
         num_edges=graph.num_edges,
-        method=found.method,
-        reason=found.method_reason,
-        status=found.status.name.lower(),
+        solved=found.summary(),
         trace=trace,
-        best_objective=best,
+        best_objective=min(objectives),
         bound=bound,
         total_s=run.wall_s,
         cpu_s=run.cpu_s,
-        objective=found.objective,
-        gap=found.gap,
-        equality_residual=found.equality_residual,
         error=relative_error(found.locations, truth),
         before_mb=before_mb,
         peak_mb=peak_mb,
@@ -276,31 +230,29 @@ def _warm_up(spec: GraphSpec, threads: int) -> None:
         _trace(graph, method, 1e-4, threads)
 
 
-def _trace(graph: "ViewGraph", method: str, tol: float, threads: int) -> "tuple[SolverResult, Trace]":
+def _trace(
+    graph: "ViewGraph", method: str, tol: float, threads: int
+) -> "tuple[SolverResult, list[tuple[float, float]]]":
     """Solve; return the result, and the objective and the clock after each iteration."""
-    objectives: list[float] = []
-    seconds: list[float] = []
+    trace: list[tuple[float, float]] = []
 
-    def note(info: object) -> None:
-        seconds.append(time.perf_counter() - start)
-        objectives.append(info.objective)  # type: ignore[attr-defined]
+    def note(info: Any) -> None:
+        trace.append((info.objective, time.perf_counter() - start))
 
     start = time.perf_counter()
-    found = ours.solve(graph, note=note, solver=method, tol=tol, threads=threads)
-    return found, Trace(objectives=tuple(objectives), seconds=tuple(seconds))
+    return ours.solve(graph, note=note, solver=method, tol=tol, threads=threads), trace
 
 
-def search(name: str, problem: RigidProblem) -> Search:
+def search(spec: GraphSpec) -> Search:
     """Find the pieces in 3D a few times, after a small graph that loads the compiled code."""
     import numpy as np
 
-    edges = call(draw_edges, problem.spec)
+    edges = call(draw_edges, spec)
     ours.rigid_pieces(5, np.array([[0, 1], [1, 2], [2, 3], [3, 4], [4, 0]]))
-    runs = [ours.time_call(lambda: ours.rigid_pieces(problem.spec.n, edges)) for _ in range(RIGID_REPEATS)]
+    runs = [ours.time_call(lambda: ours.rigid_pieces(spec.n, edges)) for _ in range(RIGID_REPEATS)]
     sizes = np.bincount(runs[0].found)
     return Search(
-        name=name,
-        problem=problem,
+        spec=spec,
         num_pairs=len(edges),
         num_pieces=int(np.sum(sizes > 1)),
         num_single_pairs=int(np.sum(sizes == 1)),
@@ -315,26 +267,23 @@ def draw_edges(spec: GraphSpec) -> object:
     return draw(spec).edges
 
 
-# --- what is to be reached -------------------------------------------------------------------------
-
-
 def checks(one: Measured | Search) -> list[Check]:
     """Return the limits of one case; of solves, only `auto` has any."""
     if isinstance(one, Search):
-        values = [("seconds", one.wall_s, one.problem.seconds), ("peak", one.peak_mb, one.problem.peak_mb)]
-    elif one.asked != "auto":
-        return []
-    else:
-        problem = one.problem
-        certified_s = one.total_s if problem.gap is not None and one.gap <= problem.gap else math.nan
-        values = [
-            ("to 1e-4, s", one.close_s, problem.close_s),
-            ("certified, s", certified_s, problem.certified_s),
-            ("memory, MB", one.peak_mb, problem.memory_mb),
-            ("error", one.error, problem.error),
-            ("gap", one.gap, problem.gap),
-        ]
-    return [Check(name=name, value=value, limit=limit) for name, value, limit in values if limit is not None]
+        has_limit = one.spec.family != "er"
+        return check_all(
+            {"seconds": one.wall_s, "peak": one.peak_mb},
+            RIGID_LIMITS.get(one.spec.n, {}) if has_limit else {},
+        )
+    limits, gap = one.problem.limits if one.asked == "auto" else {}, one.solved["gap"]
+    values = {
+        CLOSE_S: one.close_s,
+        CERTIFIED_S: one.total_s if gap <= limits.get("gap", -math.inf) else math.nan,
+        MEMORY_MB: one.peak_mb,
+        "error": one.error,
+        "gap": gap,
+    }
+    return check_all(values, limits)
 
 
 def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
@@ -342,9 +291,7 @@ def exponent(sizes: Sequence[float], values: Sequence[float]) -> float:
     pairs = [(math.log(s), math.log(v)) for s, v in zip(sizes, values, strict=True) if v > 0.0]
     if len({x for x, _ in pairs}) < 2:
         return math.nan
-    mean_x = sum(x for x, _ in pairs) / len(pairs)
-    mean_y = sum(y for _, y in pairs) / len(pairs)
-    return sum((x - mean_x) * (y - mean_y) for x, y in pairs) / sum((x - mean_x) ** 2 for x, _ in pairs)
+    return statistics.linear_regression(*zip(*pairs, strict=True)).slope
 
 
 def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> list[Measured]:
@@ -354,16 +301,12 @@ def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> l
         for one in measured
         if one.problem.spec.family == family
         and one.problem.spec.sigma > 0.0
-        and ("admm" in one.method if by_admm else one.asked == "auto")
+        and ("admm" in one.solved["method"] if by_admm else one.asked == "auto")
     ]
     return sorted(chosen, key=lambda one: one.problem.spec.n)
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) -> Iterator[str]:
-    """Yield the parts of the section, and draw the plot."""
     solves = [one for one in measured.values() if isinstance(one, Measured)]
     searches = [one for one in measured.values() if isinstance(one, Search)]
     if solves:
@@ -386,7 +329,10 @@ def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) 
         yield _show_exponents(solves)
         yield "## Why this solver"
         yield "\n".join(
-            dict.fromkeys(f"- {one.problem.name}: {one.method}, because {one.reason}" for one in solves)
+            dict.fromkeys(
+                f"- {one.problem.name}: {one.solved['method']}, because {one.solved['method_reason']}"
+                for one in solves
+            )
         )
         yield _CAVEATS
     if searches:
@@ -412,9 +358,10 @@ def _label(one: Measured) -> str:
 
 def _show_times(solves: Sequence[Measured]) -> str:
     def show_limits(one: Measured) -> str:
-        limits = (one.problem.close_s, one.problem.certified_s)
-        shown = ["-" if limit is None else f"{limit:g} s" for limit in limits]
-        return " / ".join(shown) if one.asked == "auto" else "-"
+        if one.asked != "auto":
+            return "-"
+        limits = [one.problem.limits.get(name) for name in (CLOSE_S, CERTIFIED_S)]
+        return " / ".join("-" if limit is None else f"{limit:g} s" for limit in limits)
 
     return table_of(
         solves,
@@ -422,9 +369,9 @@ def _show_times(solves: Sequence[Measured]) -> str:
             "problem": _label,
             "cameras": lambda one: str(one.problem.spec.n),
             "pairs": lambda one: str(one.num_edges),
-            "method": lambda one: one.method,
+            "method": lambda one: one.solved["method"],
             "to 1e-4, s": lambda one: number(one.close_s),
-            "iterations": lambda one: f"{one.close_at or '-'} / {len(one.trace.objectives)}",
+            "iterations": lambda one: f"{one.close_at or '-'} / {len(one.trace)}",
             "total, s": lambda one: number(one.total_s),
             "CPU, s": lambda one: number(one.cpu_s),
             "certificate, s": lambda one: number(one.certificate_s),
@@ -439,18 +386,18 @@ def _show_proofs(solves: Sequence[Measured]) -> str:
         return number(one.best_objective / one.bound - 1.0) if one.bound > 0.0 else "-"
 
     def show_limit(one: Measured) -> str:
-        has_limit = one.problem.memory_mb is not None and one.asked == "auto"
-        return f"{one.problem.memory_mb:g} MB" if has_limit else "-"
+        limit = one.problem.limits.get(MEMORY_MB) if one.asked == "auto" else None
+        return "-" if limit is None else f"{limit:g} MB"
 
     return table_of(
         solves,
         {
             "problem": _label,
-            "status": lambda one: one.status,
+            "status": lambda one: one.solved["status"],
             "gap asked": lambda one: f"{one.problem.tol:.0e}",
-            "objective": lambda one: number(one.objective),
-            "gap": lambda one: number(one.gap),
-            "equality residual": lambda one: number(one.equality_residual),
+            "objective": lambda one: number(one.solved["objective"]),
+            "gap": lambda one: number(one.solved["gap"]),
+            "equality residual": lambda one: number(one.solved["equality_residual"]),
             "excess known": show_excess,
             "error": lambda one: number(one.error),
             "memory, MB": lambda one: f"{number(one.peak_mb)} / {number(one.before_mb)}",
@@ -463,8 +410,8 @@ def _show_searches(searches: Sequence[Search]) -> str:
     return table_of(
         searches,
         {
-            "graph": lambda one: one.name,
-            "cameras": lambda one: str(one.problem.spec.n),
+            "graph": lambda one: f"{one.spec.family}-{one.spec.n}",
+            "cameras": lambda one: str(one.spec.n),
             "pairs": lambda one: str(one.num_pairs),
             "pieces; single pairs": lambda one: f"{one.num_pieces}; {one.num_single_pairs}",
             "seconds (CPU)": lambda one: f"{number(one.wall_s)} ({number(one.cpu_s)})",
@@ -508,7 +455,7 @@ def _exponent_cells(found: Sequence[Measured]) -> list[str]:
         [one.total_s for one in found],
         [one.peak_mb - one.before_mb for one in found],
     )
-    sizes = " ".join(f"{n:.0e}".replace("e+0", "e") for n in cameras)
+    sizes = " ".join(map(_show_size, cameras))
     exponents = [f"{exponent(cameras, v):.2f} / {exponent(pairs, v):.2f}".replace("nan", "-") for v in values]
     return [sizes, *exponents]
 

@@ -32,13 +32,16 @@ from benchmarks.real import SCENES
 from harness import ours
 from harness.driver import Benchmark, Case, if_there
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, median, number, numbers, ratio, times, verdict
+from harness.metrics import Check, Quantity, check_all, median, number, numbers, ratio, times, verdict
 from harness.process import call, thread_environment
 from harness.record import table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import SolverResult, ViewGraph
     from sfm_shapefit.arrays import FloatArray
+
+    Solution = tuple[FloatArray, FloatArray | None, int]
+    """Locations, dual if the solver gives one, iterations."""
 
 TOL = 1e-8
 SIGMAS = (0.0, 0.05)
@@ -94,16 +97,9 @@ class Compared:
     num_edges: int
     contenders: tuple[Contender, ...]
 
-    @property
-    def wall_ratios(self) -> list[float]:
-        """How many times longer each rival takes; NaN if it failed."""
-        first, *rivals = (median(one.wall_s) for one in self.contenders)
-        return [ratio(rival, first) for rival in rivals]
-
-    @property
-    def cpu_ratios(self) -> list[float]:
-        """The same in processor time."""
-        first, *rivals = (median(one.cpu_s) for one in self.contenders)
+    def ratios(self, column: str = "wall_s") -> list[float]:
+        """Return how many times longer each rival takes, also in "cpu_s"; NaN if it failed."""
+        first, *rivals = (median(getattr(one, column)) for one in self.contenders)
         return [ratio(rival, first) for rival in rivals]
 
 
@@ -174,15 +170,12 @@ def first_solve() -> float:
     return time.perf_counter() - start
 
 
-# --- measuring -------------------------------------------------------------------------------------
-
-
 def solve_ours(graph: "ViewGraph", tol: float, method: str = "newton") -> "SolverResult":
     """Solve and certify with our solver."""
     return ours.solve(graph, solver=method, tol=tol)
 
 
-def solve_cvxpy(graph: "ViewGraph", tol: float) -> tuple["FloatArray", int]:
+def solve_cvxpy(graph: "ViewGraph", tol: float) -> "Solution":
     """Write the program down as in the paper, with a scale near 1, and let cvxpy and Clarabel solve it."""
     import cvxpy as cp
 
@@ -196,7 +189,7 @@ def solve_cvxpy(graph: "ViewGraph", tol: float) -> tuple["FloatArray", int]:
         [cp.sum(lengths) == m, cp.sum(t, axis=0) == 0],
     )
     problem.solve(solver=cp.CLARABEL, tol_gap_abs=tol, tol_gap_rel=tol, tol_feas=tol, max_threads=1)
-    return t.value, int(problem.solver_stats.num_iters)
+    return t.value, None, int(problem.solver_stats.num_iters)
 
 
 def compare(spec: GraphSpec, repeats: int) -> Compared:
@@ -207,21 +200,17 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
     graph = view_graph(problem)
     bound = solve_ours(graph, 1e-3 * TOL).dual_bound
 
-    def our_own(tol: float) -> tuple["FloatArray", "FloatArray | None", int]:
+    def our_own(tol: float) -> "Solution":
         found = solve_ours(graph, tol)
         return found.locations, found.dual, found.iterations
 
-    def cvxpy(tol: float) -> tuple["FloatArray", "FloatArray | None", int]:
-        locations, iterations = solve_cvxpy(graph, tol)
-        return locations, None, iterations
-
-    def direct(tol: float) -> tuple["FloatArray", "FloatArray | None", int]:
-        found = solve_direct(graph, tol)
-        return found.locations, found.dual, found.iterations
-
-    solvers = {"ours": our_own, "cvxpy + Clarabel": cvxpy, "Clarabel directly": direct}
+    solvers: dict[str, Callable[[float], Solution]] = {
+        "ours": our_own,
+        "cvxpy + Clarabel": partial(solve_cvxpy, graph),
+        "Clarabel directly": partial(solve_direct, graph),
+    }
     tuned = {name: _tune(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()}
-    turns: dict[str, list[list[tuple[float, float]]]] = {name: [] for name in solvers}
+    turns: dict[str, list[list[ours.Timed]]] = {name: [] for name in solvers}
     for name in [name for _ in range(repeats) for name in solvers if not tuned[name].failure]:
         turns[name].append(_turn(solvers[name], tuned[name].tolerance))
     contenders = tuple(_with_times(tuned[name], turns[name]) for name in solvers)
@@ -230,7 +219,7 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
 
 def _tune(
     name: str,
-    solver: Callable[[float], tuple["FloatArray", "FloatArray | None", int]],
+    solver: Callable[[float], "Solution"],
     graph: "ViewGraph",
     truth: "FloatArray",
     bound: float,
@@ -249,41 +238,37 @@ def _tune(
             return best if not best.failure else Contender(name=name, tolerance=tol, failure=reason)
         if locations is None:
             return best
-        centered = locations - locations.mean(axis=0)
-        proved = math.nan if dual is None else certify(graph, centered, dual, uniqueness=False).gap
-        found = Contender(
-            name=name,
-            tolerance=tol,
-            error=relative_error(locations, truth),
-            excess=objective(graph, locations) - bound,
-            gap=proved,
-            iterations=iterations,
-        )
-        if best.failure or found.excess < best.excess:
-            best = found
-        if found.excess <= TOL:
+        centered, excess = locations - locations.mean(axis=0), objective(graph, locations) - bound
+        if best.failure or excess < best.excess:
+            best = Contender(
+                name=name,
+                tolerance=tol,
+                error=relative_error(locations, truth),
+                excess=excess,
+                gap=math.nan if dual is None else certify(graph, centered, dual, uniqueness=False).gap,
+                iterations=iterations,
+            )
+        if excess <= TOL:
             break
         tol /= 10.0
     return best
 
 
-def _turn(solver: Callable[[float], object], tol: float) -> list[tuple[float, float]]:
-    """Run a solver for TURN_S, BURST times at least; return the wall-clock and CPU seconds of each run."""
-    runs: list[tuple[float, float]] = []
-    while len(runs) < BURST or sum(wall for wall, _ in runs) < TURN_S:
-        start, cpu_start = time.perf_counter(), time.process_time()
-        solver(tol)
-        runs.append((time.perf_counter() - start, time.process_time() - cpu_start))
+def _turn(solver: Callable[[float], object], tol: float) -> list[ours.Timed]:
+    """Run a solver for TURN_S, BURST times at least."""
+    runs: list[ours.Timed] = []
+    while len(runs) < BURST or sum(run.wall_s for run in runs) < TURN_S:
+        runs.append(ours.time_call(lambda: solver(tol))._replace(found=None))
     return runs
 
 
-def _with_times(contender: Contender, turns: Sequence[Sequence[tuple[float, float]]]) -> Contender:
+def _with_times(contender: Contender, turns: Sequence[Sequence[ours.Timed]]) -> Contender:
     runs = [run for turn in turns for run in turn]
     return replace(
         contender,
-        wall_s=tuple(wall for wall, _ in runs),
-        cpu_s=tuple(cpu for _, cpu in runs),
-        first_s=tuple(turn[0][0] for turn in turns),
+        wall_s=tuple(run.wall_s for run in runs),
+        cpu_s=tuple(run.cpu_s for run in runs),
+        first_s=tuple(turn[0].wall_s for turn in turns),
     )
 
 
@@ -298,9 +283,8 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     wall: dict[str, list[float]] = {"auto": [], "newton": []}
     for _ in range(REAL_REPEATS):
         for method, seconds in wall.items():
-            start = time.perf_counter()
-            solve_ours(graph, TOL, method)
-            seconds.append(time.perf_counter() - start)
+            run = ours.time_call(lambda method=method: solve_ours(graph, TOL, method))
+            seconds.append(run.wall_s)
     return RealGraph(
         name=name,
         num_cameras=graph.num_nodes - num_points,
@@ -318,9 +302,6 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     )
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(one: Compared | RealGraph | FirstSolve) -> list[Check]:
     """Return the limits of one case."""
     if isinstance(one, RealGraph):
@@ -333,7 +314,7 @@ def ratio_checks(one: Compared) -> list[Check]:
     if one.spec.n not in TARGETS:
         return []
     limits = [targets[SIGMAS.index(one.spec.sigma)] for targets in TARGETS[one.spec.n]]
-    rivals = zip(one.contenders[1:], one.wall_ratios, limits, strict=True)
+    rivals = zip(one.contenders[1:], one.ratios(), limits, strict=True)
     return [
         Check(name="gap", value=one.contenders[0].gap, limit=TOL),
         *(Check(name=r.name, value=value, limit=limit, better="higher") for r, value, limit in rivals),
@@ -342,16 +323,13 @@ def ratio_checks(one: Compared) -> list[Check]:
 
 def real_checks(one: RealGraph) -> list[Check]:
     """Return the checks of one real graph: of time only without points."""
-    values = {"gap": one.gap, "factorizations": one.factorizations}
-    if one.num_points == 0:
-        values["ms"] = 1e3 * median(one.wall_s)
-    return [Check(name=name, value=value, limit=REAL_LIMITS[name]) for name, value in values.items()]
+    values = {"gap": one.gap, "factorizations": one.factorizations, "ms": 1e3 * median(one.wall_s)}
+    return check_all(values, {k: v for k, v in REAL_LIMITS.items() if k != "ms" or one.num_points == 0})
 
 
 def tables(
     measured: Mapping[str, Compared | RealGraph | FirstSolve], _args: argparse.Namespace
 ) -> Iterator[str]:
-    """Yield the parts of the section."""
     compared = [one for one in measured.values() if isinstance(one, Compared)]
     real = [one for one in measured.values() if isinstance(one, RealGraph)]
     for one in measured.values():
@@ -401,11 +379,11 @@ def _compare_ratios(compared: Sequence[Compared]) -> str:
             "ours, ms": lambda one: number(one.contenders[0].wall_ms),
             "cvxpy, ms": lambda one: number(one.contenders[1].wall_ms),
             "Clarabel, ms": lambda one: number(one.contenders[2].wall_ms),
-            "ratio to cvxpy": lambda one: times(one.wall_ratios[0]),
+            "ratio to cvxpy": lambda one: times(one.ratios()[0]),
             "cvxpy, to reach": lambda one: show_limit(one, 1),
-            "ratio to Clarabel": lambda one: times(one.wall_ratios[1]),
+            "ratio to Clarabel": lambda one: times(one.ratios()[1]),
             "Clarabel, to reach": lambda one: show_limit(one, 2),
-            "CPU ratios": lambda one: " / ".join(map(times, one.cpu_ratios)),
+            "CPU ratios": lambda one: " / ".join(map(times, one.ratios("cpu_s"))),
             "verdict": lambda one: verdict(ratio_checks(one)),
         },
     )

@@ -108,12 +108,9 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     return found
 
 
-# --- calibration -----------------------------------------------------------------------------------
-
-
 def calibrate_graph(name: str, wrong: float, seeds: int) -> Calibration:
     """Compare errors with standard deviations on graphs of one kind."""
-    ratios = [graph_ratios(GRAPHS[name](seed, wrong)) for seed in range(seeds)]
+    ratios = [graph_ratios(draw_graph(name, seed, wrong)) for seed in range(seeds)]
     return _summarize(f"graph {name}, {wrong:.0%} wrong", np.concatenate(ratios))
 
 
@@ -166,9 +163,6 @@ def scene_ratios(shape: str, seed: int) -> "FloatArray":
     return _placement_ratios(found.placement, scene.centers)
 
 
-# --- ranking ---------------------------------------------------------------------------------------
-
-
 def rank(name: str, seeds: int) -> Ranking:
     """Rank the cameras of spoiled graphs by their trust."""
     found = [rank_graph(SPOILED[name](seed)) for seed in range(seeds)]
@@ -198,9 +192,6 @@ def rank_graph(graph: Graph) -> tuple[float, int]:
     return area_under_curve(placement.assessment.trust, bad) if bad.any() else 0.0, int(bad.sum())
 
 
-# --- synthetic problems ----------------------------------------------------------------------------
-
-
 def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", seed: int) -> Graph:
     """Return directions with normal errors of known, varying size, and random ones where `wrong`."""
     from sfm_shapefit.geometry import normalized, tangent_bases
@@ -219,28 +210,21 @@ def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", see
     )
 
 
-def _random(seed: int, wrong: float) -> Graph:
-    from sfm_shapefit.synthetic import random_graph_problem
+GRAPHS: dict[str, tuple[str, int, float]] = {
+    "random": ("random_graph_problem", 80, 0.4),
+    "box": ("box_graph_problem", 200, 20.0),
+    "community": ("community_graph_problem", 200, 30.0),
+}
+"""Functions of `sfm_shapefit.synthetic` and their arguments."""
 
-    problem = random_graph_problem(80, 0.4, q=wrong, seed=seed)
+
+def draw_graph(name: str, seed: int, wrong: float = 0.0) -> Graph:
+    """Return a graph of a kind, a share of whose directions is wrong."""
+    from sfm_shapefit import synthetic
+
+    function, n, density = GRAPHS[name]
+    problem = getattr(synthetic, function)(n, density, q=wrong, seed=seed)
     return _measure(problem.locations, problem.edges, problem.corrupted, seed)
-
-
-def _box(seed: int, wrong: float) -> Graph:
-    from sfm_shapefit.synthetic import box_graph_problem
-
-    problem = box_graph_problem(200, 20.0, q=wrong, seed=seed)
-    return _measure(problem.locations, problem.edges, problem.corrupted, seed)
-
-
-def _community(seed: int, wrong: float) -> Graph:
-    from sfm_shapefit.synthetic import community_graph_problem
-
-    problem = community_graph_problem(200, 30.0, q=wrong, seed=seed)
-    return _measure(problem.locations, problem.edges, problem.corrupted, seed)
-
-
-GRAPHS: dict[str, Callable[[int, float], Graph]] = {"random": _random, "box": _box, "community": _community}
 
 
 def _chosen(seed: int, graph: Graph) -> "BoolArray":
@@ -254,7 +238,7 @@ def _chosen(seed: int, graph: Graph) -> "BoolArray":
 
 def concentrate(seed: int) -> Graph:
     """A tenth of the cameras have 70 % wrong pairs."""
-    graph = _box(seed, 0.0)
+    graph = draw_graph("box", seed)
     own = _chosen(seed, graph)[graph.edges].any(axis=1)
     wrong = own & (np.random.default_rng(3000 + seed).random(len(graph.edges)) < 0.7)
     return _measure(graph.locations, graph.edges, wrong, seed)
@@ -264,7 +248,7 @@ def turn_cameras(seed: int) -> Graph:
     """A tenth of the cameras are turned by 20 degrees, the directions of their pairs half as far."""
     from sfm_shapefit.geometry import normalized
 
-    graph = _box(seed, 0.0)
+    graph = draw_graph("box", seed)
     axes = normalized(np.random.default_rng(3000 + seed).standard_normal(graph.locations.shape))
     turns = np.where(_chosen(seed, graph)[:, None], np.radians(20.0) * axes, 0.0)
     moved = np.cross(turns[graph.edges].sum(axis=1) / 2.0, graph.directions)
@@ -278,7 +262,7 @@ def turn_cameras(seed: int) -> Graph:
 
 def weaken(seed: int) -> Graph:
     """A tenth of the cameras have three pairs."""
-    graph = _box(seed, 0.0)
+    graph = draw_graph("box", seed)
     kept = np.ones(len(graph.edges), dtype=np.bool_)
     for camera in np.flatnonzero(_chosen(seed, graph)).tolist():
         own = np.flatnonzero((graph.edges == camera).any(axis=1) & kept)
@@ -292,9 +276,6 @@ SPOILED: dict[str, Callable[[int], Graph]] = {
     "10 % of the cameras turned by 20 degrees": turn_cameras,
     "10 % of the cameras with three pairs": weaken,
 }
-
-
-# --- real scenes -----------------------------------------------------------------------------------
 
 
 def flag(folder: Path) -> Flagged:
@@ -331,9 +312,6 @@ def rotation_errors_deg(model: "PosedModel", truth: "PosedModel") -> "FloatArray
     return errors
 
 
-# --- the section -----------------------------------------------------------------------------------
-
-
 def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
     """Return the limits of one case; sets whose truth gives their rotations have none."""
     if isinstance(one, Calibration):
@@ -356,7 +334,6 @@ def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
 def tables(
     measured: Mapping[str, Calibration | Ranking | Flagged], _args: argparse.Namespace
 ) -> Iterator[str]:
-    """Yield the parts of the section."""
     found = list(measured.values())
     yield "## Standard deviations"
     yield table_of(

@@ -22,10 +22,6 @@ STUB_M = 1.5
 """Length at which directions are drawn; they have none."""
 
 
-def add_arguments(_parser: argparse.ArgumentParser) -> None:
-    """Declare no arguments beside the common ones."""
-
-
 def run(args: argparse.Namespace) -> None:
     """Locate the cameras of the courtyard and draw them."""
     found = sfm_shapefit.locate(SCENE / "truth", SCENE / "database.db")

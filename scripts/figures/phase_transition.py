@@ -6,11 +6,11 @@ go on where they were. Source: Hand, Lee, Voroninski (2015), section 4.
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import matplotlib as mpl
 import numpy as np
@@ -65,60 +65,36 @@ NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
 FINE, COARSE = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
 
 
-def panels(figure: str) -> list[Panel]:
-    """Return the panels of a figure."""
-    return FIGURES[figure]()
-
-
 def _paper(method: str = "ShapeFit") -> list[Panel]:
     return [Panel(f"{method}, {words}", method, *FINE, sigma=s) for s, words in NOISES]
 
 
-def _reference() -> list[Panel]:
-    return _paper() + _paper("ShapeFit, conic")
+def _coarse(title: str, method: str, **settings: Any) -> Panel:
+    return Panel(title, method, *COARSE, **settings)
 
 
-def _methods() -> list[Panel]:
-    methods = ("ShapeFit", "refined", "LUD", "least squares")
-    return [Panel(f"{m}, {words}", m, *COARSE, sigma=s) for s, words in NOISES for m in methods]
-
-
-def _corruption() -> list[Panel]:
-    methods = ("ShapeFit", "refined", "LUD")
-    return [
-        Panel(f"{m}, {kind}", m, *COARSE, corruption=kind) for kind in get_args(Corruption) for m in methods
-    ]
-
-
-def _density() -> list[Panel]:
-    return [Panel(f"ShapeFit, p = {p}", "ShapeFit", *COARSE, p=p) for p in (0.25, 0.5, 0.75)]
-
-
-def _dimension() -> list[Panel]:
-    low = [Panel(f"ShapeFit, d = {d}", "ShapeFit", *COARSE, d=d) for d in (2, 3, 10)]
-    return [*low, Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50)]
-
-
-def _large() -> list[Panel]:
-    return [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])]
-
-
-FIGURES: dict[str, Callable[[], list[Panel]]] = {
-    "paper": _paper,
-    "reference": _reference,
-    "methods": _methods,
-    "corruption": _corruption,
-    "density": _density,
-    "dimension": _dimension,
-    "large": _large,
+METHODS_SHOWN = ("ShapeFit", "refined", "LUD", "least squares")
+FIGURES: dict[str, list[Panel]] = {
+    "paper": _paper(),
+    "reference": _paper() + _paper("ShapeFit, conic"),
+    "methods": [_coarse(f"{m}, {words}", m, sigma=s) for s, words in NOISES for m in METHODS_SHOWN],
+    "corruption": [
+        _coarse(f"{m}, {kind}", m, corruption=kind)
+        for kind in get_args(Corruption)
+        for m in METHODS_SHOWN[:3]
+    ],
+    "density": [_coarse(f"ShapeFit, p = {p}", "ShapeFit", p=p) for p in (0.25, 0.5, 0.75)],
+    "dimension": [
+        *(_coarse(f"ShapeFit, d = {d}", "ShapeFit", d=d) for d in (2, 3, 10)),
+        Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50),
+    ],
+    "large": [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])],
 }
 
 
 def quick(panel: Panel) -> Panel:
     """Return the panel with few cells: what the tests run."""
-    return Panel(
-        panel.title, panel.method, (10, 30), (0.0, 0.2), panel.sigma, panel.p, panel.d, panel.corruption
-    )
+    return replace(panel, n=(10, 30), q=(0.0, 0.2))
 
 
 def compute(shown: Sequence[Panel], trials: int, cache: Path | None, processes: int) -> Results:
@@ -234,7 +210,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> None:
     """Compute and draw a figure, and say what the paper's text says of its own."""
-    shown, trials = panels(args.figure), args.trials
+    shown, trials = FIGURES[args.figure], args.trials
     if args.quick:
         shown, trials = [quick(panel) for panel in shown], 2
     results = compute(shown, trials, args.cache, args.processes)

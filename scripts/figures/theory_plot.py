@@ -115,10 +115,6 @@ def report(label: str, values: Sequence[float], points: list[Point]) -> str:
     return "\n".join(lines)
 
 
-def add_arguments(_parser: argparse.ArgumentParser) -> None:
-    """Declare no arguments beside the common ones."""
-
-
 def run(args: argparse.Namespace) -> None:
     """Compute and draw the curves, and print the figures behind them."""
     sizes, densities = (QUICK_SIZES, QUICK_DENSITIES) if args.quick else (SIZES, DENSITIES)

@@ -84,15 +84,10 @@ def run_trials(
     processes: int = 2,
     seed: int = 0,
 ) -> Results:
-    """Run all trials that the cache does not hold, with a progress bar on stderr.
+    """Run all trials that the cache, an npz file, does not hold, with a progress bar on stderr.
 
-    Args:
-        cells: settings.
-        methods: names in `METHODS`.
-        trials: problems per cell.
-        cache: npz file; one that belongs to other settings is an error.
-        processes: worker processes, one thread each.
-        seed: first number of every problem's seed.
+    Raises:
+        ValueError: if the cache belongs to other settings.
     """
     settings = {"cells": [asdict(c) for c in cells], "methods": list(methods), "trials": trials, "seed": seed}
     values = np.full((len(cells), len(methods), trials, len(Trial._fields)), np.nan)
@@ -122,14 +117,15 @@ def _compute(
 ) -> Iterator[tuple[list[int], FloatArray]]:
     """Yield batches of rows and their values as they are done; the largest problems go first."""
     order = sorted(missing.tolist(), key=lambda k: -cells[k].n)
-    batches = [order[k :: max(len(order) // _BATCH, 1)] for k in range(max(len(order) // _BATCH, 1))]
-    batches = [batch for batch in batches if batch]
-    if not batches:
+    if not order:
         return
+    step = max(len(order) // _BATCH, 1)
+    batches = [order[k::step] for k in range(step)]
     # The spawned workers read it when they load numpy.
     os.environ.update(thread_environment(1))
+    columns = (TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with (
-        _make_bar(len(order)) as progress,
+        Progress(*columns, console=Console(stderr=True)) as progress,
         ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
     ):
         bar = progress.add_task("trials", total=len(order))
@@ -142,25 +138,13 @@ def _compute(
             yield running[done], done.result()
 
 
-def _make_bar(total: int) -> Progress:
-    columns = (TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True), disable=total == 0)
-
-
 def run_batch(cells: Sequence[Cell], methods: Sequence[str], trials: int, seed: int) -> FloatArray:
     """Return the values of all trials of some cells; what a worker process does."""
-    return np.array(
-        [
-            np.transpose(
-                [
-                    [trial(problem, METHODS[name]) for name in methods]
-                    for problem in problems(c, trials, seed)
-                ],
-                (1, 0, 2),
-            )
-            for c in cells
-        ]
-    )
+    values = [
+        [[trial(problem, METHODS[name]) for name in methods] for problem in problems(cell, trials, seed)]
+        for cell in cells
+    ]
+    return np.swapaxes(values, 1, 2)
 
 
 def problems(cell: Cell, trials: int, seed: int) -> Iterator[GraphProblem]:

@@ -36,8 +36,13 @@ Case = Callable[[], Any] | str
 """A function to be called in a fresh process, or the reason why the case is skipped."""
 
 
-def no_flags(parser: argparse.ArgumentParser) -> None:
+def no_flags(_parser: argparse.ArgumentParser) -> None:
     """Declare no arguments beside the common ones."""
+
+
+def no_checks(_found: Any) -> Sequence[Check]:
+    """Return nothing: the tables compare, and have no limit."""
+    return ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,11 +53,11 @@ class Benchmark:
     title: str
     cases: Callable[[argparse.Namespace], Mapping[str, Case]]
     """By name; a case can be pickled, such as a `partial` of a function of a module."""
-    checks: Callable[[Any], Sequence[Check]]
-    """The limits of what one case gave."""
     tables: Callable[[Mapping[str, Any], argparse.Namespace], Iterable[str]]
     """The parts of the section, of what all cases gave."""
     quantities: Sequence[Quantity]
+    checks: Callable[[Any], Sequence[Check]] = no_checks
+    """The limits of what one case gave."""
     packages: Sequence[str] = ("numpy", "scipy", "numba", "pycolmap")
     flags: Callable[[argparse.ArgumentParser], None] = no_flags
     quick: Mapping[str, Any] = field(default_factory=dict)

@@ -5,7 +5,7 @@ A limit is met by the value as measured, not as printed; a value that is not fin
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -47,6 +47,11 @@ class Check:
     def __str__(self) -> str:
         sign = ">" if self.better == "lower" else "<"
         return "met" if self.met else f"{self.name} {number(self.value)} {sign} {number(self.limit)}"
+
+
+def check_all(values: Mapping[str, float], limits: Mapping[str, float]) -> list[Check]:
+    """Return the check of each value that has an upper limit of the same name."""
+    return [Check(name=name, value=values[name], limit=limit) for name, limit in limits.items()]
 
 
 def verdict(checks: Sequence[Check]) -> str:

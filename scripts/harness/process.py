@@ -36,14 +36,9 @@ def call(
     timeout_s: float | None = None,
     cpu_limit_s: int | None = None,
 ) -> Any:
-    """Call a function in a fresh process and return its result.
+    """Call a function in a fresh process, with further environment variables, and return its result.
 
-    Args:
-        function: of a module that can be imported; its arguments and its result are pickled.
-        args: its arguments.
-        environment: variables to set for that process, on top of this one's.
-        timeout_s: wall-clock limit, imports included.
-        cpu_limit_s: limit of the process's own CPU time, imports included: the same on a loaded machine.
+    Arguments and result are pickled. The limits of wall-clock and CPU time include imports.
 
     Raises:
         TimeoutError: if a limit passed; the process is ended.

@@ -9,7 +9,7 @@ B_e of the complement of v_e:
 The multiplier of edge e is (w_e, z_e) in the same cone, and y_e = -B_e z_e the dual of the program.
 """
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -18,16 +18,11 @@ if TYPE_CHECKING:
     from sfm_shapefit.viewgraph import ViewGraph
 
 
-class DirectAnswer(NamedTuple):
-    """What Clarabel returned."""
+def solve_direct(graph: "ViewGraph", tol: float) -> "tuple[FloatArray, FloatArray, int]":
+    """Build the cone program and solve it with Clarabel's tolerances set to `tol`, on one thread.
 
-    locations: "FloatArray"
-    dual: "FloatArray"
-    iterations: int
-
-
-def solve_direct(graph: "ViewGraph", tol: float) -> DirectAnswer:
-    """Build the cone program and solve it with Clarabel's tolerances set to `tol`, on one thread."""
+    Returns locations, the dual of the program, and the number of iterations.
+    """
     import clarabel
     from scipy.sparse import csc_array
 
@@ -60,7 +55,7 @@ def solve_direct(graph: "ViewGraph", tol: float) -> DirectAnswer:
     ).solve()
     t = np.vstack([np.zeros((1, d)), np.reshape(solution.x[: (n - 1) * d], (-1, d))])
     z = np.reshape(solution.z[1:], (m, d))[:, 1:]
-    return DirectAnswer(t, -np.einsum("edk,ek->ed", bases, z), int(solution.iterations))
+    return t, -np.einsum("edk,ek->ed", bases, z), int(solution.iterations)
 
 
 def _cone_entries(graph: "ViewGraph", bases: "FloatArray") -> tuple["FloatArray", "np.ndarray", "np.ndarray"]:

@@ -20,8 +20,8 @@ import tempfile
 import time
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,8 +33,7 @@ MIN_VIEWS = 3
 MAX_SPREAD_PX = 10.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
+class Setting(NamedTuple):
     """Which pairs GLOMAP's positioning sees."""
 
     min_num_matches: int
@@ -43,11 +42,8 @@ class Setting:
     @property
     def label(self) -> str:
         """The setting in words, for the table."""
-        filtered = (
-            ""
-            if self.max_rotation_error_deg is None
-            else f", rotations within {self.max_rotation_error_deg:g} deg"
-        )
+        limit_deg = self.max_rotation_error_deg
+        filtered = "" if limit_deg is None else f", rotations within {limit_deg:g} deg"
         return f"min_num_matches {self.min_num_matches}{filtered}"
 
 
@@ -58,8 +54,7 @@ SETTINGS = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Positioned:
+class Positioned(NamedTuple):
     """What one run of the positioning gave."""
 
     reconstruction: pycolmap.Reconstruction
@@ -93,12 +88,7 @@ def copy_database(database: Path, folder: Path) -> Path:
 
 
 def position(database: Path, model: Path, setting: Setting) -> Positioned:
-    """Run GLOMAP's positioning with the rotations and intrinsics of `model`.
-
-    Args:
-        database: the COLMAP database; only a copy of it is opened.
-        model: folder of the model that gives rotations and intrinsics; its centers and points are not used.
-        setting: which pairs are used.
+    """Run GLOMAP's positioning with the rotations and intrinsics of a model, not its centers and points.
 
     Raises:
         RuntimeError: if no pair is left, or pycolmap reports that the positioning failed.
@@ -134,17 +124,9 @@ def map_database(
     refine_sensors: bool | None = None,
     num_threads: int = -1,
 ) -> tuple[pycolmap.Reconstruction, float]:
-    """Run pycolmap's whole mapping: own rotations, positioning, triangulation, bundle adjustment.
+    """Run pycolmap's whole mapping, global or incremental; return the largest model and the seconds.
 
-    Args:
-        database: the COLMAP database; only a copy of it is opened.
-        min_num_matches: pairs with fewer matches are not used.
-        incremental: image by image instead of globally.
-        refine_sensors: whether global mapping changes sensors in their rigs; its default if None.
-        num_threads: of pycolmap; -1 for all.
-
-    Returns:
-        The largest model and the seconds of the call.
+    `refine_sensors` says whether global mapping changes sensors in their rigs; its default if None.
 
     Raises:
         RuntimeError: if no model came out.
@@ -176,11 +158,6 @@ def average_rotations(database: Path, model: Path, min_num_matches: int = 15) ->
     are those of `model`, so that runs on averaged and on given rotations differ in the rotations only.
     Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in
     GLOMAP.
-
-    Args:
-        database: the COLMAP database; only a copy of it is opened.
-        model: folder of the model that gives the intrinsics and the images; its poses are not used.
-        min_num_matches: pairs with fewer verified matches are not averaged.
 
     Raises:
         RuntimeError: if pycolmap reports that the averaging failed.
@@ -291,14 +268,9 @@ def consistent_tracks(
 ) -> list[npt.NDArray[np.int64]]:
     """Return the tracks of matched keypoints, each as ascending keypoint indices, one keypoint per image.
 
-    Args:
-        matches: (m, 2) indices of keypoints that match.
-        image_of: (k,) the image of each keypoint; ascending.
-        xy: (k, 2) pixels.
-
-    Returns:
-        Tracks seen by at least `MIN_VIEWS` images, without those that have two keypoints in one image that
-        are more than `MAX_SPREAD_PX` from each other's first.
+    Given are the pairs of keypoints (m, 2), and of each its image (k,), ascending, and pixels (k, 2). Left
+    out are tracks of fewer than `MIN_VIEWS` images, and those with a keypoint farther than `MAX_SPREAD_PX`
+    from the first one of its image.
     """
     count = len(image_of)
     joined = coo_array(

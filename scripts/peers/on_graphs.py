@@ -18,7 +18,7 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from harness import ours
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
@@ -37,15 +37,12 @@ _GTSAM_SIGMA, _HUBER = 0.01, 1.345
 _SHAPEFIT_TOL = 1e-6
 
 PROBLEMS = {
-    "er2-100": GraphSpec(family="er2", n=100, sigma=0.01),
-    "er2-300": GraphSpec(family="er2", n=300, sigma=0.01),
-    "geo-1000": GraphSpec(family="geo", n=1000, degree=40.0, sigma=0.01),
-    "geo-5000": GraphSpec(family="geo", n=5000, degree=40.0, sigma=0.01),
-    "comm-1000": GraphSpec(family="comm", n=1000, degree=67.0, sigma=0.01),
-    "lawn-1000": GraphSpec(family="lawn", n=1000, degree=20.0, sigma=0.01),
-    "ring-500": GraphSpec(family="ring", n=500, degree=20.0, sigma=0.01),
-    "corr-500": GraphSpec(family="corr", n=500, degree=20.0, sigma=0.01),
-    "seq-300": GraphSpec(family="seq", n=300, degree=36.0, sigma=0.01),
+    f"{family}-{n}": GraphSpec(family=family, n=n, degree=degree, sigma=0.01)
+    for family, n, degree in (
+        *(("er2", 100, 0.0), ("er2", 300, 0.0), ("geo", 1000, 40.0), ("geo", 5000, 40.0)),
+        *(("comm", 1000, 67.0), ("lawn", 1000, 20.0), ("ring", 500, 20.0), ("corr", 500, 20.0)),
+        ("seq", 300, 36.0),
+    )
 }
 WARM_UP = {
     # Above 450 unknowns there are factors in single precision too.
@@ -86,9 +83,6 @@ class Compared:
     answers: tuple[Answer, ...]
 
 
-# --- running ---------------------------------------------------------------------------------------
-
-
 def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
     """Return a contender's answer, or why there is none."""
     empty = Answer(name=contender.name, ours=contender.package is None)
@@ -107,8 +101,6 @@ def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
         return replace(empty, note=f"failed: {reason}")
     return replace(empty, error=error, seconds=seconds, cpu_s=cpu_s, note=note, peak_mb=peak_mb)
 
-
-# --- the contenders --------------------------------------------------------------------------------
 
 Solver = Callable[[], tuple["FloatArray", str]]
 """Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
@@ -131,14 +123,14 @@ def _prepare_place(graph: "ViewGraph") -> Solver:
     return run_it
 
 
-def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["ViewGraph"], Solver]:
+def _prepare_pytheia(nonlinear: bool) -> Callable[["ViewGraph"], Solver]:
     def prepare(graph: "ViewGraph") -> Solver:
         import numpy as np
-        import pytheia
+        from pytheia import sfm
 
         pairs = {}
         for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
-            info = pytheia.sfm.TwoViewInfo()
+            info = sfm.TwoViewInfo()
             info.rotation_2 = np.zeros(3)
             # Where the second camera is, seen from the first.
             info.position_2 = -v if i < j else v
@@ -148,23 +140,18 @@ def _prepare_pytheia(estimate: Callable[[Any, Any, Any], Any]) -> Callable[["Vie
 
         def run_it() -> tuple["FloatArray", str]:
             with _silence():
-                found = estimate(pytheia.sfm, pairs, orientations)
+                if nonlinear:
+                    options = sfm.NonlinearPositionEstimatorOptions()
+                    estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
+                else:
+                    options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
+                    estimator = sfm.LeastUnsquaredDeviationPositionEstimator(options)
+                found = estimator.EstimatePositions(pairs, orientations)
             return _gather({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
 
         return run_it
 
     return prepare
-
-
-def _pytheia_lud(sfm: Any, pairs: Any, orientations: Any) -> Any:
-    options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
-    return sfm.LeastUnsquaredDeviationPositionEstimator(options).EstimatePositions(pairs, orientations)
-
-
-def _pytheia_nonlinear(sfm: Any, pairs: Any, orientations: Any) -> Any:
-    options = sfm.NonlinearPositionEstimatorOptions()
-    estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
-    return estimator.EstimatePositions(pairs, orientations)
 
 
 def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph"], Solver]:
@@ -192,7 +179,7 @@ def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph
     return prepare
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Contender:
     """A solver of bare graphs and the package it needs; None: ours."""
 
@@ -204,21 +191,14 @@ class Contender:
 
 
 CONTENDERS = (
-    Contender(name="ours, placed", prepare=_prepare_place),
-    Contender(name="ours, ShapeFit", prepare=_prepare_shapefit),
-    Contender(name="pytheia LUD", prepare=_prepare_pytheia(_pytheia_lud), package="pytheia"),
-    Contender(
-        name="pytheia Nonlinear", prepare=_prepare_pytheia(_pytheia_nonlinear), package="pytheia", runs=3
-    ),
-    Contender(name="gtsam TranslationRecovery", prepare=_prepare_gtsam(robust=False), package="gtsam"),
-    Contender(name="gtsam with Huber", prepare=_prepare_gtsam(robust=True), package="gtsam"),
-    Contender(
-        name="gtsam bilinear with Huber", prepare=_prepare_gtsam(robust=True, bilinear=True), package="gtsam"
-    ),
+    Contender("ours, placed", _prepare_place),
+    Contender("ours, ShapeFit", _prepare_shapefit),
+    Contender("pytheia LUD", _prepare_pytheia(nonlinear=False), "pytheia"),
+    Contender("pytheia Nonlinear", _prepare_pytheia(nonlinear=True), "pytheia", runs=3),
+    Contender("gtsam TranslationRecovery", _prepare_gtsam(robust=False), "gtsam"),
+    Contender("gtsam with Huber", _prepare_gtsam(robust=True), "gtsam"),
+    Contender("gtsam bilinear with Huber", _prepare_gtsam(robust=True, bilinear=True), "gtsam"),
 )
-
-
-# --- measuring -------------------------------------------------------------------------------------
 
 
 def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float]:
@@ -271,9 +251,6 @@ def _silence() -> Iterator[None]:
             os.dup2(descriptor, target)
             os.close(descriptor)
         os.close(nowhere)
-
-
-# --- what is to be reached -------------------------------------------------------------------------
 
 
 def best_of_ours(one: Compared) -> Answer | None:

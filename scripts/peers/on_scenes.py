@@ -83,15 +83,7 @@ def contenders() -> tuple[str, ...]:
 
 
 def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, cpu_limit_s: int) -> Row:
-    """Return a contender's answer on a set, or why there is none.
-
-    Args:
-        name: one of `contenders`.
-        folder: of the set.
-        scene: what the set is.
-        directions: what `measured_directions` gave, or the reason why there are none.
-        cpu_limit_s: limit of the process's CPU time, imports included.
-    """
+    """Return a contender's answer on a set, or why there is none, such as no directions for a peer."""
     empty = Row(name=name)
     package = next((one.package for one in GRAPH_CONTENDERS if one.name == name), None)
     if package is not None and find_spec(package) is None:
@@ -113,14 +105,8 @@ def answer(name: str, folder: Path, scene: Scene, directions: Directions | str, 
         errors = _errors(found, folder, scene)
     except (TimeoutError, RuntimeError) as reason:
         return replace(empty, note=f"failed: {reason}")
-    return replace(
-        empty,
-        errors=errors,
-        seconds=found.seconds,
-        cpu_s=found.cpu_s,
-        peak_mb=found.peak_mb,
-        note=found.note,
-    )
+    costs = {"seconds": found.seconds, "cpu_s": found.cpu_s, "peak_mb": found.peak_mb}
+    return replace(empty, errors=errors, **costs, note=found.note)
 
 
 def measure_directions(folder: Path) -> Directions:

@@ -119,8 +119,8 @@ class CholeskyFactor:
         traces[-1] += float(traces.mean()) if ground is None else ground
         if not self._factor(panels, parts):
             raise UnsolvableError(
-                f"the Laplacian is singular at node {self.weakest_node} (relative pivot {self.smallest_pivot:.1e}); "
-                "the graph is disconnected or not rigid there, or its weights are not positive"
+                f"the Laplacian is singular at node {self.weakest_node} (relative pivot "
+                f"{self.smallest_pivot:.1e}); the graph is disconnected or not rigid there, or its weights are not positive"
             )
 
     def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:

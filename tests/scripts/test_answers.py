@@ -39,20 +39,17 @@ def test_equal_code_gives_equal_answers_and_what_differs_is_reported(tmp_path):
     place = ("tables", "cameras.csv", "x", 4)
     text, is_equal = answers.compare_recordings(first, changed(first, place, repr(float(x) + 1e-6)))
     assert not is_equal
-    assert "cameras.csv 4 " in text
+    assert "tables cameras.csv positions 4 " in text
     assert "0 of 1 cases equal" in text
     assert answers.compare_recordings(first, changed(first, place, repr(math.nextafter(float(x), 9))))[1]
 
     verdicts = ("tables", "pairs.csv", "verdict", 0)
-    assert (
-        "-> 'doubtful' (1 rows)" in answers.compare_recordings(first, changed(first, verdicts, "doubtful"))[0]
-    )
+    assert "-> 'doubtful'" in answers.compare_recordings(first, changed(first, verdicts, "doubtful"))[0]
     assert "exit 0 -> 3" in answers.compare_recordings(first, changed(first, ("exit",), 3))[0]
     reworded = changed(first, ("json", "locate.json", "inputs", "directions"), "the directions are given")
     text, is_equal = answers.compare_recordings(first, reworded)
     assert is_equal
     assert "words (1):" in text
-    assert not answers.compare_recordings(first, reworded, strict_words=True)[1]
 
 
 def test_names_of_cases_are_unique_and_missing_sets_are_skipped(tmp_path, capsys):

@@ -88,8 +88,7 @@ def test_the_slope_is_fitted_where_the_noise_is_small():
 
 
 def test_every_panel_of_every_figure_names_a_known_method():
-    for name in phase_transition.FIGURES:
-        panels = phase_transition.panels(name)
+    for panels in phase_transition.FIGURES.values():
         assert panels
         assert {panel.method for panel in panels} <= set(METHODS)
 
@@ -106,7 +105,7 @@ def test_solvers_may_be_apart_only_where_the_optimum_is_not_certified_to_be_uniq
 
 
 def test_only_sizes_that_double_are_drawn_on_a_logarithmic_axis():
-    panels = {name: phase_transition.panels(name) for name in phase_transition.FIGURES}
+    panels = phase_transition.FIGURES
     assert [name for name, shown in panels.items() if any(panel.doubles for panel in shown)] == ["large"]
     assert all(panel.doubles for panel in panels["large"])
 

@@ -154,29 +154,18 @@ def test_an_exponent_is_the_slope_of_the_logarithms():
 
 
 def measured_solve(seconds, objectives, gap=1e-7, **changes):
-    problem = scale.Problem(
-        spec=GraphSpec(family="geo", n=10_000, degree=40.0, sigma=0.01),
-        tol=1e-6,
-        close_s=0.5,
-        certified_s=3.0,
-        gap=1e-6,
-        memory_mb=900.0,
-    )
+    limits = {scale.CLOSE_S: 0.5, scale.CERTIFIED_S: 3.0, "gap": 1e-6, scale.MEMORY_MB: 900.0}
+    spec = GraphSpec(family="geo", n=10_000, degree=40.0, sigma=0.01)
     values = {
-        "problem": problem,
+        "problem": scale.Problem(spec, 1e-6, limits=limits),
         "asked": "auto",
         "num_edges": 180_000,
-        "method": "admm",
-        "reason": "asked for",
-        "status": "converged",
-        "trace": scale.Trace(objectives=tuple(objectives), seconds=tuple(seconds)),
+        "solved": {"method": "admm", "objective": 1.0, "gap": gap},
+        "trace": list(zip(objectives, seconds, strict=True)),
         "best_objective": 1.0,
         "bound": 1.0 - 1e-6,
         "total_s": 2.0,
         "cpu_s": 2.5,
-        "objective": 1.0,
-        "gap": gap,
-        "equality_residual": 1e-15,
         "error": 1e-3,
         "before_mb": 300.0,
         "peak_mb": 500.0,
@@ -190,18 +179,19 @@ def test_the_limits_of_scale_are_judged_in_hindsight_and_only_with_a_certificate
     assert good.certificate_s == pytest.approx(1.1)
     assert [check.met for check in scale.checks(good)] == [True, True, True, True]
     late = measured_solve([0.1, 0.4, 0.9], [2.0, 1.0002, 1.0], gap=2e-6)
-    assert [check.met for check in scale.checks(late)] == [False, False, True, False]  # fast, not certified
+    # It is fast, and not certified.
+    assert [check.met for check in scale.checks(late)] == [False, False, False, True]
     assert scale.checks(measured_solve([0.1], [1.0], asked="admm")) == []
 
 
 def test_rigid_pieces_and_single_pairs_are_told_apart_and_limits_are_judged(monkeypatch):
     edges = np.array([[0, 1], [0, 2], [1, 2], [2, 3], [3, 4], [3, 5], [4, 5]])  # two triangles and a bridge
     monkeypatch.setattr(scale, "call", lambda _function, _spec: edges)
-    problem = scale.RigidProblem(spec=GraphSpec(family="geo", n=6), seconds=30.0, peak_mb=1.0)
-    found = scale.search("bridge", problem)
+    monkeypatch.setattr(scale, "RIGID_LIMITS", {6: {"seconds": 30.0, "peak": 1.0}})
+    found = scale.search(GraphSpec(family="geo", n=6))
     assert (found.num_pairs, found.num_pieces, found.num_single_pairs) == (7, 2, 1)
     assert [check.met for check in scale.checks(found)] == [True, False]
-    free = dataclasses.replace(found, problem=scale.RigidProblem(spec=problem.spec))
+    free = dataclasses.replace(found, spec=GraphSpec(family="er", n=6))
     assert verdict(scale.checks(free)) == "no target"
 
 

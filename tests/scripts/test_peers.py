@@ -67,13 +67,13 @@ def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie():
 def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it():
     graph = view_graph(draw(SMALL))
     ours = solver.solve_ours(graph, 1e-11)
-    by_cvxpy, _ = solver.solve_cvxpy(graph, 1e-10)
-    direct = solve_direct(graph, 1e-10)
+    by_cvxpy, _, _ = solver.solve_cvxpy(graph, 1e-10)
+    direct, dual, _ = solve_direct(graph, 1e-10)
     # A gap of 1e-10 leaves about its square root in locations along the flattest direction.
     assert relative_error(by_cvxpy, ours.locations) < 1e-5
-    assert relative_error(direct.locations, ours.locations) < 1e-5
-    centered = direct.locations - direct.locations.mean(axis=0)
-    assert certify(graph, centered, direct.dual, uniqueness=False).gap < 1e-8
+    assert relative_error(direct, ours.locations) < 1e-5
+    centered = direct - direct.mean(axis=0)
+    assert certify(graph, centered, dual, uniqueness=False).gap < 1e-8
 
 
 def answers(*rows):
