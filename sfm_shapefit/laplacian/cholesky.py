@@ -120,7 +120,8 @@ class CholeskyFactor:
         if not self._factor(panels, parts):
             raise UnsolvableError(
                 f"the Laplacian is singular at node {self.weakest_node} (relative pivot "
-                f"{self.smallest_pivot:.1e}); the graph is disconnected or not rigid there, or its weights are not positive"
+                f"{self.smallest_pivot:.1e}); the graph is disconnected or not rigid there, or its weights "
+                "are not positive"
             )
 
     def refactor_blocks(self, edges: IntArray, diagonal: FloatArray, off_diagonal: FloatArray) -> bool:
