@@ -29,6 +29,7 @@ from sfm_shapefit.solver.splitting.edges import (
     EdgePasses,
     edge_data,
 )
+from sfm_shapefit.solver.splitting.engine import Iteration
 from sfm_shapefit.solver.splitting.linear import predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
 from sfm_shapefit.synthetic import (
@@ -374,22 +375,43 @@ def test_acceleration_takes_the_best_combination_of_its_history():
         np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
-@pytest.mark.parametrize(("sigma", "begins"), [(0.0, 1), (0.01, 0)])
-def test_acceleration_begins_where_the_fitting_edges_stay(sigma, begins, monkeypatch):
-    begun = []
+@pytest.mark.parametrize(
+    ("accelerate", "inside", "before", "accelerated"),
+    [
+        (True, 90, np.inf, False),
+        (True, 90, 0.91, True),
+        (True, 20, 0.9, False),
+        (True, 1, 0.01, False),
+        (False, 90, 0.91, False),
+    ],
+)
+def test_acceleration_begins_where_the_fitting_edges_stay(accelerate, inside, before, accelerated):
+    x = np.zeros((100, 3))
+    sums = np.zeros(5)
+    sums[INTERIOR] = inside
+    passes = SimpleNamespace(data=SimpleNamespace(bounds=(0, 100)))
+    asked = SimpleNamespace(settings=SimpleNamespace(accelerate=accelerate), passes=passes)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(100), sums=sums, interior=before)
+    assert (Iteration._accelerator(asked, state) is not None) == accelerated
+    assert state.interior == inside / 100
 
-    class Noted(Anderson):
-        def __init__(self, *given):
-            begun.append(given)
-            super().__init__(*given)
 
-    monkeypatch.setattr(engine, "Anderson", Noted)
-    edges, t = geo(400, 40, 3)
-    graph = view_graph(edges, t, sigma=sigma, q=0.2, seed=3)
-    solve_admm(graph, 1e-8, 300)
-    assert len(begun) == begins
-    solve_lud(graph, 100, certified=False)
-    assert len(begun) == begins
+@pytest.mark.parametrize(("change", "restarts"), [(10.0, 0), (1e9, 1)])
+def test_acceleration_forgets_its_history_after_a_step_that_made_things_much_worse(change, restarts):
+    calls = []
+    history = SimpleNamespace(restart=lambda: calls.append("restart"), advance=lambda _x, f, _rho: f)
+    x = np.zeros((4, 3))
+    passes = SimpleNamespace(
+        step=lambda *_: (None, np.array([0.0, 0.0, 0.0, change, 0.0])), pull=lambda *_: np.ones((3, 3))
+    )
+    asked = SimpleNamespace(settings=SimpleNamespace(relaxation=1.7), passes=passes)
+    state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(4), steps=[10.0], anderson=history)
+    Iteration._pass(asked, state)
+    assert calls == ["restart"] * restarts
+    assert state.spare is x
+    assert state.x is not x
+    assert state.steps == [10.0, change]
+    np.testing.assert_array_equal(state.pull, 1.0)
 
 
 @pytest.mark.parametrize(
