@@ -165,6 +165,13 @@ def test_a_dual_whose_sums_overflow_proves_nothing(size):
     assert certificate.dual_bound <= objective(graph, t) + 1e-12
 
 
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_violation_that_is_not_a_number_is_the_largest(row):
+    total = np.ones((2, 3))
+    total[row, 1] = np.nan
+    assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
+
+
 def test_the_metric_of_wrong_locations_still_proves_a_bound():
     graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
