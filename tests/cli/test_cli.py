@@ -15,7 +15,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.commands import write as files
-from sfm_shapefit.formats import graph_text
+from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
