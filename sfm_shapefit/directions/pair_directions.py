@@ -27,7 +27,6 @@ class DirectionStatus(enum.Enum):
 CONTRADICTIONS = (DirectionStatus.LOW_INLIER_RATIO, DirectionStatus.ROTATION_MISMATCH)
 """The reasons that speak against the given rotations."""
 
-
 # Good rotations leave so much in any direction; matches that promise more are no better.
 _FLOOR_DEG = 0.05
 # This least weight keeps the program well conditioned; a camera may have nothing better.

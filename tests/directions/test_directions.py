@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.commands.locate import locate
-from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.estimate import estimate_directions, from_relative_poses
 from sfm_shapefit.directions.matches import RayMatches, RelativePoses
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections, concatenate
-from sfm_shapefit.directions.relative_poses import from_relative_poses
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph

@@ -256,7 +256,7 @@ def test_poses_come_back_from_transforms_json(courtyard):
 
 
 def test_a_camera_model_that_nerf_has_not_is_refused(courtyard):
-    camera = replace(courtyard.cameras[0], model="FOV", params=(1.0, 1.0, 0.0, 0.0, 0.5))
+    camera = courtyard.cameras[0]._replace(model="FOV", params=(1.0, 1.0, 0.0, 0.0, 0.5))
     with pytest.raises(InputError, match="camera model FOV has no equivalent"):
         nerf_text(replace(courtyard, cameras=(camera,)))
 

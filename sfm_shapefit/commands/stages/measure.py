@@ -11,14 +11,13 @@ from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.execution import measure_with_workers
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.memory import Workload
-from sfm_shapefit.directions.estimate import estimate_directions
+from sfm_shapefit.directions.estimate import estimate_directions, from_relative_poses
 from sfm_shapefit.directions.pair_directions import (
     CONTRADICTIONS,
     DirectionStatus,
     PairDirections,
     concatenate,
 )
-from sfm_shapefit.directions.relative_poses import from_relative_poses
 from sfm_shapefit.directions.tracks import build_tracks, covering_set, join_points
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
