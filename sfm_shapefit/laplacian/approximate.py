@@ -66,9 +66,9 @@ class ApproximateCholesky:
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return F^-T diag(pivots)^-1 F^-1 rhs for each column of rhs, (n, k)."""
         out = np.empty(rhs.shape)
-        x = np.zeros((len(rhs), 3))
         for k in range(0, rhs.shape[1], 3):
             width = min(rhs.shape[1] - k, 3)
+            x = np.zeros((len(rhs), 3))
             x[:, :width] = rhs[self.permutation, k : k + 3]
             _substitute(self.pointers, self.rows, self.fractions, self.pivots, x)
             out[self.permutation, k : k + 3] = x[:, :width]
@@ -87,12 +87,8 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     if not (np.isfinite(w).all() and (w >= 0.0).all()):
         raise ValueError("approximate Cholesky needs finite weights >= 0")
     state = np.array([seed & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64)
-    permutation, pointers, rows, fractions, pivots = _eliminate_all(
-        graph.pointers, graph.neighbours, graph.edge_of, w, state
-    )
-    return ApproximateCholesky(
-        frozen(permutation), frozen(pointers), frozen(rows), frozen(fractions), frozen(pivots)
-    )
+    parts = _eliminate_all(graph.pointers, graph.neighbours, graph.edge_of, w, state)
+    return ApproximateCholesky(*(frozen(part) for part in parts))
 
 
 @kernel(exact=True)

@@ -182,13 +182,14 @@ class CholeskyFactor:
         lead = (n,) if b == 1 else (n, b)
         if np.shape(rhs)[: len(lead)] != lead or np.ndim(rhs) > len(lead) + 1:
             raise ValueError(f"rhs has shape {np.shape(rhs)}, this factor takes {lead} or {(*lead, 'k')}")
-        given = np.asarray(rhs, dtype=np.float64).reshape(n * b, -1)
-        x = np.empty((n * b, 3), dtype=self.dtype)
+        given = np.asarray(rhs, dtype=np.float64).reshape(n, b, -1)
         out = np.empty_like(given)
-        for k in range(0, given.shape[1], 3):
-            _gather(given[:, k : k + 3], plan.permutation, b, x)
-            _substitute(self, x)
-            _scatter(x, plan.permutation, b, out[:, k : k + 3])
+        for k in range(0, given.shape[2], 3):
+            width = min(given.shape[2] - k, 3)
+            x = np.zeros((n, b, 3), dtype=self.dtype)
+            x[:, :, :width] = given[plan.permutation, :, k : k + 3]
+            _substitute(self, x.reshape(n * b, 3))
+            out[plan.permutation, :, k : k + 3] = x[:, :, :width]
         return out.reshape(np.shape(rhs))
 
 
@@ -522,31 +523,15 @@ def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
         )  # fmt: skip
 
     factor.workers.run([job(_descend, *task, outer[k]) for k, task in enumerate(plan.tasks)])
+    nodes = (plan.num_nodes, b, 3)
     for k, (_, end) in enumerate(plan.tasks):
-        _collect(plan.rows[plan.row_pointers[end - 1] : plan.row_pointers[end]], b, outer[k], x)
+        rows = plan.rows[plan.row_pointers[end - 1] : plan.row_pointers[end]]
+        x.reshape(nodes)[rows] += outer[k].reshape(nodes)[rows]
     for run in plan.above:
         job(_descend, *run, x)()
     for run in plan.above[::-1]:
         job(_ascend, *run)()
     factor.workers.run([job(_ascend, *task) for task in plan.tasks])
-
-
-@kernel(exact=True)
-def _gather(columns: Any, permutation: Any, b: int, x: Any) -> None:
-    """Write up to three right-hand sides into the columns of x in elimination order; the others are 0."""
-    for i in range(len(permutation)):
-        for a in range(b):
-            for k in range(3):
-                x[i * b + a, k] = columns[permutation[i] * b + a, k] if k < columns.shape[1] else 0.0
-
-
-@kernel(exact=True)
-def _scatter(x: Any, permutation: Any, b: int, columns: Any) -> None:
-    """Undo `_gather`."""
-    for i in range(len(permutation)):
-        for a in range(b):
-            for k in range(columns.shape[1]):
-                columns[permutation[i] * b + a, k] = x[i * b + a, k]
 
 
 @kernel(exact=True)
@@ -574,15 +559,6 @@ def _ascend(
         width = (first[s + 1] - first[s]) * b
         _backward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
         _store_front(b, s, first, x, work)
-
-
-@kernel(exact=True)
-def _collect(rows: Any, b: int, outer: Any, x: Any) -> None:
-    """Add what a task has left for the rows above it."""
-    for row in rows:
-        for a in range(b):
-            for k in range(3):
-                x[row * b + a, k] += outer[row * b + a, k]
 
 
 @kernel(exact=True)

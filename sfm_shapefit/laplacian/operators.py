@@ -63,8 +63,7 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
         num_nodes: n.
         edges: (m, 2) int64, checked.
     """
-    pointers, neighbours, edge_of = _adjacency(num_nodes, edges)
-    return Adjacency(frozen(pointers), frozen(neighbours), frozen(edge_of))
+    return Adjacency(*(frozen(part) for part in _adjacency(num_nodes, edges)))
 
 
 @kernel()

@@ -75,7 +75,6 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
     """
     n = game.num_nodes
     links = np.bincount(game.ends.ravel(), minlength=n)
-    marks = list(np.zeros((7, n), dtype=np.int64))
     board = _Board(
         np.full((n, dimension), -1, dtype=np.int64),
         np.full(n, dimension, dtype=np.int64),
@@ -83,7 +82,7 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
         np.argsort(game.ends.ravel(), kind="stable") // 2,
         game.ends,
         np.zeros(2, dtype=np.int64),
-        *marks,
+        *np.zeros((7, n), dtype=np.int64),
     )
     mark = _place_links(board, game.copies, _GAME_WORK * n)
     if board.free.sum() == dimension + 1:  # the whole is one rigid set

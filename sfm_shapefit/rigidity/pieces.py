@@ -107,16 +107,9 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
     large_at = np.bincount(nodes[is_large], minlength=graph.num_nodes)
     is_hinge = large_at[nodes] - is_large > 0
 
-    edge_order = np.argsort(label, kind="stable").astype(np.int64)
-    edge_start = np.searchsorted(label[edge_order], np.arange(num_pieces + 1))
-    return [
-        RigidPiece(
-            nodes=frozen(nodes[start[k] : start[k + 1]]),
-            edges=frozen(edge_order[edge_start[k] : edge_start[k + 1]]),
-            hinges=frozen(nodes[start[k] : start[k + 1]][is_hinge[start[k] : start[k + 1]]]),
-        )
-        for k in range(num_pieces)
-    ]
+    edges = np.split(np.argsort(label, kind="stable"), np.cumsum(np.bincount(label))[:-1])
+    parts = zip(np.split(nodes, start[1:-1]), edges, np.split(is_hinge, start[1:-1]), strict=True)
+    return [RigidPiece(frozen(own), frozen(pairs), frozen(own[hinge])) for own, pairs, hinge in parts]
 
 
 @kernel()

@@ -11,8 +11,8 @@ whether it is right (`judge_matches`). The points of the exact model are those s
 right matches. On the CPU and with a seed, all of it is the same on every run and for any number of threads.
 """
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -25,12 +25,7 @@ from sfm_shapefit.colmap.quiet import quiet_log
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.synthetic.models import ModelParts, Points, image_name, new_camera, write_models
 from sfm_shapefit.synthetic.options import WorkspaceOptions
-from sfm_shapefit.synthetic.rendering import (
-    RenderedScene,
-    encode_image,
-    project_distorted,
-    surface_points,
-)
+from sfm_shapefit.synthetic.rendering import RenderedScene, encode_image, project_distorted, surface_points
 from sfm_shapefit.synthetic.rigs import single_cameras
 from sfm_shapefit.synthetic.workspace import compact_database
 from sfm_shapefit.viewgraph import connected_components
@@ -40,8 +35,7 @@ _LARGEST_ERROR_PX = 4.0
 _POINT_GRAY = 160
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class JudgedMatches:
+class JudgedMatches(NamedTuple):
     """The keypoints and verified pairs of a rendered workspace, and how much of each pair is right."""
 
     keypoints: list[FloatArray]
@@ -72,7 +66,9 @@ def write_rendered_workspace(
     """
     options = options or WorkspaceOptions()
     with atomic_folder(out) as workspace:
-        _write_images(scene, workspace / "images")
+        (workspace / "images").mkdir()
+        for k in range(scene.num_images):
+            (workspace / "images" / image_name(k)).write_bytes(encode_image(scene, k))
         judged = None
         if options.database:
             _match_images(scene, workspace, relative_poses=options.relative_poses)
@@ -109,9 +105,7 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
         )
         is_right[rows] = errors < _LARGEST_ERROR_PX
         wrong[e] = 2 * is_right[rows].sum() < len(a)
-    return JudgedMatches(
-        keypoints=keypoints, surface=surface, matches=joined, is_right=is_right, pair_is_wrong=wrong
-    )
+    return JudgedMatches(keypoints, surface, joined, is_right, wrong)
 
 
 def _join(batches: list[MatchBatch]) -> MatchBatch:
@@ -140,16 +134,6 @@ def _transfer_error_px(scene: RenderedScene, image: int, points: FloatArray, xy:
     if len(seen):
         errors[seen] = np.linalg.norm(project_distorted(scene, image, points[seen]) - xy[seen], axis=1)
     return errors
-
-
-# --- images and database -----------------------------------------------------------------------------------
-
-
-def _write_images(scene: RenderedScene, folder: Path) -> None:
-    """Write the photographs as JPEG files."""
-    folder.mkdir()
-    for k in range(scene.num_images):
-        (folder / image_name(k)).write_bytes(encode_image(scene, k))
 
 
 def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool) -> None:

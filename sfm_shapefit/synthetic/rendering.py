@@ -98,9 +98,10 @@ def draw_image(scene: RenderedScene, image: int) -> ByteArray:
     Depends on the scene's options and the image's index only, not on what was drawn before.
     """
     rng = np.random.default_rng([scene.options.seed, 2, image])
-    rays = _sample_rays(scene)
-    samples = _shade(scene, image, rays)
     height, width = scene.options.image_height, scene.options.image_width
+    y, x = (np.indices((_SAMPLES * height, _SAMPLES * width)).reshape(2, -1) + 0.5) / _SAMPLES
+    rays = _undistort(scene, np.stack([x, y], axis=1)).reshape(_SAMPLES * height, _SAMPLES * width, 2)
+    samples = _shade(scene, image, rays)
     pixels = samples.reshape(height, _SAMPLES, width, _SAMPLES, 3).mean(axis=(1, 3))
     pixels *= 1.0 + scene.render.exposure_spread * rng.standard_normal()
     pixels += scene.render.gray_noise * rng.standard_normal(pixels.shape)
@@ -121,8 +122,8 @@ def surface_points(scene: RenderedScene, image: int, xy: FloatArray) -> FloatArr
     rays = _undistort(scene, xy).reshape(1, -1, 2)
     triangles = _facing_triangles(scene, image)
     bounds = np.tile(np.array([0, 1, 0, rays.shape[1]], dtype=np.int64), (len(triangles.rows), 1))
-    nearest, inverse_depth = _nearest_triangles(rays, triangles.inverse, bounds)
-    depth = np.where(nearest[0] >= 0, 1.0 / np.where(nearest[0] >= 0, inverse_depth[0], 1.0), np.nan)
+    _, inverse_depth = _nearest_triangles(rays, triangles.inverse, bounds)
+    depth = 1.0 / np.where(inverse_depth[0] > 0.0, inverse_depth[0], np.nan)
     in_camera = np.column_stack([rays[0], np.ones(rays.shape[1])]) * depth[:, None]
     return np.asarray(in_camera @ scene.rotations[image] + scene.centers[image])
 
@@ -176,15 +177,6 @@ def _undistort(scene: RenderedScene, xy: FloatArray) -> FloatArray:
         return np.empty((0, 2))
     rays = cv2.undistortPoints(pixels, scene.calibration, scene.distortion, criteria=criteria)
     return np.asarray(rays, dtype=np.float64).reshape(-1, 2)
-
-
-def _sample_rays(scene: RenderedScene) -> FloatArray:
-    """Return the (rows, columns, 2) rays of the samples of an image."""
-    rows, columns = _SAMPLES * scene.options.image_height, _SAMPLES * scene.options.image_width
-    y, x = np.meshgrid(
-        (np.arange(rows) + 0.5) / _SAMPLES, (np.arange(columns) + 0.5) / _SAMPLES, indexing="ij"
-    )
-    return _undistort(scene, np.stack([x.ravel(), y.ravel()], axis=1)).reshape(rows, columns, 2)
 
 
 class _Triangles(NamedTuple):

@@ -204,8 +204,7 @@ def _photograph(
 ) -> tuple[IntArray, FloatArray]:
     """Return which of the candidates an image shows, ascending, and their noisy pixels, all inside the image.
 
-    A point shows when it is in front, near enough, inside the image, and faces the camera. Every surface
-    here is convex towards its cameras, so that facing also decides occlusion.
+    A point shows when it is in front, near enough, inside the image, and faces the camera.
     """
     center, cam_from_world = layout.centers[image], layout.rotations[image]
     points = layout.points[candidates]
@@ -331,11 +330,7 @@ def _false_lists(
     options: SceneOptions,
     rng: np.random.Generator,
 ) -> dict[int, _FalseList]:
-    """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs.
-
-    Raises:
-        InputError: if not enough pairs have a false baseline from which their points would be in view.
-    """
+    """Return the false list of each corrupted pair, by pair index; a random fraction of all pairs."""
     asked = round(options.corrupted_pair_fraction * len(pairs))
     found: dict[int, _FalseList] = {}
     for e in rng.permutation(len(pairs)):
@@ -372,10 +367,8 @@ def _false_list(
     centers = _false_centers(layout.centers[other], layout.centers[displaced], rng)
 
     in_view = _in_view_from(points, centers, layout.rotations[displaced], options)
-    angle_deg = angle_between_deg(
-        normalized(layout.centers[other] - centers),
-        normalized(layout.centers[other] - layout.centers[displaced]),
-    )
+    true_baseline = layout.centers[other] - layout.centers[displaced]
+    angle_deg = angle_between_deg(normalized(layout.centers[other] - centers), normalized(true_baseline))
     fits = (in_view.sum(axis=1) >= options.min_matches) & (angle_deg >= _SMALLEST_FALSE_ANGLE_DEG)
     if not fits.any():
         return None

@@ -18,15 +18,8 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.synthetic.models import (
-    ModelParts,
-    Points,
-    new_camera,
-    new_images,
-    new_rigs,
-    rigid,
-    write_models,
-)
+from sfm_shapefit.synthetic import models
+from sfm_shapefit.synthetic.models import ModelParts, Points
 from sfm_shapefit.synthetic.options import WorkspaceOptions
 from sfm_shapefit.synthetic.rigs import Rigs, single_cameras
 from sfm_shapefit.synthetic.scenes import Scene
@@ -55,7 +48,7 @@ def write_workspace(
         if options.database:
             _write_database(scene, workspace / "database.db", rigs, relative_poses=options.relative_poses)
         parts = ModelParts(scene, rigs, _camera(scene), scene.keypoints, _points(scene))
-        write_models(parts, workspace, options.model)
+        models.write_models(parts, workspace, options.model)
 
 
 def _points(scene: Scene) -> Points:
@@ -75,7 +68,7 @@ def _points(scene: Scene) -> Points:
 def _camera(scene: Scene) -> pycolmap.Camera:
     """Return the camera of a scene."""
     k = scene.calibration
-    return new_camera(scene, "PINHOLE", [k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
+    return models.new_camera(scene, "PINHOLE", [k[0, 0], k[1, 1], k[0, 2], k[1, 2]])
 
 
 # --- database --------------------------------------------------------------------------------------------
@@ -102,8 +95,8 @@ def compact_database(path: Path) -> None:
 
 def _write_images(scene: Scene, rigs: Rigs, database: pycolmap.Database) -> None:
     """Write cameras, rigs, frames, images and keypoints."""
-    cameras, made = new_rigs(rigs, _camera(scene))
-    images, frames = new_images(rigs, [np.empty((0, 2))] * scene.num_images)
+    cameras, made = models.new_rigs(rigs, _camera(scene))
+    images, frames = models.new_images(rigs, [np.empty((0, 2))] * scene.num_images)
     for camera in cameras:
         database.write_camera(camera, use_camera_id=True)
     for rig in made:
@@ -127,7 +120,9 @@ def _write_pairs(scene: Scene, database: pycolmap.Database, *, relative_poses: b
         geometry.E, geometry.F = essential[e], fundamental[e]
         geometry.inlier_matches = matches
         if relative_poses:
-            geometry.cam2_from_cam1 = rigid(scene.relative_rotations[e], scene.relative_translations[e])
+            geometry.cam2_from_cam1 = models.rigid(
+                scene.relative_rotations[e], scene.relative_translations[e]
+            )
         database.write_matches(i, j, matches)
         database.write_two_view_geometry(i, j, geometry)
 
