@@ -35,7 +35,7 @@ MADE = ("rig", *_PRUNED, *(f"{name}-new" for name in _EXTENDED))
 
 def truth_of(folder: Path) -> str:
     """Return which of a scene's models is the best there is."""
-    return next(name for name in _TRUTHS if (folder / name).is_dir())
+    return next(name for name in TRUTHS if (folder / name).is_dir())
 
 
 def make_inputs(work: Path, scenes: Mapping[str, Path]) -> None:
