@@ -30,8 +30,9 @@ from sfm_shapefit.refinement.angular import (
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.solver.options import SolverResult, Status
-from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
+from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs import ReducedFactor, lud_over_groups
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -172,7 +173,7 @@ def refine_starts(
     # To the bit: the certificate is that of these very locations.
     is_certified = kept.name == "ShapeFit" and moved[1] == 0.0
     return RefinedPlacement(
-        locations=solved.locations if is_certified else normalized_locations(graph, kept.best),
+        locations=solved.locations if is_certified else normalize_locations(graph, kept.best),
         start=kept.name,
         is_refined=moved[1] > 0.0,
         reason=reason,
@@ -217,7 +218,8 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
 def _solve_lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
     """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
     certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
-    found = solve_lud(_weight_points(graph, classes), _LUD_STEPS, certified=certified, threads=threads)
+    weighted, resources = _weight_points(graph, classes), Resources(threads)
+    found = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=resources)
     is_usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
     return found if is_usable else None
 

@@ -35,7 +35,7 @@ and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells w
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -53,7 +53,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
@@ -125,9 +125,7 @@ def certify(
     *,
     tol: float = 0.0,
     uniqueness: bool = False,
-    factor: LaplacianFactor | None = None,
-    threads: int = 1,
-    overwrite_dual: bool = False,
+    resources: Resources = ONE_THREAD,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -137,51 +135,30 @@ def certify(
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
-            graph; it serves as preconditioner and cannot make the bound wrong.
-        threads: of a repair; the bound does not depend on it.
-        overwrite_dual: make `dual` itself feasible where that saves a copy of it.
+        resources: threads of a repair, and a factor, which saves a new analysis of the graph; it serves as
+            preconditioner and cannot make the bound wrong.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
         UnsolvableError: if the dual must be repaired, no factor is given, and the graph is not connected.
     """
-    y = np.array(dual, dtype=np.float64, order="C", copy=None if overwrite_dual else True)
-    found = _proved(graph, locations, y, tol, np.inf, uniqueness, factor, threads)
+    y = np.array(dual, dtype=np.float64, order="C")
+    found = certify_in_place(graph, locations, y, tol, np.inf, resources)
     assert found is not None, "no gap is above infinity"
-    return found
+    if not uniqueness:
+        return found
+    return replace(found, unique=_is_unique(graph, locations - locations.mean(axis=0), found.dual))
 
 
 @one_blas_thread()
-def certify_within(
-    graph: ViewGraph,
-    locations: FloatArray,
-    dual: FloatArray,
-    tol: float,
-    *,
-    factor: LaplacianFactor | None = None,
-    threads: int = 1,
+def certify_in_place(
+    graph: ViewGraph, locations: FloatArray, y: FloatArray, tol: float, hopeless: float, resources: Resources
 ) -> Certificate | None:
-    """Return what `certify` would if its gap is at most `tol`, else None, as soon as that is clear.
+    """Return what `certify` does, with y itself made feasible; None if the gap is above `hopeless`.
 
-    `dual` is overwritten. On loosely joined communities a proof takes as long as hundreds of iterations of a
+    That is clear early. On loosely joined communities a proof takes as long as hundreds of iterations of a
     solver, and more than half of that is saved where the dual is not good enough yet.
     """
-    found = _proved(graph, locations, dual, tol, tol, False, factor, threads)
-    return found if found is not None and found.gap <= tol else None
-
-
-def _proved(
-    graph: ViewGraph,
-    locations: FloatArray,
-    y: FloatArray,
-    tol: float,
-    hopeless: float,
-    uniqueness: bool,
-    factor: LaplacianFactor | None,
-    threads: int,
-) -> Certificate | None:
-    """Make y feasible in place and return what it proves; None if the gap is going to be above `hopeless`."""
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, y)
     n, d, w = graph.num_nodes, graph.dimension, graph.weights
@@ -190,7 +167,7 @@ def _proved(
     degree = float(degrees.max())
     multiplier = _multiplier(total, c, t)
     if _unbalanced(total, c, multiplier) > degree * _exact(value - multiplier / max(1.0, worst)):
-        repair = _repair(graph, t, y, factor, threads)
+        repair = _repair(graph, t, y, resources)
         gap = _clip_in_rounds(repair, c, t, value, tol, hopeless)
         if gap > hopeless:
             return None
@@ -207,12 +184,10 @@ def _proved(
     # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
     if not (bound > 0.0 and violation <= _UNREPAIRED * degree):
         y, bound, violation = np.zeros_like(y), 0.0, 0.0
+    if not value - bound <= hopeless:
+        return None
     return Certificate(
-        objective=value,
-        dual_bound=bound,
-        dual=frozen(y),
-        equality_residual=violation / degree,
-        unique=_is_unique(graph, t, y) if uniqueness else None,
+        objective=value, dual_bound=bound, dual=frozen(y), equality_residual=violation / degree
     )
 
 
@@ -278,31 +253,24 @@ class _Repair(NamedTuple):
         return total
 
 
-def _repair(
-    graph: ViewGraph, t: FloatArray, y: FloatArray, factor: LaplacianFactor | None, threads: int
-) -> _Repair:
+def _repair(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources) -> _Repair:
     """Return the metric of the residuals at t, with no pair on the surface of its ball so far."""
     edges, v = np.ascontiguousarray(graph.edges), np.ascontiguousarray(graph.directions)
     stiffness = _stiffness(graph, t).astype(np.float32)
     normal, axes = np.zeros(graph.num_edges, np.float32), tuple(range(graph.dimension))
     metric = _Metric(edges, v, graph.weights, stiffness, y, normal, axes)
     blocks = _EDGE_BLOCKS if graph.num_edges >= _LARGE else 1
-    precondition = _preconditioner(graph, stiffness, factor, threads)
-    return _Repair(metric, precondition, Workers(threads), np.empty((blocks, *t.shape)))
+    precondition = _preconditioner(graph, stiffness, resources)
+    return _Repair(metric, precondition, Workers(resources.threads), np.empty((blocks, *t.shape)))
 
 
 def _clip_in_rounds(
     repair: _Repair, c: FloatArray, t: FloatArray, value: float, tol: float, hopeless: float
 ) -> float:
-    """Clip y and restore the equality roughly, in turns, until its excess costs little.
+    """Clip y and restore the equality roughly, in turns; return about the gap that the dual proves.
 
-    Args:
-        value: the objective at t, to tell how far the bound is.
-        tol: the gap wanted; it ends somewhat below it in any case.
-        hopeless: a gap from which an end has no use; from the second clipping on, lambda hardly rises again.
-
-    Returns:
-        About the gap that the dual proves.
+    The rounds end when the excess costs little of the gap to `value`, the objective at t; somewhat below the
+    gap `tol` in any case; and above `hopeless`, for from the second clipping on lambda hardly rises again.
     """
     gap = value
     for k in range(_ROUNDS):
@@ -371,17 +339,17 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return residuals
 
 
-def _preconditioner(
-    graph: ViewGraph, stiffness: npt.NDArray[Any], factor: LaplacianFactor | None, threads: int
-) -> Preconditioner:
+def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Resources) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
-    if factor is None:  # whoever has a factor has looked, and on large graphs the look takes much memory
+    if (
+        resources.factor is None
+    ):  # whoever has a factor has looked, and on large graphs the look takes much memory
         components = int(graph.components().max()) + 1
         if components > 1:
             raise UnsolvableError(
                 f"the graph falls into {components} connected components; certify each one separately"
             )
-        factor = laplacian_factor(graph, threads=threads)
+    factor = laplacian_factor(graph, resources)
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32

@@ -10,7 +10,7 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton.reduction import factor_pinned
+from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
 from sfm_shapefit.solver.rigs import certify_groups, largest_tied, lud_over_groups, solve_groups
@@ -101,11 +101,9 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     np.testing.assert_allclose(centred(factor.solve(g)), centred((expand @ x).reshape(-1, 3)), atol=1e-10)
     # Of one pinned pair, tau v v^T is taken away again.
     tau, pinned = 2.5, 4
-    lifted = blocks.copy()
-    lifted[pinned] += tau * np.outer(v[pinned], v[pinned])
     c = unit.reduce(scale_functional(between))
     i, j = edges[pinned]
-    system = factor_pinned(factor, lifted, c, ((int(i), int(j)), v[pinned]), tau)
+    system = factor_pinned(factor, blocks.copy(), c, Pin(pinned, edges[pinned], v[pinned], tau))
     right = unit.reduce(g)
     multiplier, x = system.solve(right, 0.7)
     np.testing.assert_allclose(matrix @ x, multiplier * c + right, atol=1e-9)

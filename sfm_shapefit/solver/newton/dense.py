@@ -23,7 +23,7 @@ from sfm_shapefit.solver.newton.steps import (
     extend_step,
     is_cancelled,
     linearize,
-    measure_from_python,
+    measure_plain,
     pays,
     scalars,
     set_gradient,
@@ -87,14 +87,15 @@ def solve_newton_dense(
     Raises:
         UnsolvableError: if the directions do not determine any locations.
     """
-    problem, iterate, linearization, step = allocate(graph)
+    work = allocate(graph)
+    problem, iterate, linearization, step = work
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
     factor = _allocate_factor(n, d, np.float32 if single else np.float64)
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure_from_python(problem, iterate)
+        progress = Progress(*measure_plain(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -119,7 +119,16 @@ class Progress(NamedTuple):
     """Whether the next steps go on from the clipped dual."""
 
 
-def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Linearization, Step]:
+class Work(NamedTuple):
+    """The problem as arrays, and room for the iteration."""
+
+    problem: Problem
+    iterate: Iterate
+    linearization: Linearization
+    step: Step
+
+
+def allocate(graph: ViewGraph) -> Work:
     """Return the problem as arrays, and room for the iteration.
 
     Raises:
@@ -150,15 +159,13 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Linearization, Step]:
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
     step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
-    return problem, Iterate(nodes(), edges(), edges(), edges()), linearization, step
+    return Work(problem, Iterate(nodes(), edges(), edges(), edges()), linearization, step)
 
 
 def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
     """Tell the callback where the solver stands; return whether it asks to stop."""
-    if on_iteration is None:
-        return False
     bound = progress.objective - progress.gap
-    return on_iteration(IterationInfo(iteration, progress.objective, bound)) is False
+    return asks_to_stop(on_iteration, IterationInfo(iteration, progress.objective, bound))
 
 
 @kernel()
@@ -487,8 +494,7 @@ def dot(x: Any, y: Any) -> float:
 #
 # What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while
 # the kernel ran would be raised there, and end the process by a segmentation fault: kernels that Python
-# calls return plain tuples. So each operation has three names: the inlined kernel, the kernel around it that
-# returns plain numbers, and the function that makes a NamedTuple of these.
+# calls return plain tuples, of which `Progress(*...)` makes the scalars again.
 
 Scalars = tuple[float, float, float, float, bool]
 
@@ -500,34 +506,20 @@ def scalars(progress: Any) -> Scalars:
 
 
 @kernel()
-def _measure_plain(problem: Any, iterate: Any) -> Scalars:
+def measure_plain(problem: Any, iterate: Any) -> Scalars:
+    """Return the scalars at the iterate; see `measure`."""
     return scalars(measure(problem, iterate))
 
 
 @kernel()
-def _take_step_plain(
+def take_step_plain(
     problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float
 ) -> Scalars:
+    """Take a step and return the scalars after it; see `take_step`."""
     return scalars(take_step(problem, iterate, step, mu, progress, target))
 
 
 @kernel()
-def _close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
-    return scalars(close_cycle(iterate, progress, mu, first))
-
-
-def measure_from_python(problem: Problem, iterate: Iterate) -> Progress:
-    """Return the scalars at the iterate; see `measure`."""
-    return Progress(*_measure_plain(problem, iterate))
-
-
-def take_step_from_python(
-    problem: Problem, iterate: Iterate, step: Step, mu: float, progress: Progress, target: float
-) -> Progress:
-    """Take a step and return the scalars after it; see `take_step`."""
-    return Progress(*_take_step_plain(problem, iterate, step, mu, progress, target))
-
-
-def close_cycle_from_python(iterate: Iterate, progress: Progress, mu: float, first: float) -> Progress:
+def close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
     """Return the scalars after a cycle; see `close_cycle`."""
-    return Progress(*_close_cycle_plain(iterate, progress, mu, first))
+    return scalars(close_cycle(iterate, progress, mu, first))

@@ -6,6 +6,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -25,7 +26,8 @@ def lud_over_groups(graph: ViewGraph, groups: RigidGroups, max_steps: int = _MAX
     """
     try:
         factor = ReducedFactor(graph.edges, groups.normalize())
-        locations = solve_lud(graph, max_steps, factor, certified=False).locations
+        resources = Resources(factor=factor)
+        locations = solve_lud(graph, max_steps, certified=False, resources=resources).locations
     except UnsolvableError:
         return None
     return locations if np.isfinite(locations).all() else None

@@ -6,8 +6,7 @@ and conjugate gradients that reduce their residual tenfold count as solved, sinc
 next right-hand side.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -49,11 +48,23 @@ class LaplacianFactor(Protocol):
 
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,) in the order of the graph's edges."""
-        ...
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, (n, d), up to a constant per column; the columns of rhs sum to 0."""
-        ...
+
+
+class Resources(NamedTuple):
+    """What a solve may use; its answer does not depend on the threads."""
+
+    threads: int = 1
+    memory_bytes: int = DEFAULT_FACTOR_BYTES
+    """What one factor may take, predicted before it is allocated."""
+    factor: LaplacianFactor | None = None
+    """A solver for the graph's Laplacian that may be overwritten, where there is one already."""
+
+
+ONE_THREAD = Resources()
+"""What a solve uses where nothing else is said."""
 
 
 class IterativeSolver:
@@ -92,8 +103,7 @@ def _diagonal_suffices(operator: LaplacianOperator, jacobi: Preconditioner) -> b
     return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class Prediction(NamedTuple):
     """What is known of a graph's factor before any number: the order of elimination, if one is of use."""
 
     tree: EliminationTree | None
@@ -127,29 +137,27 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 
 
 def laplacian_factor(
-    graph: ViewGraph,
-    memory_bytes: int = DEFAULT_FACTOR_BYTES,
-    *,
-    prediction: Prediction | None = None,
-    threads: int = 1,
+    graph: ViewGraph, resources: Resources = ONE_THREAD, prediction: Prediction | None = None
 ) -> LaplacianFactor:
-    """Return a float32 Cholesky factor of the graph's Laplacian, or an iterative solver where that is better.
+    """Return the factor of the resources; if None, a float32 Cholesky factor of the graph's Laplacian.
 
-    It is better where the factor would not fit, or would take longer than it saves.
+    Or an iterative solver where that factor would not fit, or would take longer than it saves.
 
     Args:
         graph: a connected view graph.
-        memory_bytes: what the factor may take; predicted before anything is allocated.
+        resources: threads and memory of the factor.
         prediction: from `predict_factor` on the same graph, if it is there already.
-        threads: of the factor; its answers do not depend on it.
     """
+    if resources.factor is not None:
+        return resources.factor
     tree = (predict_factor(graph) if prediction is None else prediction).tree
-    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    edges = np.ascontiguousarray(graph.edges)
+    neighbors = adjacency(graph.num_nodes, edges)
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
-        return IterativeSolver(neighbors, threads)
-    if tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes:
-        return IterativeSolver(neighbors, threads)
-    plan = plan_factorisation(neighbors, np.ascontiguousarray(graph.edges), tree)
-    if plan.num_bytes(1, np.float32) > memory_bytes:
-        return IterativeSolver(neighbors, threads)
-    return allocate_factor(plan, 1, np.float32, threads=threads)
+        return IterativeSolver(neighbors, resources.threads)
+    if tree.num_nonzeros * np.dtype(np.float32).itemsize > resources.memory_bytes:
+        return IterativeSolver(neighbors, resources.threads)
+    plan = plan_factorisation(neighbors, edges, tree)
+    if plan.num_bytes(1, np.float32) > resources.memory_bytes:
+        return IterativeSolver(neighbors, resources.threads)
+    return allocate_factor(plan, 1, np.float32, threads=resources.threads)

@@ -24,11 +24,12 @@ from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import across, adjoint, along, differences
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
-from sfm_shapefit.solver.splitting.engine import Iteration, Settings, Stop
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Stop, Tuning
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 _LEAST_LENGTH = 1.0
+_TUNING = Tuning(relaxation=1.6, renewals=(), penalty=1.0, accelerate=False)
 _REPAIRS = 12
 # The balance is restored twice to this residual, which makes 1e-14.
 _CG_TOL = 1e-7
@@ -58,11 +59,10 @@ class LudResult:
 def solve_lud(
     graph: ViewGraph,
     max_iterations: int = 50,
-    factor: LaplacianFactor | None = None,
     *,
     tol: float = 1e-8,
     certified: bool = True,
-    threads: int = 1,
+    resources: Resources = ONE_THREAD,
     on_iteration: OnIteration | None = None,
 ) -> LudResult:
     """Solve LUD by ADMM with constant penalties, so that its Laplacian is factored once.
@@ -70,25 +70,16 @@ def solve_lud(
     Args:
         graph: a connected view graph.
         max_iterations: 25 to 50 suffice as the start of a robust refinement.
-        factor: solver for the graph's Laplacian, overwritten; by default what `laplacian_factor` picks.
         tol: relative error of the objective, estimated, at which to stop early.
         certified: compute the dual bound, at the price of about 100 iterations.
-        threads: of the passes over edges; the result does not depend on it.
+        resources: threads of the passes over edges, and the factor, by default what `laplacian_factor` picks.
         on_iteration: called after each iteration; returning False cancels and returns the iterate.
     """
-    settings = Settings(
-        absolute_tol=0.0,
-        tol=tol,
-        max_iterations=max_iterations,
-        relaxation=1.6,
-        renewals=(),
-        penalty=1.0,
-        accelerate=False,
-    )
-    factor = laplacian_factor(graph) if factor is None else factor
-    passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), threads)
+    factor = laplacian_factor(graph, resources)
+    passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), resources.threads)
     try:
-        outcome = Iteration(passes, factor, settings, None, float(graph.weights.sum())).run(on_iteration)
+        iteration = Iteration(passes, factor, _TUNING, None, float(graph.weights.sum()))
+        outcome = iteration.run(Goal(tol, 0.0, max_iterations), on_iteration)
         dual = passes.in_graph_order(passes.dual(outcome.state.x, outcome.state.rho))
     finally:
         passes.close()

@@ -1,6 +1,6 @@
 """ShapeFit by the splitting of `engine`."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -8,11 +8,11 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
-from sfm_shapefit.solver.splitting.engine import Iteration, Outcome, Settings, Stop
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Outcome, Stop, Tuning
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
-_RENEWALS = tuple(10 * 2**k for k in range(8))
+_TUNING = Tuning(relaxation=1.7, renewals=tuple(10 * 2**k for k in range(8)), penalty=0.5, accelerate=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -31,20 +31,12 @@ class AdmmResult:
 class Splitting:
     """A run of ADMM that can be continued. Close it after use."""
 
-    def __init__(self, graph: ViewGraph, factor: LaplacianFactor, threads: int) -> None:
-        """Set up the iteration; the factor may serve others between two runs."""
-        settings = Settings(
-            tol=0.0,
-            absolute_tol=0.0,
-            max_iterations=0,
-            relaxation=1.7,
-            renewals=_RENEWALS,
-            penalty=0.5,
-            accelerate=True,
-        )
-        self._passes = EdgePasses(edge_data(graph, -np.inf), threads)
-        kappa = float(graph.weights.sum())
-        self._iteration = Iteration(self._passes, factor, settings, scale_functional(graph), kappa)
+    def __init__(self, graph: ViewGraph, resources: Resources) -> None:
+        """Set up the iteration; the factor of the resources may serve others between two runs."""
+        self.graph, self.resources = graph, resources
+        self._passes = EdgePasses(edge_data(graph, -np.inf), resources.threads)
+        kappa, factor = float(graph.weights.sum()), laplacian_factor(graph, resources)
+        self._iteration = Iteration(self._passes, factor, _TUNING, scale_functional(graph), kappa)
         self._outcome: Outcome | None = None
 
     def close(self) -> None:
@@ -62,11 +54,8 @@ class Splitting:
             max_iterations: limit of all iterations since the beginning.
             on_iteration: called after each iteration; returning False cancels and returns the iterate.
         """
-        iteration = self._iteration
-        iteration.settings = replace(
-            iteration.settings, tol=tol, absolute_tol=absolute_tol, max_iterations=max_iterations
-        )
-        outcome = self._outcome = iteration.run(on_iteration, self._outcome)
+        goal = Goal(tol, absolute_tol, max_iterations)
+        outcome = self._outcome = self._iteration.run(goal, on_iteration, self._outcome)
         state = outcome.state
         dual = self._passes.in_graph_order(self._passes.dual(state.x, state.rho))
         t = state.t - state.t.mean(axis=0)
@@ -77,9 +66,7 @@ def solve_admm(
     graph: ViewGraph,
     tol: float,
     max_iterations: int,
-    factor: LaplacianFactor | None = None,
-    *,
-    threads: int = 1,
+    resources: Resources = ONE_THREAD,
     on_iteration: OnIteration | None = None,
 ) -> AdmmResult:
     """Solve ShapeFit by ADMM with the scalar graph Laplacian.
@@ -88,14 +75,13 @@ def solve_admm(
         graph: a connected, parallel-rigid view graph whose directions do not cancel.
         tol: relative error of the objective at which to stop, estimated; not certified.
         max_iterations: hard limit, reported in `stop`.
-        factor: solver for the graph's Laplacian, overwritten; by default what `laplacian_factor` picks.
-        threads: of the passes over edges; the result does not depend on it.
+        resources: threads of the passes over edges, and the factor, by default what `laplacian_factor` picks.
         on_iteration: called after each iteration; returning False cancels and returns the iterate.
 
     Raises:
         UnsolvableError: if the factor finds the Laplacian singular: the graph is not connected.
     """
-    splitting = Splitting(graph, laplacian_factor(graph) if factor is None else factor, threads)
+    splitting = Splitting(graph, resources)
     try:
         return splitting.run(tol, 0.0, max_iterations, on_iteration)
     finally:
