@@ -315,15 +315,11 @@ def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, Fl
 
 def _restore(repair: _Repair, violation: FloatArray, tol: float) -> float:
     """Move y by S D h so that `violation` shrinks to `tol` times itself; return max_e ||y_e|| / w_e."""
-    h = conjugate_gradients(
-        repair.product,
-        repair.precondition,
-        violation,
-        tol=min(tol, 0.5),
-        max_iterations=_CG_STEPS,
-        coupled=True,
-    ).x
-    return float(_move(repair.metric, h))
+    product, precondition, tol = repair.product, repair.precondition, min(tol, 0.5)
+    found = conjugate_gradients(
+        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled=True
+    )
+    return float(_move(repair.metric, found.x))
 
 
 def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
