@@ -111,9 +111,8 @@ def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatAr
     middle, unit = t[own].mean(axis=0), float(np.median(lengths))
     motions = np.tile(np.eye(d, d + 1), (len(edges), 1, 1))
     motions[:, :, d] = (t[own] - middle) / unit
-    seen = (motions - u[:, :, None] * (u[:, None, :] @ motions)) * (unit / (lengths * noise_rad))[
-        :, None, None
-    ]
+    transverse = motions - u[:, :, None] * (u[:, None, :] @ motions)
+    seen = transverse * (unit / (lengths * noise_rad))[:, None, None]
     values, vectors = np.linalg.eigh(np.einsum("eax,eay->xy", seen, seen))
     values = np.where(values > _ROUNDING * values[-1], values, _UNKNOWN)
     moves = np.tile(np.eye(d, d + 1), (len(group), 1, 1))

@@ -150,13 +150,15 @@ def refine_starts(
         options: which starts, and whether to refine.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    if solved.status is Status.NOT_SOLVED:
-        return _keep_baseline(_Problem(measured, metric, None), solved)
-    lud, second = _find_second_start(measured, options.num_threads())
-    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
+    is_baseline = solved.status is Status.NOT_SOLVED
+    refines = options.refines and not is_baseline
+    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.num_threads())
+    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
+    candidates = [(solved.method if is_baseline else "ShapeFit", solved.locations)]
+    if second is not None:
+        candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
@@ -166,14 +168,16 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = _choose(starts, costs, apart, options)
-    if problem.normal_solver is None and options.refines:
+    kept, reason = starts[0], "the baseline's own answer, as asked"
+    if not is_baseline:
+        kept, reason = _choose(starts, costs, apart, options)
+    if problem.normal_solver is None and refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _measure_moves(kept)
     # To the bit: the certificate is that of these very locations.
-    is_certified = kept.name == "ShapeFit" and moved[1] == 0.0
+    is_as_solved = kept.locations is solved.locations and moved[1] == 0.0
     return RefinedPlacement(
-        locations=solved.locations if is_certified else normalize_locations(graph, kept.best),
+        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.best),
         start=kept.name,
         is_refined=moved[1] > 0.0,
         reason=reason,
@@ -201,11 +205,15 @@ def _plan_normal_solver(
 
 
 def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult | None, FloatArray | None]:
-    """Return LUD's solution, which groups have none of, and its locations."""
+    """Return LUD's solution after a few steps, which groups have none of, and its locations, if usable."""
     graph, classes, groups = measured.graph, measured.classes, measured.groups
     if groups is None:
-        lud = _solve_lud_start(graph, classes, threads) if has_second_start(graph) else None
-        return lud, None if lud is None else lud.locations
+        if not has_second_start(graph):
+            return None, None
+        certified, weighted = graph.num_edges <= _LUD_CERTIFIED_PAIRS, _weight_points(graph, classes)
+        lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
+        is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
+        return (lud, lud.locations) if is_usable else (None, None)
     metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
     found = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
@@ -215,37 +223,9 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
     return None, min(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def _solve_lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
-    """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
-    certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
-    weighted, resources = _weight_points(graph, classes), Resources(threads)
-    found = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=resources)
-    is_usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
-    return found if is_usable else None
-
-
 def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
     """Return the graph with the weights that directions to points have in LUD."""
     return graph.with_weights(np.where(classes > 0, point_weight, 1.0) * graph.weights)
-
-
-def _keep_baseline(problem: _Problem, solved: SolverResult) -> RefinedPlacement:
-    """Return a baseline's answer as it is."""
-    start = _unrefined_start(solved.method, solved.locations)
-    levels = _common_levels(problem, [start])
-    return RefinedPlacement(
-        locations=solved.locations,
-        start=start.name,
-        is_refined=False,
-        reason="the baseline's own answer, as asked",
-        disagreement=None,
-        costs={start.name: robust_cost(problem.graph, start.best, problem.metric, levels)},
-        levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=_measure_moves(start),
-        num_turned_pairs=0,
-        reset_nodes=start.reset_nodes,
-        lud=None,
-    )
 
 
 def has_second_start(graph: ViewGraph) -> bool:
@@ -255,8 +235,7 @@ def has_second_start(graph: ViewGraph) -> bool:
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
     """Return the standard deviation of the log ratio of node lengths of two sets of locations (n, d)."""
-    ratio = np.log(_node_lengths(graph, a) / _node_lengths(graph, b))
-    return float(np.std(ratio))
+    return float(np.std(np.log(_node_lengths(graph, a) / _node_lengths(graph, b))))
 
 
 def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -281,12 +260,8 @@ def _refine_start(
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round.
 
-    Args:
-        problem: what it is refined on.
-        name: of the start.
-        locations: (n, d) as solved.
-        fallback: (n, d) locations that nodes are reset to which the refinement moves far out.
-        other: (n, d) the other start, refined: this one ends early where it cannot do better.
+    It ends early where it cannot do better than the `other` start, refined. Nodes that it moves far out are
+    reset to the `fallback`.
     """
     if problem.normal_solver is None:
         return _unrefined_start(name, locations)
@@ -300,10 +275,9 @@ def _refine_start(
 def _reset_strays(
     problem: _Problem, fallback: FloatArray, refined: AngularResult
 ) -> tuple[AngularResult, IntArray]:
-    """Return a refinement whose strays are reset to the fallback, and these nodes.
+    """Return a refinement whose strays are reset, and these nodes, each of which is a group of its own.
 
-    If the fallback as a whole fits better, all nodes are as it has them. Only nodes that are a group of their
-    own can be reset one by one.
+    If the fallback as a whole fits better, all nodes are as it has them.
     """
     graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
     agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
@@ -376,9 +350,9 @@ def _choose(
 
 
 def _normalize(t: FloatArray) -> FloatArray:
-    """Return locations (n, d) centred and of norm 1."""
-    centred = t - t.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    """Return locations (n, d) centered and of norm 1."""
+    centered = t - t.mean(axis=0)
+    return np.asarray(centered / np.linalg.norm(centered))
 
 
 def _measure_moves(kept: Start) -> tuple[float, float]:
