@@ -63,14 +63,16 @@ _ROUND_REDUCTION = 0.1
 # The rounds end when the excess costs less than this share of the gap; the second share is that where the gap
 # misses what was asked for in any case.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
-# The least residual, relative to the mean one, that the metric takes seriously.
-_RESIDUAL_FLOOR = 0.1
+RESIDUAL_FLOOR = 0.1
+"""The least residual, relative to the mean one, that the metric takes seriously."""
+
 # The share of the metric across the surface of a ball that is taken away.
 _ALONG_SURFACE = 0.97
 # A pair counts as on the surface of its ball from this ||y_e|| / w_e on.
 _ON_SURFACE = 0.99
-# Each repair shrinks the equality residual to the rounding of the previous one.
-_REPAIRS = 4
+REPAIRS = 4
+"""Each repair shrinks the equality residual to the rounding of the previous one."""
+
 # Conjugate gradients need 10 to 60 steps on all but long chains.
 _CG_STEPS = 500
 # From so many pairs on, the passes over them run by so many blocks, on several threads.
@@ -84,11 +86,14 @@ _LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10
 _ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
 # No bound may rest on a larger equality residual, relative to the largest degree.
 _UNREPAIRED = 1e-9
-# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
-_STRICT = 1e-3
-# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this; in single
-# precision it must be far above the rounding of the factor, n d eps.
-_REGULAR, _REGULAR_SINGLE = 1e-9, 1e-3
+STRICT = 1e-3
+"""A pair counts as held by its fit if ||y_e|| < (1 - this) w_e."""
+
+REGULAR = 1e-9
+"""A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this."""
+
+# In single precision it must be far above the rounding of the factor, n d eps.
+_REGULAR_SINGLE = 1e-3
 # From so many unknowns on a factor in single precision is tried first.
 _SINGLE_FROM = 450
 # Uniqueness is not examined beyond so many pairs, whose ordering alone takes seconds, or so many operations.
@@ -297,7 +302,7 @@ def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: flo
     repair.metric.normal[:] = 0.0
     fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
     worst = 1.0
-    for _ in range(_REPAIRS):
+    for _ in range(REPAIRS):
         violation = _violation(repair.metric, c, t)[1]
         reduction = fine / max(float(np.linalg.norm(violation)), fine)
         worst = _restore(repair, violation, reduction)
@@ -329,7 +334,7 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
     mean = float(np.vdot(graph.weights, residuals) / graph.weights.sum())
     if not mean > 0.0:
         return graph.weights
-    np.maximum(residuals, _RESIDUAL_FLOOR * mean, out=residuals)
+    np.maximum(residuals, RESIDUAL_FLOOR * mean, out=residuals)
     np.divide(graph.weights, residuals, out=residuals)  # in place: on large graphs memory is short here
     residuals *= mean
     return residuals
@@ -456,36 +461,33 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
-    v, w = graph.directions, graph.weights
-    longest = int(np.argmax(along(differences(t, graph.edges), v)))
-    n, d = graph.num_nodes, graph.dimension
+    n, d, v = graph.num_nodes, graph.dimension, graph.directions
     order = cache(lambda: best_order(adjacency(n, graph.edges)))
-    if prefers_dense_factor(graph, lambda: order().flops * d**3):
-        return _is_regular_dense(graph, y, longest)
-    if order().flops * d**3 > _UNIQUENESS_FLOPS:
+    is_dense = prefers_dense_factor(graph, lambda: order().flops * d**3)
+    if not is_dense and order().flops * d**3 > _UNIQUENESS_FLOPS:
         return None
-    symbolic = plan_factorisation(adjacency(n, graph.edges), graph.edges, order())
+    longest = int(np.argmax(along(differences(t, graph.edges), v)))
     blocks = np.empty((graph.num_edges, d, d))
-    _set_conditions(v, w, y, longest, blocks)
+    _set_conditions(v, graph.weights, y, longest, blocks)
+    if is_dense:
+        return _is_regular_dense(graph, blocks)
+    symbolic = plan_factorisation(adjacency(n, graph.edges), graph.edges, order())
     try:
-        return factorise(symbolic, blocks).smallest_pivot > _REGULAR
+        return factorise(symbolic, blocks).smallest_pivot > REGULAR
     except UnsolvableError:
         return False
 
 
-def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
-    """Return whether the conditions of uniqueness have a regular matrix, by a dense factor of it."""
+def _is_regular_dense(graph: ViewGraph, blocks: FloatArray) -> bool:
+    """Return whether the Laplacian of the blocks is regular, by a dense factor of it."""
     n, d = graph.num_nodes, graph.dimension
-    blocks = np.empty((graph.num_edges, d, d))
-    _set_conditions(graph.directions, graph.weights, y, longest, blocks)
     diagonal = np.zeros((n, d, d))
-    with one_blas_thread():
-        if n * d >= _SINGLE_FROM:
-            matrix = np.zeros((n * d) ** 2, np.float32)
-            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float32)) > _REGULAR_SINGLE:
+    for dtype, regular in ((np.float32, _REGULAR_SINGLE), (np.float64, REGULAR)):
+        if n * d >= _SINGLE_FROM or dtype is np.float64:
+            matrix = np.zeros((n * d) ** 2, dtype)
+            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(dtype)) > regular:
                 return True
-        double, blas = np.zeros((n * d) ** 2), blas_of(np.float64)
-        return bool(_least_pivot(graph.edges, blocks, diagonal, double, blas) > _REGULAR)
+    return False
 
 
 @kernel(exact=True)
@@ -496,7 +498,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
         square = 0.0
         for k in range(d):
             square += y[e, k] ** 2
-        bend = w[e] / square if np.sqrt(square) >= (1.0 - _STRICT) * w[e] else 0.0
+        bend = w[e] / square if np.sqrt(square) >= (1.0 - STRICT) * w[e] else 0.0
         for k in range(d):
             for q in range(d):
                 x = w[e] if k == q else 0.0

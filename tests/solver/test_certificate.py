@@ -12,13 +12,12 @@ from sfm_shapefit.solver import certificate
 from sfm_shapefit.solver.certificate import certify, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import solve_admm
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
-from tests.problems import exact_graph, measure_graph
+from tests.problems import exact_graph, measure_graph, solve_admm
 
 
 def draw_family(family, n, degree, *, sigma=0.01, q=0.2, seed=1):

@@ -16,7 +16,6 @@ from sfm_shapefit.solver.splitting import (
     engine,
     laplacian_factor,
     linear,
-    solve_admm,
     solve_lud,
 )
 from sfm_shapefit.solver.splitting.anderson import Anderson
@@ -39,7 +38,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
-from tests.problems import shape
+from tests.problems import shape, solve_admm
 
 
 def view_graph(edges, t, *, sigma, q, seed, weights=None):

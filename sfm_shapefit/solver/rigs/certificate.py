@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.solver.certificate import Certificate
+from sfm_shapefit.solver.certificate import REGULAR, REPAIRS, RESIDUAL_FLOOR, STRICT, Certificate
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
 from sfm_shapefit.solver.rigs.groups import RigidGroups
@@ -19,14 +19,6 @@ from sfm_shapefit.viewgraph import ViewGraph
 _OFF_GROUPS = 1e-9
 # An equality residual that needs no repair.
 _EXACT = 1e-12
-# Each repair shrinks the equality residual to the rounding of the previous one.
-_REPAIRS = 4
-# The least residual, relative to the mean one, that the metric of the repair takes seriously.
-_RESIDUAL_FLOOR = 0.1
-# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
-_STRICT = 1e-3
-# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this.
-_REGULAR = 1e-9
 
 
 def certify_groups(
@@ -124,7 +116,7 @@ def _balance(
     system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, pin)
     if system is None:
         raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
-    for _ in range(_REPAIRS):
+    for _ in range(REPAIRS):
         multiplier, h = system.balance(total)
         moved = across(differences(groups.expand(h), graph.edges), v)
         y = across(y - stiffness[:, None] * moved, v)
@@ -140,7 +132,7 @@ def _stiffness(graph: ViewGraph, locations: FloatArray) -> FloatArray:
     mean = float(np.average(residuals, weights=graph.weights))
     if not mean > 0.0:
         return graph.weights
-    return np.asarray(graph.weights / np.maximum(residuals / mean, _RESIDUAL_FLOOR))
+    return np.asarray(graph.weights / np.maximum(residuals / mean, RESIDUAL_FLOOR))
 
 
 def _longest(graph: ViewGraph, locations: FloatArray) -> int:
@@ -152,7 +144,7 @@ def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: 
     """Return whether the feasible dual excludes other optima, up to translation and scale."""
     v, w = graph.directions, graph.weights
     norms = np.linalg.norm(y, axis=1)
-    held: BoolArray = norms < (1.0 - _STRICT) * w
+    held: BoolArray = norms < (1.0 - STRICT) * w
     u = np.where(held[:, None], 0.0, y / np.maximum(norms, 1e-300)[:, None])
     conditions = np.eye(graph.dimension) - v[:, :, None] * v[:, None, :] - u[:, :, None] * u[:, None, :]
     blocks = w[:, None, None] * conditions
@@ -163,4 +155,4 @@ def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: 
         factor.refactor(blocks)
     except UnsolvableError:
         return False
-    return factor.smallest_pivot > _REGULAR
+    return factor.smallest_pivot > REGULAR

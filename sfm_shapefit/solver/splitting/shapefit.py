@@ -9,7 +9,7 @@ from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
 from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Outcome, Stop, Tuning
-from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 _TUNING = Tuning(relaxation=1.7, renewals=tuple(10 * 2**k for k in range(8)), penalty=0.5, accelerate=True)
@@ -43,46 +43,13 @@ class Splitting:
         """End the threads."""
         self._passes.close()
 
-    def run(
-        self, tol: float, absolute_tol: float, max_iterations: int, on_iteration: OnIteration | None
-    ) -> AdmmResult:
-        """Iterate on until the error of the objective is estimated below `tol`, relative, or `absolute_tol`.
+    def run(self, goal: Goal, on_iteration: OnIteration | None) -> AdmmResult:
+        """Iterate on until the goal is reached, whose limit is that of all iterations since the beginning.
 
-        Args:
-            tol: relative error.
-            absolute_tol: error in units of the objective R / L.
-            max_iterations: limit of all iterations since the beginning.
-            on_iteration: called after each iteration; returning False cancels and returns the iterate.
+        The callback is called after each; where it returns False, the run ends with the iterate.
         """
-        goal = Goal(tol, absolute_tol, max_iterations)
         outcome = self._outcome = self._iteration.run(goal, on_iteration, self._outcome)
         state = outcome.state
         dual = self._passes.in_graph_order(self._passes.dual(state.x, state.rho))
         t = state.t - state.t.mean(axis=0)
         return AdmmResult(locations=t, dual=dual, iterations=outcome.iterations, stop=outcome.stop)
-
-
-def solve_admm(
-    graph: ViewGraph,
-    tol: float,
-    max_iterations: int,
-    resources: Resources = ONE_THREAD,
-    on_iteration: OnIteration | None = None,
-) -> AdmmResult:
-    """Solve ShapeFit by ADMM with the scalar graph Laplacian.
-
-    Args:
-        graph: a connected, parallel-rigid view graph whose directions do not cancel.
-        tol: relative error of the objective at which to stop, estimated; not certified.
-        max_iterations: hard limit, reported in `stop`.
-        resources: threads of the passes over edges, and the factor, by default what `laplacian_factor` picks.
-        on_iteration: called after each iteration; returning False cancels and returns the iterate.
-
-    Raises:
-        UnsolvableError: if the factor finds the Laplacian singular: the graph is not connected.
-    """
-    splitting = Splitting(graph, resources)
-    try:
-        return splitting.run(tol, 0.0, max_iterations, on_iteration)
-    finally:
-        splitting.close()

@@ -20,6 +20,7 @@ from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
 from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
+from sfm_shapefit.solver.splitting.engine import Goal
 from sfm_shapefit.solver.splitting.linear import ONE_THREAD, LaplacianFactor, Prediction, Resources
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -114,7 +115,7 @@ def _split(
     """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
     graph, resources, target = splitting.graph, splitting.resources, _FIRST_TARGET_PER_TOL * tol
     for attempts_left in reversed(range(_CERTIFICATES)):
-        step = splitting.run(0.0, target, max_iterations, on_iteration)
+        step = splitting.run(Goal(0.0, target, max_iterations), on_iteration)
         hopeless = tol if step.stop is Stop.ACCURATE and attempts_left else np.inf
         certificate = certify_in_place(graph, step.locations, step.dual, tol, hopeless, resources)
         if certificate is not None:
