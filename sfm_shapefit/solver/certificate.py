@@ -16,13 +16,13 @@ The division is what costs: one pair that is moved out of its ball by 1 % lowers
   u_e, mostly along the surface, and hardly at all where its residual is long: H_e = w_e / max(||r_e||, r).
   That is the Hessian of w ||r|| tamed so far that the scalar Laplacian of the weights H remains a good
   preconditioner. It asks nothing of the solver: r_e are the residuals of the given locations.
-- *Rounds.* What leaves its ball is clipped, and the equality is restored again, a few times. These
-  rounds need crude solves only; one solve to rounding comes last. From a dual of the splitting the bound is
-  then 100 to 1000 times closer than from one repair with S = P.
+- *Rounds.* What leaves its ball is clipped, and the equality is restored again, a few times, by crude solves;
+  one to rounding comes last. From a dual of the splitting the bound is then 100 to 1000 times closer than
+  from one repair with S = P.
 
 The systems are solved by conjugate gradients with that Laplacian, factored in float32 or, where it would
-fill in, approximately, as preconditioner; the number of steps does not grow with n. A dual that satisfies the
-equality already, as that of a Newton method does, is taken as it is.
+fill in, approximately, as preconditioner. A dual that satisfies the equality already, as that of a Newton
+method does, is taken as it is.
 
 Uniqueness. An optimal T' has w_e ||r'_e|| = <y_e, r'_e> for every pair and every optimal dual: r'_e = 0
 where ||y_e|| < w_e, and r'_e points along y_e where ||y_e|| = w_e. If translations and T are all that

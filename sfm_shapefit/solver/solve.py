@@ -17,7 +17,7 @@ from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
-from sfm_shapefit.solver.program import normalize_locations, objective, scale_functional
+from sfm_shapefit.solver.program import normalize_locations, scale_functional
 from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
@@ -98,15 +98,9 @@ def run_choice(
     prove: Callable[[FloatArray, FloatArray], Certificate],
     start: float,
 ) -> SolverResult:
-    """Run the chosen solver and return what it found, with its certificate.
+    """Run the chosen solver and return what it found; the solve began at `start`, by `time.perf_counter()`.
 
-    Args:
-        graph: what is solved.
-        choice: of the method.
-        options: solver settings.
-        on_iteration: called after each iteration; returning False cancels the solve.
-        prove: returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
-        start: `time.perf_counter()` when the solve began.
+    `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
 
     Raises:
         UnsolvableError: if the locations found are not finite or point against the directions.
@@ -133,32 +127,6 @@ def run_choice(
         seconds=time.perf_counter() - start,
         method=choice.method,
         method_reason="; ".join(filter(None, [choice.reason, run.note])),
-    )
-
-
-def uncertified(
-    graph: ViewGraph, locations: FloatArray, status: Status, method: str, reason: str, start: float
-) -> SolverResult:
-    """Return locations (n, d) that `method` found, for a `reason`, in ShapeFit's scale.
-
-    They have no certificate, and `status` says why; `start` is `time.perf_counter()` when it began.
-
-    Raises:
-        UnsolvableError: if they are not finite or point against the directions.
-    """
-    scaled = normalize_locations(graph, locations)
-    return SolverResult(
-        locations=frozen(scaled),
-        status=status,
-        objective=objective(graph, scaled),
-        dual_bound=0.0,
-        dual=frozen(np.zeros_like(graph.directions)),
-        equality_residual=0.0,
-        unique=None,
-        iterations=0,
-        seconds=time.perf_counter() - start,
-        method=method,
-        method_reason=reason,
     )
 
 

@@ -11,7 +11,7 @@ from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.solver.rigs import lud_over_groups, solve_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting import solve_lud
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import outer, rig_problem, shape
 

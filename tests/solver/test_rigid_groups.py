@@ -18,7 +18,7 @@ from sfm_shapefit.solver.rigs import solve as groups_solve
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting import solve_lud
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import outer, rig_problem
 

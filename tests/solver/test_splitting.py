@@ -10,14 +10,7 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import (
-    IterativeSolver,
-    Stop,
-    engine,
-    laplacian_factor,
-    linear,
-    solve_lud,
-)
+from sfm_shapefit.solver.splitting import engine, linear
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import (
     ALONG,
@@ -28,7 +21,14 @@ from sfm_shapefit.solver.splitting.edges import (
     EdgePasses,
     edge_data,
 )
-from sfm_shapefit.solver.splitting.linear import Resources, predict_factor
+from sfm_shapefit.solver.splitting.engine import Stop
+from sfm_shapefit.solver.splitting.linear import (
+    IterativeSolver,
+    Resources,
+    laplacian_factor,
+    predict_factor,
+)
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
 from sfm_shapefit.synthetic import (
     box_graph_problem,

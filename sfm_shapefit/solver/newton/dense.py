@@ -73,22 +73,11 @@ class DenseFactor(NamedTuple):
 def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a dense Cholesky factor of nd x nd; for n up to about a thousand.
+    """Solve the program with a dense Cholesky factor of nd x nd; as `solve_newton_sparse` otherwise.
 
-    Args:
-        graph: a connected, parallel-rigid view graph whose c is not 0.
-        tol: the gap wanted, in units of the objective.
-        max_iterations: limit of factorizations.
-        on_iteration: called after every factorization and its steps.
-
-    Returns:
-        locations (n, d), the dual (m, d), and the number of factorizations.
-
-    Raises:
-        UnsolvableError: if the directions do not determine any locations.
+    For n up to about a thousand.
     """
-    work = allocate(graph)
-    problem, iterate, linearization, step = work
+    problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
     single = n * d >= _SINGLE_FROM
     factor = _allocate_factor(n, d, np.float32 if single else np.float64)

@@ -38,7 +38,7 @@ def solve_newton_sparse(
     start: tuple[FloatArray, FloatArray] | None = None,
     plan: SymbolicFactor | EliminationTree | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a sparse Cholesky factor in d x d blocks; as `solve_newton_dense` otherwise.
+    """Solve the program with a sparse Cholesky factor in d x d blocks.
 
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
@@ -70,12 +70,9 @@ def solve_newton_reduced(
     on_iteration: OnIteration | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program over the unknowns of a reduction; see `solve_newton_sparse`.
+    """Solve the program over the unknowns of a reduction, which the pairs determine.
 
-    Args:
-        graph: a connected view graph whose pairs determine the unknowns.
-        reduction: of its locations, with memory for the factor.
-        tol, max_iterations, on_iteration, start: as in `solve_newton_sparse`.
+    All else is as in `solve_newton_sparse`.
     """
     work = steps.allocate(graph)
     problem, iterate = work.problem, work.iterate

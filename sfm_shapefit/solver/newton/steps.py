@@ -136,30 +136,21 @@ def allocate(graph: ViewGraph) -> Work:
     """
     n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
 
-    def nodes() -> FloatArray:
+    def at_nodes() -> FloatArray:
         return np.empty((n, d))
 
-    def edges() -> FloatArray:
+    def at_edges() -> FloatArray:
         return np.empty((m, d - 1))
 
-    basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
-    linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), nodes())
-    set_up(graph.directions, graph.weights, basis, tilt, linearization.s)
-    problem = Problem(
-        graph.edges.astype(np.uint32),
-        graph.directions,
-        basis,
-        tilt,
-        graph.weights,
-        scale_functional(graph),
-        float(graph.weights.sum()),
-        tuple(range(d)),
-        tuple(range(d - 1)),
-    )
+    v, w, basis, tilt = graph.directions, graph.weights, np.empty((m, d, d - 1)), np.empty(m)
+    linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), at_nodes())
+    set_up(v, w, basis, tilt, linearization.s)
+    edges, c, kappa, axes = graph.edges.astype(np.uint32), scale_functional(graph), float(w.sum()), range(d)
+    problem = Problem(edges, v, basis, tilt, w, c, kappa, tuple(axes), tuple(axes[:-1]))
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-    step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
-    return Work(problem, Iterate(nodes(), edges(), edges(), edges()), linearization, step)
+    step = Step(at_nodes(), at_edges(), at_edges(), at_nodes(), at_edges(), np.empty(m), np.empty(m))
+    return Work(problem, Iterate(at_nodes(), at_edges(), at_edges(), at_edges()), linearization, step)
 
 
 def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:

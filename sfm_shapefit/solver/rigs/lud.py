@@ -15,14 +15,10 @@ _MAX_STEPS = 150
 
 
 def lud_over_groups(graph: ViewGraph, groups: RigidGroups, max_steps: int = _MAX_STEPS) -> FloatArray | None:
-    """Return LUD's locations (n, d), centred, after some steps; None if the system breaks down.
+    """Return LUD's locations (n, d), centered, after some steps; None if the system breaks down.
 
-    The splitting sees the groups through its linear solve alone, which moves the locations by A x.
-
-    Args:
-        graph: connected over the groups; every pair joins two of them.
-        groups: of its nodes.
-        max_steps: limit of steps of the splitting.
+    The splitting sees the groups through its linear solve alone, which moves the locations by A x. Every pair
+    of the graph joins two groups, and all groups are connected.
     """
     try:
         factor = ReducedFactor(graph.edges, groups.normalize())

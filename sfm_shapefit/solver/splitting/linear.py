@@ -1,9 +1,8 @@
 """The linear solve inside ADMM: a float32 Cholesky factor where it fits, conjugate gradients elsewhere.
 
-Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta
-(delta form). An error of delta is then an error relative to the *step*: a float32 factor loses nothing,
-and conjugate gradients that reduce their residual tenfold count as solved, since what is left enters the
-next right-hand side.
+Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta. An
+error of delta is relative to the *step* and enters the next right-hand side: a float32 factor loses nothing,
+and conjugate gradients that reduce their residual tenfold count as solved.
 """
 
 from typing import NamedTuple, Protocol
@@ -119,10 +118,9 @@ def predict_factor(graph: ViewGraph) -> Prediction:
     """Return the order of elimination that `laplacian_factor` would use.
 
     A graph on which the diagonal is a good preconditioner has a large spectral gap, so no small separators
-    (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, and the ordering, which takes longer
-    than a solve by conjugate gradients, is saved. So it is on huge graphs whose levels are so wide that the
-    factor would take longer than it saves; some of them may have better separators than their levels, but
-    approximate Cholesky serves them as well.
+    (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, so none is looked for. Nor is it on
+    huge graphs whose levels are so wide that the factor would take longer than it saves; if some of them have
+    better separators than their levels, approximate Cholesky serves them as well.
     """
     neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if graph.num_nodes >= _LARGE:

@@ -107,10 +107,10 @@ def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner
     v, w, n = graph.directions, graph.weights, graph.num_nodes
     bound_active = along(dual, v) < -1e-6 * w
     for _ in range(_REPAIRS):
-        y = _balanced(graph, dual, bound_active, precondition)
+        y = _balance(graph, dual, bound_active, precondition)
         still_active = bound_active & (along(y, v) <= 0.0)
         if (still_active == bound_active).all():  # then once more, to rounding
-            y = _balanced(graph, y, bound_active, precondition)
+            y = _balance(graph, y, bound_active, precondition)
             still_active = bound_active & (along(y, v) <= 0.0)
         if (still_active == bound_active).all():
             break
@@ -123,22 +123,19 @@ def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner
     return float(-along(y, v)[bound_active].sum()), residual
 
 
-def _balanced(
-    graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner
-) -> FloatArray:
+def _balance(graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner) -> FloatArray:
     """Return the dual moved to D^T y = 0, by all directions on `free` edges and across v on the others."""
     edges, v, n = graph.edges, graph.directions, graph.num_nodes
 
     def allowed(z: FloatArray) -> FloatArray:
         return np.where(free[:, None], z, across(z, v))
 
+    def product(x: FloatArray) -> FloatArray:
+        return adjoint(allowed(differences(x, edges)), edges, n)
+
     y = allowed(dual)
+    total = adjoint(y, edges, n)
     h = conjugate_gradients(
-        lambda x: adjoint(allowed(differences(x, edges)), edges, n),
-        precondition,
-        adjoint(y, edges, n),
-        tol=_CG_TOL,
-        max_iterations=_CG_STEPS,
-        coupled=True,
+        product, precondition, total, tol=_CG_TOL, max_iterations=_CG_STEPS, coupled=True
     ).x
     return np.asarray(y - allowed(differences(h, edges)))

@@ -1,11 +1,10 @@
 """Large graphs to a proven gap: splitting, then a certificate, then Newton steps only if it must be.
 
-Splitting is cheap but proves nothing; the certificate makes its dual feasible at the price of some twenty
-iterations, and the gap it then proves is mostly below the error that the splitting estimates for itself, and
-hardly ever above three times it. So the splitting is asked for a third of the gap, and its answer certified.
-If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes
-over from the certified point, if its factor fits. Newton's method converges from near a solution or from its
-own beginning: if the point was of no use, it begins again there.
+Splitting is cheap but proves nothing; the certificate costs some twenty of its iterations, and the gap proven
+is hardly ever above three times the error that the splitting estimates for itself. So the splitting is asked
+for a third of the gap, and its answer certified. If that misses, it goes on where it was. Where it stalls, as
+on long chains, the sparse Newton solver takes over from the certified point, if its factor fits, and begins
+anew where that point was of no use.
 """
 
 import enum
@@ -19,9 +18,15 @@ from sfm_shapefit.solver.certificate import Certificate, certify, certify_in_pla
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
-from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
-from sfm_shapefit.solver.splitting.engine import Goal
-from sfm_shapefit.solver.splitting.linear import ONE_THREAD, LaplacianFactor, Prediction, Resources
+from sfm_shapefit.solver.splitting.engine import Goal, Stop
+from sfm_shapefit.solver.splitting.linear import (
+    ONE_THREAD,
+    LaplacianFactor,
+    Prediction,
+    Resources,
+    laplacian_factor,
+)
+from sfm_shapefit.solver.splitting.shapefit import Splitting
 from sfm_shapefit.viewgraph import ViewGraph
 
 # The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
