@@ -10,14 +10,9 @@ eigenvalue of the first term. It counts by the arctangent kernel, with k = 3,
 
     minimize  sum_e w_e / 2 * k^2 atan(chi2_e / k^2),
 
-which forgets outliers as that of Geman and McClure does. On right directions alone the two compare like this:
-
-    kernel                error over that of least squares
-    arctangent            1.04
-    Geman and McClure     1.18
-
-While the level falls the latter is used all the same: it lets go of a wrong direction early, where the
-arctangent may settle for a larger level.
+which forgets outliers as that of Geman and McClure does. On right directions alone its error is 1.04 times
+that of least squares, theirs 1.18 times. While the level falls theirs is used all the same: it lets go of a
+wrong direction early, where the arctangent may settle for a larger level.
 
 The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
 A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
@@ -99,7 +94,7 @@ class AngularResult:
     """Locations refined in angles."""
 
     locations: FloatArray
-    """(n, d) centred, of unit norm."""
+    """(n, d) centered, of unit norm."""
     levels_rad: FloatArray
     """(number of classes,) the s at which it ended."""
     cost: float
@@ -113,8 +108,7 @@ def plan_refinement(
 ) -> SymbolicFactor | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 
-    Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
-    few steps. On long chains they need many, but there a factor is little work.
+    Where a factor is much work, the graph is well connected, and conjugate gradients need few steps.
     """
     neighbors = adjacency(graph.num_nodes, graph.edges)
     tree = best_order(neighbors)
@@ -313,8 +307,8 @@ def _unit(t: FloatArray) -> FloatArray:
 def _motion(t: FloatArray, moved: FloatArray) -> float:
     """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
 
-    A few loose nodes may wander for long while nothing else changes; in a long chain the cost may hardly
-    fall while all of it still moves.
+    A few loose nodes may wander for long; in a long chain the cost may hardly fall while all of it still
+    moves.
     """
     return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 

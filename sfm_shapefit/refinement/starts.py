@@ -41,7 +41,7 @@ COLLAPSED = 0.3
 
 # Disagreement from which LUD is likely to be the better start.
 _UNEQUAL = 0.1
-# Iterations of LUD; more change nothing after the refinement.
+# More change nothing after the refinement.
 _LUD_STEPS = 50
 # Up to so many pairs LUD's own bound is computed, which costs about 100 more iterations.
 _LUD_CERTIFIED_PAIRS = 50_000
@@ -79,7 +79,7 @@ class RefinedPlacement:
     """The locations that are kept, and why."""
 
     locations: FloatArray
-    """(n, d) centred, scaled like the solver's."""
+    """(n, d) centered, scaled like the solver's."""
     start: str
     """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
     is_refined: bool
@@ -94,7 +94,7 @@ class RefinedPlacement:
     """Noise level of each class of directions: between cameras, then from cameras to points."""
     moved: tuple[float, float]
     """Median and largest move of a node by the refinement, as a share of the median distance from the
-    centre."""
+    center."""
     num_turned_pairs: int
     """Directions, those to points too, that fit the start and not the refined locations, or the other way
     round, at `levels_deg`."""
@@ -194,7 +194,7 @@ def refine_starts(
 def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
 ) -> SymbolicFactor | NormalFactor | None:
-    """Return what the refinement solves its steps with, or None if its factor would be too large."""
+    """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.factor_memory_mb * 1_000_000
     if groups is None:
         return plan_refinement(graph, max_bytes)
@@ -250,11 +250,6 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
 
 
-def _unrefined_start(name: str, locations: FloatArray) -> Start:
-    """Return a start as it was solved."""
-    return Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
-
-
 def _refine_start(
     problem: _Problem, name: str, locations: FloatArray, fallback: FloatArray, other: FloatArray | None
 ) -> Start:
@@ -263,13 +258,14 @@ def _refine_start(
     It ends early where it cannot do better than the `other` start, refined. Nodes that it moves far out are
     reset to the `fallback`.
     """
+    as_solved = Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
     if problem.normal_solver is None:
-        return _unrefined_start(name, locations)
+        return as_solved
     refined = refine_angles(problem.graph, locations, problem.metric, problem.normal_solver, other)
     refined, nodes = _reset_strays(problem, fallback, refined)
     if projected_length(problem.graph, refined.locations) <= 0.0:
-        return _unrefined_start(name, locations)
-    return Start(name=name, locations=locations, refined=refined, reset_nodes=nodes)
+        return as_solved
+    return replace(as_solved, refined=refined, reset_nodes=nodes)
 
 
 def _reset_strays(

@@ -5,7 +5,7 @@ sure of itself: matches of one pair share their errors (calibration, repeated st
 of them are not a thousand witnesses. The unit of evidence is therefore the pair. For camera i let
 
     w_i        how far it turned; the level is what such turns are like, from their median, at least 0.3 deg
-    kept_p     cost of its pair p with the given rotation of i, and the centre of i placed anew
+    kept_p     cost of its pair p with the given rotation of i, and the center of i placed anew
     refined_p  cost of the pair with the refined one; the other cameras refined in both.
 
 If each pair counts as nu = 2 independent residuals of unknown variance, the refined rotation is likelier by
@@ -65,7 +65,7 @@ class RotationRefinement:
     turns: FloatArray
     """(n, 3, 3) refined ray = turn @ given ray; exactly the identity where the given rotation stays."""
     centers: FloatArray
-    """(n, 3) centres that were refined with them; shift free, median spread about 1."""
+    """(n, 3) centers that were refined with them; shift free, median spread about 1."""
     updated: BoolArray
     """(n,) which cameras take a refined rotation."""
     angles_deg: FloatArray
@@ -78,11 +78,11 @@ class RotationRefinement:
 def refine_rotations(
     matches: RayMatches, centers: FloatArray, turns: FloatArray | None = None
 ) -> RotationRefinement:
-    """Refine rotations and centres on the matches, and accept per camera what they give evidence for.
+    """Refine rotations and centers on the matches, and accept per camera what they give evidence for.
 
     Args:
         matches: the matches of k pairs of the n cameras, as the given rotations place their rays.
-        centers: (n, 3) centres to start from, from the given rotations or refined ones.
+        centers: (n, 3) centers to start from, from the given rotations or refined ones.
         turns: (n, 3, 3) where to start, refined = turns @ given, from an earlier refinement: only the
             narrowest loss is used then. The identity if None. The prior stays at the given rotations.
     """
@@ -144,7 +144,7 @@ def _gains(matches: RayMatches, kept: FloatArray, refined: FloatArray) -> FloatA
 
 
 def _median_gain(matches: RayMatches, state: State, prior: TurnPrior) -> float:
-    """Return what the median pair gains over all given rotations, with centres placed for those."""
+    """Return what the median pair gains over all given rotations, with centers placed for those."""
     n = len(state.centers)
     given = State(np.tile(np.eye(3), (n, 1, 1)), state.centers)
     placed = minimize(matches, given, _FINAL_PX, prior._replace(free=np.zeros(n, dtype=np.bool_)))
@@ -164,7 +164,7 @@ def _rotation_sigmas(normal: NormalEquations, matches: RayMatches, num_cameras: 
 def _kept_costs(matches: RayMatches, state: State) -> tuple[FloatArray, FloatArray]:
     """Return the costs (k,) of all pairs with camera i, and with camera j, at its given rotation.
 
-    The centre of that camera alone is placed anew, by damped Newton steps for all cameras at once.
+    The center of that camera alone is placed anew, by damped Newton steps for all cameras at once.
     """
     n, (i, j) = len(state.centers), matches.pairs.T
     given = np.tile(np.eye(3), (n, 1, 1))
@@ -201,7 +201,7 @@ def _choose_rows(rows: BoolArray, new: NormalEquations, old: NormalEquations) ->
 def _center_steps(
     normals: tuple[NormalEquations, NormalEquations], matches: RayMatches, damping: FloatArray
 ) -> FloatArray:
-    """Return the damped Newton step (n, 3) of each centre with all others held."""
+    """Return the damped Newton step (n, 3) of each center with all others held."""
     n = len(damping)
     hessian, gradient = np.zeros((n, 3, 3)), np.zeros((n, 3))
     for end, sign, normal in zip(matches.pairs.T, (1.0, -1.0), normals, strict=True):

@@ -1,4 +1,4 @@
-"""Rotations and centres refined together on the matches themselves, without 3D points.
+"""Rotations and centers refined together on the matches themselves, without 3D points.
 
 A match of pair (i, j) is two unit rays a, b in world axes, as the given rotations place them. A camera that
 turns by the small rotation vector w_i turns its rays, a -> exp([w_i]) a. With the baseline
@@ -51,7 +51,7 @@ _SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 
 
 class State(NamedTuple):
-    """What is sought: rotations in world axes that turn each camera's rays, and the centres."""
+    """What is sought: rotations in world axes that turn each camera's rays, and the centers."""
 
     turns: FloatArray
     """(n, 3, 3)"""

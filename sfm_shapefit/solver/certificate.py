@@ -136,7 +136,7 @@ def certify(
 
     Args:
         graph: a connected view graph.
-        locations: (n, d) camera centres, in any scale, with L(T) > 0.
+        locations: (n, d) camera centers, in any scale, with L(T) > 0.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
@@ -546,7 +546,7 @@ def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any)
 
 
 def _checked_objective(graph: ViewGraph, locations: FloatArray, t: FloatArray, dual: FloatArray) -> float:
-    """Return the objective at the locations, t when centred, or raise InputError."""
+    """Return the objective at the locations, t when centered, or raise InputError."""
     shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(

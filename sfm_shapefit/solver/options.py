@@ -132,7 +132,7 @@ class SolverResult(Displayed):
     """A solve's answer together with the evidence that it is one."""
 
     locations: "FloatArray"
-    """(n, d) camera centres with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
+    """(n, d) camera centers with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
     status: Status
     objective: float
     """R(T) / L(T) of the paper at `locations`: a length-weighted mean tangent of the angular errors."""

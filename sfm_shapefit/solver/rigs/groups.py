@@ -1,15 +1,15 @@
 """Rigid groups of cameras: rigs, whose frames are the unknowns, and cameras that must stay where they are.
 
-Camera k belongs to group b(k) and stands at a known offset from its group's centre, in world axes and in one
+Camera k belongs to group b(k) and stands at a known offset from its group's center, in world axes and in one
 unit that all groups share:
 
     t_k = f_b(k) + s o_k
 
-Unknown are the centres f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
-linear in x = (f, s), and dividing by s gives the centres in the unit of the offsets.
+Unknown are the centers f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
+linear in x = (f, s), and dividing by s gives the centers in the unit of the offsets.
 
-    rig            a frame is a group; o_k = R_frame^T (centre of the sensor in the rig), metric
-    fixed cameras  all of them are one group; o_k = their given centres
+    rig            a frame is a group; o_k = R_frame^T (center of the sensor in the rig), metric
+    fixed cameras  all of them are one group; o_k = their given centers
     other camera   a group of its own; o_k = 0
 
 Rotations are known throughout, so a group only moves, it does not turn.
@@ -69,8 +69,8 @@ class RigidGroups:
 
     def expand(self, x: FloatArray) -> FloatArray:
         """Return A x, the locations (n, d) for x = (f, s)."""
-        centres = x[:-1].reshape(-1, self.offsets.shape[1])
-        return np.asarray(centres[self.group_of] + x[-1] * self.offsets)
+        centers = x[:-1].reshape(-1, self.offsets.shape[1])
+        return np.asarray(centers[self.group_of] + x[-1] * self.offsets)
 
     def reduce(self, g: FloatArray) -> FloatArray:
         """Return A^T g for g (n, d): its sum over each group, and its inner product with the offsets."""
@@ -133,7 +133,7 @@ class RigidGroups:
         """Return the groups with all of those that hold a fixed node joined to one, the first.
 
         Args:
-            fixed: (n,) the nodes that keep their centres relative to each other.
+            fixed: (n,) the nodes that keep their centers relative to each other.
             centers: (n, d) in the unit of the offsets; those of nodes that share no group with a fixed one
                 are not read.
         """

@@ -36,7 +36,7 @@ class ReducedFactor(Reduction):
 
         Args:
             edges: (m, 2) pairs of nodes, each of two different groups, which they connect.
-            groups: of the nodes; offsets best centred.
+            groups: of the nodes; offsets best centered.
             threads: of the factor; its answers do not depend on it.
             max_bytes: what the factor may take; predicted before it is allocated.
 

@@ -41,7 +41,7 @@ class LudResult:
     """A solution of LUD with the bound that its dual proves."""
 
     locations: FloatArray
-    """(n, d) centred; the least edge length is about 1."""
+    """(n, d) centered; the least edge length is about 1."""
     lengths: FloatArray
     """(m,) s_e >= 1, the best ones for the locations."""
     objective: float

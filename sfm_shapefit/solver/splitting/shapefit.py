@@ -20,7 +20,7 @@ class AdmmResult:
     """Where the splitting ended. `certify` says what the dual proves."""
 
     locations: FloatArray
-    """(n, d) centred, with L(T) = sum of the weights."""
+    """(n, d) centered, with L(T) = sum of the weights."""
     dual: FloatArray
     """(m, d) y_e, orthogonal to v_e and ||y_e|| <= w_e; the equality holds approximately."""
     iterations: int

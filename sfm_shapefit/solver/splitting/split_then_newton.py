@@ -63,7 +63,7 @@ class HybridResult:
     """Locations and what is proven about them."""
 
     locations: FloatArray
-    """(n, d) centred, with L(T) = sum of the weights."""
+    """(n, d) centered, with L(T) = sum of the weights."""
     certificate: Certificate
     """Of these locations; its dual is feasible."""
     iterations: int
