@@ -12,8 +12,8 @@ from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs import largest_tied
 from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # The largest offset, of the median baseline, below which the scale of the offsets means nothing.
 _LEAST_UNIT = 1e-6

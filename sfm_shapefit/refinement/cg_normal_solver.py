@@ -1,7 +1,7 @@
-"""The normal equations of the angular refinement without a factor: conjugate gradients, for graphs too large.
+"""The normal equations of the angular refinement on large graphs: conjugate gradients without a factor.
 
-A step need not be exact, for the next one starts where it ends. The preconditioner is an approximate Cholesky
-factor of the scalar Laplacian whose weights are the mean eigenvalues of the blocks.
+A step need not be exact. The preconditioner is an approximate Cholesky factor of the scalar Laplacian whose
+weights are the mean eigenvalues of the blocks.
 """
 
 from typing import NamedTuple

@@ -2,9 +2,9 @@
 
 ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
 corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
-neither bias exists, and the one of lower robust cost is kept. How far the two convex starts disagree says
-whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the log ratio
-of their node lengths, a camera's node length being the median length of its pairs.
+neither bias exists, and the one of lower robust cost is kept. Whether ShapeFit's optimum can be believed by
+itself is seen by how far both disagree: the standard deviation, over cameras, of the log ratio of their node
+lengths, which are medians of the lengths of a camera's pairs.
 """
 
 from dataclasses import dataclass, replace
@@ -31,7 +31,8 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
-from sfm_shapefit.solver.rigs import ReducedFactor, lud_over_groups
+from sfm_shapefit.solver.rigs.lud import lud_over_groups
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
 from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
@@ -255,8 +256,8 @@ def _refine_start(
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round.
 
-    It ends early where it cannot do better than the `other` start, refined. Nodes that it moves far out are
-    reset to the `fallback`.
+    It ends early where the `other` start, refined, is better. Nodes moved far out are reset to the
+    `fallback`.
     """
     as_solved = Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
     if problem.normal_solver is None:
@@ -271,10 +272,7 @@ def _refine_start(
 def _reset_strays(
     problem: _Problem, fallback: FloatArray, refined: AngularResult
 ) -> tuple[AngularResult, IntArray]:
-    """Return a refinement whose strays are reset, and these nodes, each of which is a group of its own.
-
-    If the fallback as a whole fits better, all nodes are as it has them.
-    """
+    """Return a refinement with lone strays reset, or all nodes where that fits better, and the strays."""
     graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
     agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
     nodes = find_strays(graph, fallback, refined.locations, agreeing, _noise(metric, levels))

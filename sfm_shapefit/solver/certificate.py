@@ -140,8 +140,7 @@ def certify(
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        resources: threads of a repair, and a factor, which saves a new analysis of the graph; it serves as
-            preconditioner and cannot make the bound wrong.
+        resources: threads of a repair, and a factor, a preconditioner that cannot make the bound wrong.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
@@ -296,8 +295,7 @@ def _clip_in_rounds(
 def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: float) -> float:
     """Move y to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e.
 
-    The metric is H_e P_e here: what is still to be moved costs little, and the conjugate gradients need half
-    of the steps.
+    The metric is H_e P_e here, with which the conjugate gradients need half of the steps.
     """
     repair.metric.normal[:] = 0.0
     fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
@@ -375,11 +373,7 @@ def _residuals(edges: Any, v: Any, t: Any, out: Any) -> None:
 
 @kernel(exact=True)
 def _project(edges: Any, v: Any, w: Any, y: Any, c: Any, total: Any, degrees: Any) -> float:
-    """Remove the part of y along v; add D^T (w v), D^T y and the sums of w at the cameras.
-
-    Returns:
-        max_e ||y_e|| / w_e.
-    """
+    """Remove the part of y along v; add D^T (w v), D^T y and the sums of w; return max_e ||y_e|| / w_e."""
     worst = 0.0
     for e in range(len(w)):
         i, j = edges[e, 0], edges[e, 1]

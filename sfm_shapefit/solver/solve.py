@@ -63,8 +63,7 @@ def solve(
         result = solve(graph)
         result.locations, result.gap, result.unique
 
-    This is the certified program alone, whose optimum collapses on long chains and under heavy corruption; to
-    place the cameras of a graph, call `sfm_shapefit.place`.
+    Its optimum collapses on long chains and under heavy corruption; `sfm_shapefit.place` copes with that.
 
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.

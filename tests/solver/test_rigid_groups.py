@@ -13,10 +13,13 @@ from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
-from sfm_shapefit.solver.rigs import certify_groups, largest_tied, lud_over_groups, solve_groups
 from sfm_shapefit.solver.rigs import solve as groups_solve
+from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph

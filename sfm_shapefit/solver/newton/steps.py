@@ -28,8 +28,8 @@ LEAST_MU = 1e-8
 REFINEMENTS = 3
 # After so many factorizations without progress more will not help.
 STALL = 6
-# A step passes over one edge in the time of so many operations of a factorization, and over one entry of the
-# factor in that of so many: memory decides there, not arithmetic.
+# A step passes over one edge, and over one entry of the factor, in the time of so many operations of a
+# factorization: memory decides there, not arithmetic.
 EDGE_WORK, SOLVE_WORK = 500.0, 5.0
 
 # The allowed violation of D^T y = lambda c, per mean degree: per squared gap, and in any case.

@@ -39,9 +39,8 @@ def solve_groups(
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
 
     Returns:
-        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group. The equality
-        that holds for it is the balance per group and that for the scale; `equality_residual` is its largest
-        violation.
+        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
+        `equality_residual` is as in `certify_groups`.
 
     Raises:
         InputError: if a method is asked for that does not exist over groups.
@@ -73,9 +72,8 @@ def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
         raise InputError(
             "solver 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
         )
-    reason = "asked for"
-    if options.solver == "auto":
-        reason = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
         return Choice("conic", partial(_run_conic, groups), reason)
     return Choice("newton", partial(_run_newton, groups), reason)

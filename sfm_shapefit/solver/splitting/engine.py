@@ -126,8 +126,7 @@ class State:
     """The history, while the iteration is accelerated."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """Where the iteration ended."""
 
     state: State
@@ -291,8 +290,7 @@ class Iteration:
     def _accelerator(self, state: State) -> Anderson | None:
         """Return an empty history if so many edges fit exactly that acceleration pays, else None.
 
-        With noise, the edges inside their ball become few as the iteration converges; without, they
-        stay. The first renewal only takes note, for noise has not had time to show.
+        With noise, fewer and fewer edges are inside their ball. The first renewal only takes note of them.
         """
         before, state.interior = state.interior, float(state.sums[INTERIOR]) / len(state.x)
         pays = state.interior >= max(_ANDERSON_INTERIOR, _ANDERSON_KEPT * before)
@@ -312,8 +310,7 @@ def _mean(residuals: FloatArray, weights: FloatArray) -> float:
 def _steps_left(state: State) -> float:
     """Return how many steps of the present length are left, if they go on to shrink as they do.
 
-    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. Just after a renewal, when the
-    steps jump, the last answer is kept.
+    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. After a renewal the steps jump.
     """
     if len(state.steps) <= _CONTRACTION_WINDOW:
         return state.steps_left

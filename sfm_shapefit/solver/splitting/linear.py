@@ -80,19 +80,15 @@ class IterativeSolver:
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,), and choose the preconditioner by a probe."""
         self._operator.reweigh(weights)
-        self._preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
-        if not _diagonal_suffices(self._operator, self._preconditioner):
-            self._preconditioner = approximate_cholesky(self._graph, weights, _SEED)
-
-    @property
-    def preconditioner(self) -> Preconditioner:
-        """The preconditioner of the last weights: a fixed linear map, as `solve` is not."""
-        return self._preconditioner
+        # A fixed linear map, as `solve` is not.
+        self.preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
+        if not _diagonal_suffices(self._operator, self.preconditioner):
+            self.preconditioner = approximate_cholesky(self._graph, weights, _SEED)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with ||rhs - L x|| at most a tenth of ||rhs||, column by column, (n, d)."""
         return conjugate_gradients(
-            self._operator, self._preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
+            self._operator, self.preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
         ).x
 
 

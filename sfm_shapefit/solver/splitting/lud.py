@@ -2,8 +2,8 @@
 
     minimize  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
 
-The bound on each length is a gauge that no stretch of a chain can escape, where ShapeFit's single
-constraint <c, T> = kappa lets all length gather on the cleanest stretch. The dual is
+No stretch of a chain escapes the bound on each length, where ShapeFit's single constraint <c, T> = kappa lets
+all length gather on the cleanest stretch. The dual is
 
     maximize  sum_e nu_e,  nu_e = -<y_e, v_e>    subject to  D^T y = 0,  ||y_e|| <= w_e,  nu_e >= 0
 
