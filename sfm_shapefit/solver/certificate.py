@@ -53,7 +53,7 @@ from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import plan_factorisation
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
-from sfm_shapefit.solver.splitting.linear import ONE_THREAD, IterativeSolver, Resources, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
@@ -130,7 +130,7 @@ def certify(
     *,
     tol: float = 0.0,
     uniqueness: bool = False,
-    resources: Resources = ONE_THREAD,
+    threads: int = 1,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
@@ -140,14 +140,14 @@ def certify(
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        resources: threads of a repair, and a factor, a preconditioner that cannot make the bound wrong.
+        threads: of a repair; the bound does not depend on it.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
-        UnsolvableError: if the dual must be repaired, no factor is given, and the graph is not connected.
+        UnsolvableError: if the dual must be repaired and the graph is not connected.
     """
     y = np.array(dual, dtype=np.float64, order="C")
-    found = certify_in_place(graph, locations, y, tol, np.inf, resources)
+    found = certify_in_place(graph, locations, y, tol, np.inf, Resources(threads))
     assert found is not None, "no gap is above infinity"
     if not uniqueness:
         return found
@@ -160,7 +160,8 @@ def certify_in_place(
 ) -> Certificate | None:
     """Return what `certify` does, with y itself made feasible; None if the gap is above `hopeless`.
 
-    That is clear early. On loosely joined communities a proof takes as long as hundreds of iterations of a
+    A factor among the resources is a preconditioner, and cannot make the bound wrong. A hopeless gap shows
+    early. On loosely joined communities a proof takes as long as hundreds of iterations of a
     solver, and more than half of that is saved where the dual is not good enough yet.
     """
     t = np.ascontiguousarray(locations - locations.mean(axis=0))

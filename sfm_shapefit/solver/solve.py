@@ -84,8 +84,8 @@ def solve(
     options = merge_options(options, SolverOptions, overrides)
     start = time.perf_counter()
     _refuse_undetermined(graph)
-    choice, resources = choose_method(graph, options), Resources(options.num_threads())
-    prove = partial(certify, graph, tol=options.tol, uniqueness=options.uniqueness, resources=resources)
+    choice, threads = choose_method(graph, options), options.num_threads()
+    prove = partial(certify, graph, tol=options.tol, uniqueness=options.uniqueness, threads=threads)
     return run_choice(graph, choice, options, on_iteration, prove, start)
 
 

@@ -103,7 +103,7 @@ def test_a_repair_stops_at_the_gap_asked_for_and_is_the_same_for_two_threads(mon
     assert len(steps) < most
     assert_feasible(graph, found)
     assert best.gap < found.gap <= enough
-    again = certify(graph, split.locations, split.dual, tol=enough, resources=Resources(threads=2))
+    again = certify(graph, split.locations, split.dual, tol=enough, threads=2)
     assert np.array_equal(again.dual, found.dual)
 
 
@@ -262,7 +262,8 @@ def test_a_solver_without_fill_serves_as_well():
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
     iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
-    certificate = certify(graph, split.locations, split.dual, resources=Resources(factor=iterative))
+    resources = Resources(factor=iterative)
+    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, resources)
     assert_feasible(graph, certificate)
     # The rounds stop at a tenth of the violation, not at the same point of it.
     assert certificate.gap <= 3.0 * direct.gap

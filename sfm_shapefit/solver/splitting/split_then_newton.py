@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
-from sfm_shapefit.solver.certificate import Certificate, certify, certify_in_place
+from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
@@ -176,7 +176,7 @@ def _better(
     """Return the result with other locations and their certificate, if its gap is smaller."""
     if not (np.isfinite(t).all() and projected_length(graph, t) > 0.0):
         return result
-    certificate = certify(graph, t, y, tol=tol, resources=resources)
-    if not certificate.gap < result.certificate.gap:
+    certificate = certify_in_place(graph, t, y, tol, np.inf, resources)
+    if certificate is None or not certificate.gap < result.certificate.gap:
         return result
     return replace(result, locations=t - t.mean(axis=0), certificate=certificate)
