@@ -108,8 +108,8 @@ def _measure(baselines: Floats, sigma: float, q: float, rng: np.random.Generator
 
 def shape(locations: Floats) -> Floats:
     """Return locations (n, d) moved and scaled to centroid 0 and norm 1."""
-    centred = locations - locations.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    centered = locations - locations.mean(axis=0)
+    return np.asarray(centered / np.linalg.norm(centered))
 
 
 def shape_error(locations: Floats, truth: Floats) -> float:

@@ -88,7 +88,7 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
         raise ValueError("approximate Cholesky needs finite weights >= 0")
     state = np.array([seed & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64)
     permutation, pointers, rows, fractions, pivots = _eliminate_all(
-        graph.pointers, graph.neighbours, graph.edge_of, w, state
+        graph.pointers, graph.neighbors, graph.edge_of, w, state
     )
     return ApproximateCholesky(
         frozen(permutation), frozen(pointers), frozen(rows), frozen(fractions), frozen(pivots)
@@ -133,7 +133,7 @@ def _enlarge(array: Any, size: int) -> Any:
 
 
 @kernel(exact=True)
-def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> Any:
+def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> Any:
     """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
     Returns the heads, `links` (next entry, other end), weights, degrees, and the pool: [first free entry,
@@ -141,7 +141,7 @@ def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> A
     """
     n = len(pointers) - 1
     head = np.full(n, -1, np.int64)
-    links = np.empty((len(neighbours) + 4 * n + 16, 2), np.int32)
+    links = np.empty((len(neighbors) + 4 * n + 16, 2), np.int32)
     values = np.empty(len(links), np.float64)
     degree = np.zeros(n, np.int64)
     used = 0
@@ -149,7 +149,7 @@ def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> A
         for p in range(pointers[v], pointers[v + 1]):
             w = weights[edge_of[p]]
             if w > 0.0:
-                links[used, 0], links[used, 1], values[used] = head[v], neighbours[p], w
+                links[used, 0], links[used, 1], values[used] = head[v], neighbors[p], w
                 head[v] = used
                 used += 1
                 degree[v] += 1
@@ -242,18 +242,18 @@ def _sample_clique(
 
 
 @kernel(exact=True)
-def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, state: Any) -> Any:
+def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, state: Any) -> Any:
     """Eliminate all nodes, each time one with the fewest edges left."""
     n = len(pointers) - 1
-    head, links, values, degree, pool = _edge_lists(pointers, neighbours, edge_of, weights)
-    bucket = np.full(len(neighbours) + 2, -1, np.int64)
+    head, links, values, degree, pool = _edge_lists(pointers, neighbors, edge_of, weights)
+    bucket = np.full(len(neighbors) + 2, -1, np.int64)
     above, below = np.empty(n, np.int64), np.empty(n, np.int64)
     for v in range(n - 1, -1, -1):
         _push(bucket, above, below, degree, v)
     step, place = np.full(n, -1, np.int32), np.full(n, -1, np.int64)
     star, star_weight, tail = np.empty(n, np.int64), np.empty(n), np.empty(n + 1)
     permutation, pivots, columns = np.empty(n, np.int64), np.empty(n), np.zeros(n + 1, np.int64)
-    rows = np.empty(len(neighbours) + n, np.int32)
+    rows = np.empty(len(neighbors) + n, np.int32)
     fractions = np.empty(len(rows), np.float32)
     lowest = 0
     for k in range(n):

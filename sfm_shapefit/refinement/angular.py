@@ -37,7 +37,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorization
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
@@ -114,7 +114,7 @@ def plan_refinement(
     tree = best_order(neighbors)
     if tree.flops * graph.dimension**3 > _MAX_FLOPS:
         return IterativeNormal(graph)
-    plan = plan_factorisation(neighbors, graph.edges, tree)
+    plan = plan_factorization(neighbors, graph.edges, tree)
     return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
 

@@ -46,11 +46,11 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import factorise
+from sfm_shapefit.laplacian.cholesky import factorize
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
 from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
@@ -466,9 +466,9 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     _set_conditions(v, graph.weights, y, longest, blocks)
     if is_dense:
         return _is_regular_dense(graph, blocks)
-    symbolic = plan_factorisation(adjacency(n, graph.edges), graph.edges, order())
+    symbolic = plan_factorization(adjacency(n, graph.edges), graph.edges, order())
     try:
-        return factorise(symbolic, blocks).smallest_pivot > REGULAR
+        return factorize(symbolic, blocks).smallest_pivot > REGULAR
     except UnsolvableError:
         return False
 

@@ -26,7 +26,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import outer, rig_problem
 
 
-def centred(t):
+def centered(t):
     return t - t.mean(axis=0)
 
 
@@ -57,7 +57,7 @@ def test_groups_with_fixed_nodes_become_one_whole_frames_with_them():
     np.testing.assert_array_equal(joined.group_of, [0, 0, 0, 0, 1])
     # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own centre.
     expected = np.array([[5.0, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, 0]])
-    np.testing.assert_allclose(centred(joined.offsets[:4]), centred(expected), atol=1e-14)
+    np.testing.assert_allclose(centered(joined.offsets[:4]), centered(expected), atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     factor.refactor(blocks)
     g = adjoint(rng.normal(size=v.shape), edges, n)
     x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
-    np.testing.assert_allclose(centred(factor.solve(g)), centred((expand @ x).reshape(-1, 3)), atol=1e-10)
+    np.testing.assert_allclose(centered(factor.solve(g)), centered((expand @ x).reshape(-1, 3)), atol=1e-10)
     # Of one pinned pair, tau v v^T is taken away again.
     tau, pinned = 2.5, 4
     c = unit.reduce(scale_functional(between))
@@ -138,7 +138,7 @@ def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
     assert result.unique
     assert apart < 1e-12
     # Certified to 1e-8 in an objective of 0.1; errors are of that order.
-    np.testing.assert_allclose(centred(result.locations) / x[-1], centred(t), atol=1e-6)
+    np.testing.assert_allclose(centered(result.locations) / x[-1], centered(t), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
@@ -148,11 +148,11 @@ def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
     locations, dual, _ = solve_conic(outer(graph, groups)[0], 1e-9, 200, groups)
     every = np.zeros_like(graph.directions)
     every[groups.joins(graph.edges)] = dual
-    reference = certify_groups(graph, groups, centred(locations), every)
+    reference = certify_groups(graph, groups, centered(locations), every)
     assert reference.gap < 1e-9  # so the two optima agree to the sum of both gaps
     assert result.objective == pytest.approx(reference.objective, abs=1e-8)
     # The objective is sharp here: locations agree to a few times its error.
-    np.testing.assert_allclose(result.locations, centred(locations), atol=1e-6)
+    np.testing.assert_allclose(result.locations, centered(locations), atol=1e-6)
 
 
 def test_groups_of_one_node_are_the_plain_program_and_s_stays_zero():
@@ -323,8 +323,8 @@ def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():
     locations = lud_over_groups(between, groups)
     x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
-    errors = np.linalg.norm(locations / x[-1] - centred(t), axis=1)
-    assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centred(t), axis=1))
+    errors = np.linalg.norm(locations / x[-1] - centered(t), axis=1)
+    assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centered(t), axis=1))
 
 
 def test_lud_over_single_nodes_has_the_optimum_of_lud():
@@ -345,7 +345,7 @@ def test_the_placement_has_the_errors_that_it_states():
     for seed in range(3):
         graph, groups, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
         placed = place(MeasuredGraph(graph, groups=groups))
-        errors.append(centred(placed.locations / placed.unit) - centred(t))
+        errors.append(centered(placed.locations / placed.unit) - centered(t))
         stated.append(placed.assessment.sigmas / placed.unit)
         assert placed.refined.is_refined
         assert placed.assessment.trust.min() > 0.9

@@ -17,7 +17,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
 from sfm_shapefit.solver.newton import steps
 from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_pinned
 from sfm_shapefit.solver.newton.steps import Iterate, Linearization, Problem, Progress, Work
@@ -57,7 +57,7 @@ def solve_newton_sparse(
     """
     if not isinstance(plan, SymbolicFactor):
         neighbors = adjacency(graph.num_nodes, graph.edges)
-        plan = plan_factorisation(neighbors, graph.edges, plan or best_order(neighbors))
+        plan = plan_factorization(neighbors, graph.edges, plan or best_order(neighbors))
     reduction = Reduction(allocate_factor(plan, graph.dimension))
     return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
 

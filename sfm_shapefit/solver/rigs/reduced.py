@@ -14,7 +14,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.laplacian.cholesky import allocate_factor, analyse
+from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
 from sfm_shapefit.solver.newton.reduction import Reduction
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
@@ -48,7 +48,7 @@ class ReducedFactor(Reduction):
         self._offsets = groups.offsets[edges[:, 0]] - groups.offsets[edges[:, 1]]
         self._metric = bool(self._offsets.any())
         dimension = groups.offsets.shape[1]
-        plan = analyse(groups.num_groups, self._ends)
+        plan = analyze(groups.num_groups, self._ends)
         needed = plan.num_bytes(dimension, np.float64, threads)
         if max_bytes is not None and needed > max_bytes:
             raise UnsolvableError(

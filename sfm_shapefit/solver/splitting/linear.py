@@ -19,7 +19,7 @@ from sfm_shapefit.laplacian.approximate import (
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorization
 from sfm_shapefit.viewgraph import ViewGraph
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
@@ -151,7 +151,7 @@ def laplacian_factor(
         return IterativeSolver(neighbors, resources.threads)
     if tree.num_nonzeros * np.dtype(np.float32).itemsize > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
-    plan = plan_factorisation(neighbors, edges, tree)
+    plan = plan_factorization(neighbors, edges, tree)
     if plan.num_bytes(1, np.float32) > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
     return allocate_factor(plan, 1, np.float32, threads=resources.threads)
