@@ -12,10 +12,10 @@ with sigma the angle of one pixel. Its derivatives, all exact:
     e by w_j:  b x (d x a)        s^2 / 2 by w_j:  -<b, d> (b x d)
     e by d:    a x b              s^2 / 2 by d:    -<a, d> a - <b, d> b
 
-and d moves with C_i - C_j by (I - d d^T) / |C_i - C_j|. One pass over the matches sums, for each pair, the 9
-x 9 normal matrix of (w_i, w_j, C_i - C_j). The sum of Cauchy losses plus a soft prior on the w_i is minimized
-by Levenberg-Marquardt steps over 6 unknowns per camera. The prior fixes the common rotation; the damping
-takes care of shift and scale.
+and d moves with C_i - C_j by (I - d d^T) / |C_i - C_j|. One pass over the matches sums, for each pair, the
+normal matrix (9, 9) of (w_i, w_j, C_i - C_j). The sum of Cauchy losses plus a soft prior on the w_i is
+minimized by Levenberg-Marquardt steps over 6 unknowns per camera. The prior fixes the common rotation; the
+damping takes care of shift and scale.
 
 Sources: Sampson error: Hartley and Zisserman, "Multiple View Geometry", 2nd ed., section 11.4.3;
 Levenberg-Marquardt with robust weights: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999,

@@ -161,8 +161,8 @@ def certify_in_place(
     """Return what `certify` does, with y itself made feasible; None if the gap is above `hopeless`.
 
     A factor among the resources is a preconditioner, and cannot make the bound wrong. A hopeless gap shows
-    early. On loosely joined communities a proof takes as long as hundreds of iterations of a
-    solver, and more than half of that is saved where the dual is not good enough yet.
+    early: on loosely joined communities, where a proof takes as long as hundreds of iterations of a solver,
+    that saves more than half of it.
     """
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, y)
