@@ -13,7 +13,7 @@ gives the same factor on every machine.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -311,9 +311,9 @@ class GradientsResult:
     x: FloatArray
     """(n, k) the solution, of mean 0 in each column."""
     iterations: int
-    """Products with the operator, after the first residual."""
+    """Products with the operator."""
     residual: float
-    """Largest ||rhs - L x|| of a column, relative to what `relative_to` says."""
+    """Largest ||rhs - L x|| of a column, relative to ||rhs||."""
     converged: bool
     """Whether `residual` is at most the tolerance."""
 
@@ -323,10 +323,8 @@ def conjugate_gradients(
     preconditioner: Preconditioner,
     rhs: FloatArray,
     *,
-    start: FloatArray | None = None,
     tol: float = 1e-10,
     max_iterations: int = 500,
-    relative_to: Literal["rhs", "start"] = "rhs",
     coupled: bool = False,
 ) -> GradientsResult:
     """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
@@ -338,23 +336,14 @@ def conjugate_gradients(
         operator: maps (n, k) to L times it.
         preconditioner: an `ApproximateCholesky`, `JacobiPreconditioner` or `CholeskyFactor`.
         rhs: (n, k); its column means are ignored, for L has no such vectors in its range.
-        start: (n, k) first guess, 0 if None.
-        tol: stop when each residual is at most this, relative to `relative_to`.
+        tol: stop when each residual is at most this, relative to its right-hand side.
         max_iterations: hard limit, reported in `converged`.
-        relative_to: "rhs", or "start": the residual of the first guess (a warm start must improve by `tol`).
         coupled: the k columns are one vector of an (nk x nk) system, not k separate systems.
-
-    Raises:
-        ValueError: if the shapes of `rhs` and `start` differ.
     """
-    b = rhs - rhs.mean(axis=0)
-    x = np.zeros_like(b) if start is None else np.array(start, dtype=np.float64)
-    if x.shape != b.shape:
-        raise ValueError(f"start has shape {x.shape}, rhs has {b.shape}")
-    r = b if start is None else b - operator(x)
-    scale = _norms(b if relative_to == "rhs" else r, coupled)
+    r = rhs - rhs.mean(axis=0)
+    x, p = np.zeros_like(r), np.zeros_like(r)
+    scale = _norms(r, coupled)
     scale = np.where(scale > 0.0, scale, 1.0)
-    p = np.zeros_like(b)
     rho_before = np.ones_like(scale)
     k, best, least = 0, x, float(np.max(_norms(r, coupled) / scale, initial=0.0))
     largest = least

@@ -516,24 +516,6 @@ def test_jacobi_is_enough_on_random_graphs_and_not_on_sequences():
     assert iterations["er"] < 40 < iterations["seq"]
 
 
-def test_a_warm_start_saves_iterations_and_can_set_the_scale():
-    edges, w, matrix, rhs = system("geo")
-    n = len(rhs)
-    factor = approximate_cholesky(adjacency(n, edges), w, 0)
-
-    def run(**options):
-        return conjugate_gradients(lambda x: matrix @ x, factor, rhs, **options)
-
-    cold = run(tol=1e-8)
-    near = cold.x + 1e-5 * balanced_rhs((n, 3), 3) * np.abs(cold.x).max()
-    warm = run(tol=1e-8, start=near)
-    assert warm.iterations < cold.iterations
-    tenth = run(tol=0.1, start=near, relative_to="start")
-    before, after = (np.linalg.norm(rhs - matrix @ x) for x in (near, tenth.x))
-    assert after < 0.12 * before
-    assert 1 <= tenth.iterations <= 4
-
-
 def test_an_iteration_limit_is_reported():
     _, _, matrix, rhs = system("geo")
     preconditioner = JacobiPreconditioner(matrix.diagonal())
