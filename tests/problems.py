@@ -7,8 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.splitting.engine import Goal
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources
+from sfm_shapefit.solver.splitting.shapefit import AdmmResult, Splitting
 from sfm_shapefit.viewgraph import ViewGraph
 
 Floats = npt.NDArray[np.float64]
@@ -104,10 +108,25 @@ def _measure(baselines: Floats, sigma: float, q: float, rng: np.random.Generator
 
 def shape(locations: Floats) -> Floats:
     """Return locations (n, d) moved and scaled to centroid 0 and norm 1."""
-    centred = locations - locations.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    centered = locations - locations.mean(axis=0)
+    return np.asarray(centered / np.linalg.norm(centered))
 
 
 def shape_error(locations: Floats, truth: Floats) -> float:
     """Return the distance of two shapes: the relative error of Hand et al. (2015), section 4."""
     return float(np.linalg.norm(shape(locations) - shape(truth)))
+
+
+def solve_admm(
+    graph: ViewGraph,
+    tol: float,
+    max_iterations: int,
+    resources: Resources = ONE_THREAD,
+    on_iteration: OnIteration | None = None,
+) -> AdmmResult:
+    """ShapeFit by the splitting alone, until the relative error of the objective is estimated below `tol`."""
+    splitting = Splitting(graph, resources)
+    try:
+        return splitting.run(Goal(tol, 0.0, max_iterations), on_iteration)
+    finally:
+        splitting.close()

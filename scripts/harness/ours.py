@@ -38,7 +38,7 @@ def solve(graph: "ViewGraph", *, note: Any = None, **options: Any) -> "SolverRes
 
 def solve_lud(graph: "ViewGraph") -> "FloatArray":
     """Return the LUD start, (n, d)."""
-    from sfm_shapefit.solver.splitting import solve_lud as solve_program
+    from sfm_shapefit.solver.splitting.lud import solve_lud as solve_program
 
     return solve_program(graph).locations
 

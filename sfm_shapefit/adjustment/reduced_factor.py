@@ -20,7 +20,7 @@ from sfm_shapefit.laplacian.cholesky import (
     PIVOT_TOLERANCE,
     CholeskyFactor,
     allocate_factor,
-    analyse,
+    analyze,
 )
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.selected import selected_inverse
@@ -114,7 +114,7 @@ class SparseFactor:
     def plan(cls, layout: Layout, threads: int) -> "SparseFactor":
         """Order the nodes and plan the factorisation."""
         block = int(layout.active.any(axis=0).sum())
-        symbolic = analyse(layout.num_nodes, layout.pairs)
+        symbolic = analyze(layout.num_nodes, layout.pairs)
         return cls(
             allocate_factor(symbolic, block, threads=threads), layout.pairs, layout.active.astype(np.float64)
         )

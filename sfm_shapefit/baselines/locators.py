@@ -9,7 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
 from sfm_shapefit.baselines.least_squares import locate_least_squares
 from sfm_shapefit.baselines.linf import locate_linf
 from sfm_shapefit.baselines.lud import locate_lud
@@ -17,8 +17,7 @@ from sfm_shapefit.baselines.onedsfm import filter_1dsfm
 from sfm_shapefit.directions.triangles import filter_triangles
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.options import SolverResult, Status
-from sfm_shapefit.solver.program import projected_length
-from sfm_shapefit.solver.solve import uncertified
+from sfm_shapefit.solver.program import normalize_locations, objective, projected_length
 from sfm_shapefit.viewgraph import ViewGraph
 
 LOCATORS: dict[str, Callable[[ViewGraph], FloatArray]] = {
@@ -51,5 +50,17 @@ def solve_baseline(graph: ViewGraph, name: str) -> SolverResult:
         raise UnsolvableError(
             f"{name} found no finite locations; check the directions, or choose --objective auto"
         )
-    reason = "as asked; ShapeFit was not solved, so nothing certifies these locations"
-    return uncertified(graph, located, Status.NOT_SOLVED, name, reason, start)
+    locations = normalize_locations(graph, located)
+    return SolverResult(
+        locations=frozen(locations),
+        status=Status.NOT_SOLVED,
+        objective=objective(graph, locations),
+        dual_bound=0.0,
+        dual=frozen(np.zeros_like(graph.directions)),
+        equality_residual=0.0,
+        unique=None,
+        iterations=0,
+        seconds=time.perf_counter() - start,
+        method=name,
+        method_reason="as asked; ShapeFit was not solved, so nothing certifies these locations",
+    )

@@ -51,7 +51,7 @@ def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> Fl
     sign = np.where(graph.edges[arcs.edge_of, 0] == node, -1.0, 1.0)
     for axis in axes:
         ahead = graph.directions @ axis  # positive: camera i comes after camera j
-        place = _greedy_order(arcs.pointers, arcs.neighbours, sign * ahead[arcs.edge_of])
+        place = _greedy_order(arcs.pointers, arcs.neighbors, sign * ahead[arcs.edge_of])
         before = place[graph.edges[:, 0]] < place[graph.edges[:, 1]]
         scores += np.where(before == (ahead > 0.0), np.abs(ahead), 0.0)
     return scores / num_axes

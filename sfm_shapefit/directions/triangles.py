@@ -66,7 +66,7 @@ def _triangles(graph: ViewGraph) -> IntArray:
     found = [np.empty((0, 3), dtype=np.int64)]
     for e, (i, j) in enumerate(graph.edges.tolist()):
         rows = [slice(around.pointers[c], around.pointers[c + 1]) for c in (i, j)]
-        around_i, around_j = (around.neighbours[row] for row in rows)
+        around_i, around_j = (around.neighbors[row] for row in rows)
         _, of_i, of_j = np.intersect1d(around_i, around_j, assume_unique=True, return_indices=True)
         sides = np.full((len(of_i), 3), e, dtype=np.int64)
         sides[:, 1] = around.edge_of[rows[0]][of_i]

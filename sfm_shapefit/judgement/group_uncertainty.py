@@ -12,7 +12,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.solver.program import adjoint, differences
@@ -66,11 +66,11 @@ def propagate_groups(
     across = projectors @ information @ projectors
     blocks = across / lengths[:, None, None] ** 2
     ends = np.ascontiguousarray(groups.group_of[edges])
-    plan = analyse(groups.num_groups, ends)
+    plan = analyze(groups.num_groups, ends)
     if plan.num_bytes(d) > max_bytes:
         return None
     traces = np.trace(blocks, axis1=1, axis2=2)
-    factor = factorise(plan, blocks + _RIDGE * traces[:, None, None] * np.eye(d))
+    factor = factorize(plan, blocks + _RIDGE * traces[:, None, None] * np.eye(d))
     inverse = selected_inverse(factor, ends)
     i, j = ends.T
     relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)

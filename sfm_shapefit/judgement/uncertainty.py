@@ -34,7 +34,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyse, factorise
+from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import SelectedInverse, selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.solver.program import adjoint, differences
@@ -100,7 +100,7 @@ def propagate(
     units = baselines / np.maximum(lengths, _SHORTEST * lengths.max())[:, None]
     across = _across(information, units)
     blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
-    plan = analyse(n, edges)
+    plan = analyze(n, edges)
     if plan.num_bytes(d) > max_bytes:
         return None
     factor = _grounded_factor(plan, blocks, units, lengths)
@@ -164,7 +164,7 @@ def _grounded_factor(
         regular = blocks + ridge * traces[:, None, None] * np.eye(d)
         regular[longest] += held
         try:
-            return factorise(plan, regular)
+            return factorize(plan, regular)
         except UnsolvableError:
             if ridge == _RIDGES[-1]:
                 raise
@@ -215,11 +215,11 @@ def _in_gauge(
 def _gauge_pair(locations: FloatArray, gauge: BoolArray) -> tuple[FloatArray, FloatArray]:
     """Return N and F, (n, d, d + 1): shifts and scale, and what reads them off the nodes in `gauge`."""
     n, d = locations.shape
-    centred = locations - locations[gauge].mean(axis=0)
+    centered = locations - locations[gauge].mean(axis=0)
     null = np.zeros((n, d, d + 1))
     null[:, range(d), range(d)] = 1.0
-    null[:, :, d] = centred
+    null[:, :, d] = centered
     fixed = np.where(gauge[:, None, None], null, 0.0)
     fixed[:, :, :d] /= np.sum(gauge)
-    fixed[:, :, d] /= np.sum(centred[gauge] ** 2)
+    fixed[:, :, d] /= np.sum(centered[gauge] ** 2)
     return null, fixed

@@ -35,7 +35,7 @@ from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.rigidity import parallel_rigid_pieces
 from sfm_shapefit.solver.program import along, differences
-from sfm_shapefit.solver.rigs import largest_tied
+from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Probability that a normal residual counts as wrong; in 3D a chi-square of 25, "5 sigma".
 _OUTLIER_PROBABILITY = 3.7e-6

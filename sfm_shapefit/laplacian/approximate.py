@@ -13,7 +13,7 @@ gives the same factor on every machine.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -87,7 +87,7 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     if not (np.isfinite(w).all() and (w >= 0.0).all()):
         raise ValueError("approximate Cholesky needs finite weights >= 0")
     state = np.array([seed & 0xFFFFFFFFFFFFFFFF], dtype=np.uint64)
-    parts = _eliminate_all(graph.pointers, graph.neighbours, graph.edge_of, w, state)
+    parts = _eliminate_all(graph.pointers, graph.neighbors, graph.edge_of, w, state)
     return ApproximateCholesky(*(frozen(part) for part in parts))
 
 
@@ -129,7 +129,7 @@ def _enlarge(array: Any, size: int) -> Any:
 
 
 @kernel(exact=True)
-def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> Any:
+def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> Any:
     """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
     Returns the heads, `links` (next entry, other end), weights, degrees, and the pool: [first free entry,
@@ -137,7 +137,7 @@ def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> A
     """
     n = len(pointers) - 1
     head = np.full(n, -1, np.int64)
-    links = np.empty((len(neighbours) + 4 * n + 16, 2), np.int32)
+    links = np.empty((len(neighbors) + 4 * n + 16, 2), np.int32)
     values = np.empty(len(links), np.float64)
     degree = np.zeros(n, np.int64)
     used = 0
@@ -145,7 +145,7 @@ def _edge_lists(pointers: Any, neighbours: Any, edge_of: Any, weights: Any) -> A
         for p in range(pointers[v], pointers[v + 1]):
             w = weights[edge_of[p]]
             if w > 0.0:
-                links[used, 0], links[used, 1], values[used] = head[v], neighbours[p], w
+                links[used, 0], links[used, 1], values[used] = head[v], neighbors[p], w
                 head[v] = used
                 used += 1
                 degree[v] += 1
@@ -238,18 +238,18 @@ def _sample_clique(
 
 
 @kernel(exact=True)
-def _eliminate_all(pointers: Any, neighbours: Any, edge_of: Any, weights: Any, state: Any) -> Any:
+def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, state: Any) -> Any:
     """Eliminate all nodes, each time one with the fewest edges left."""
     n = len(pointers) - 1
-    head, links, values, degree, pool = _edge_lists(pointers, neighbours, edge_of, weights)
-    bucket = np.full(len(neighbours) + 2, -1, np.int64)
+    head, links, values, degree, pool = _edge_lists(pointers, neighbors, edge_of, weights)
+    bucket = np.full(len(neighbors) + 2, -1, np.int64)
     above, below = np.empty(n, np.int64), np.empty(n, np.int64)
     for v in range(n - 1, -1, -1):
         _push(bucket, above, below, degree, v)
     step, place = np.full(n, -1, np.int32), np.full(n, -1, np.int64)
     star, star_weight, tail = np.empty(n, np.int64), np.empty(n), np.empty(n + 1)
     permutation, pivots, columns = np.empty(n, np.int64), np.empty(n), np.zeros(n + 1, np.int64)
-    rows = np.empty(len(neighbours) + n, np.int32)
+    rows = np.empty(len(neighbors) + n, np.int32)
     fractions = np.empty(len(rows), np.float32)
     lowest = 0
     for k in range(n):
@@ -307,9 +307,9 @@ class GradientsResult:
     x: FloatArray
     """(n, k) the solution, of mean 0 in each column."""
     iterations: int
-    """Products with the operator, after the first residual."""
+    """Products with the operator."""
     residual: float
-    """Largest ||rhs - L x|| of a column, relative to what `relative_to` says."""
+    """Largest ||rhs - L x|| of a column, relative to ||rhs||."""
     converged: bool
     """Whether `residual` is at most the tolerance."""
 
@@ -319,10 +319,8 @@ def conjugate_gradients(
     preconditioner: Preconditioner,
     rhs: FloatArray,
     *,
-    start: FloatArray | None = None,
     tol: float = 1e-10,
     max_iterations: int = 500,
-    relative_to: Literal["rhs", "start"] = "rhs",
     coupled: bool = False,
 ) -> GradientsResult:
     """Solve L x = rhs for a Laplacian L by preconditioned conjugate gradients.
@@ -334,23 +332,14 @@ def conjugate_gradients(
         operator: maps (n, k) to L times it.
         preconditioner: an `ApproximateCholesky`, `JacobiPreconditioner` or `CholeskyFactor`.
         rhs: (n, k); its column means are ignored, for L has no such vectors in its range.
-        start: (n, k) first guess, 0 if None.
-        tol: stop when each residual is at most this, relative to `relative_to`.
+        tol: stop when each residual is at most this, relative to its right-hand side.
         max_iterations: hard limit, reported in `converged`.
-        relative_to: "rhs", or "start": the residual of the first guess (a warm start must improve by `tol`).
         coupled: the k columns are one vector of an (nk x nk) system, not k separate systems.
-
-    Raises:
-        ValueError: if the shapes of `rhs` and `start` differ.
     """
-    b = rhs - rhs.mean(axis=0)
-    x = np.zeros_like(b) if start is None else np.array(start, dtype=np.float64)
-    if x.shape != b.shape:
-        raise ValueError(f"start has shape {x.shape}, rhs has {b.shape}")
-    r = b if start is None else b - operator(x)
-    scale = _norms(b if relative_to == "rhs" else r, coupled)
+    r = rhs - rhs.mean(axis=0)
+    x, p = np.zeros_like(r), np.zeros_like(r)
+    scale = _norms(r, coupled)
     scale = np.where(scale > 0.0, scale, 1.0)
-    p = np.zeros_like(b)
     rho_before = np.ones_like(scale)
     k, best, least = 0, x, float(np.max(_norms(r, coupled) / scale, initial=0.0))
     largest = least

@@ -7,7 +7,7 @@ solution"). For each supernode, children first:
     factor     the square part, L_JJ = chol, and the rows below, L_RJ = A_RJ L_JJ^-T
     update     U = -L_RJ L_RJ^T + what the children leave for later fronts, kept on a stack
 
-What depends on the graph alone is planned once (`analyse`); `refactor` takes new edge weights and does not
+What depends on the graph alone is planned once (`analyze`); `refactor` takes new edge weights and does not
 sort. Disjoint subtrees are tasks for several threads, in the factorization and in both substitutions; the
 large fronts above them are factored by strips of columns. Tasks and strips are the same for any number of
 threads, and so is every bit of the answer.
@@ -35,7 +35,7 @@ from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_a
 from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
 from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
 
 PIVOT_TOLERANCE = 64.0
 """Pivots below this many rounding units of their diagonal entry count as zero."""
@@ -193,7 +193,7 @@ class CholeskyFactor:
         return out.reshape(np.shape(rhs))
 
 
-def analyse(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray = "auto") -> SymbolicFactor:
+def analyze(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray = "auto") -> SymbolicFactor:
     """Plan the factorization of the Laplacians of a graph, whatever their weights, block size and precision.
 
     Args:
@@ -211,7 +211,7 @@ def analyse(num_nodes: int, edges: npt.ArrayLike, ordering: Ordering | IntArray 
     pairs = check_edges(num_nodes, edges)
     graph = adjacency(num_nodes, pairs)
     tree = best_order(graph, ordering) if isinstance(ordering, str) else elimination_tree(graph, ordering)
-    return plan_factorisation(graph, pairs, tree)
+    return plan_factorization(graph, pairs, tree)
 
 
 def allocate_factor(
@@ -231,7 +231,7 @@ def allocate_factor(
     )
 
 
-def factorise(
+def factorize(
     symbolic: SymbolicFactor,
     weights: FloatArray,
     dtype: npt.DTypeLike = np.float64,
@@ -260,7 +260,7 @@ def _factor_all(
             begin, end = plan.tasks[k]
             arena = free.get()
             try:
-                failed[k] = _factorise(begin, end, panels, parts, arena, pivots[k], blas_of(factor.dtype))
+                failed[k] = _factorize(begin, end, panels, parts, arena, pivots[k], blas_of(factor.dtype))
             finally:
                 free.put(arena)
 
@@ -286,7 +286,7 @@ def _factor_above(
     large = np.flatnonzero(heights * factor.block >= _LARGE_FRONT) + begin
     at = begin
     for s in [*large.tolist(), end]:
-        if at < s and _factorise(at, s, panels, parts, 0, pivot, blas_of(factor.dtype)):
+        if at < s and _factorize(at, s, panels, parts, 0, pivot, blas_of(factor.dtype)):
             return True
         if s < end and _factor_large(factor, panels, parts, s, pivot):
             return True
@@ -354,7 +354,7 @@ def _sum_at_nodes(panels: Any, parts: Any) -> None:
 
 
 @kernel(exact=True)
-def _factorise(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot: Any, blas: Any) -> bool:
+def _factorize(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot: Any, blas: Any) -> bool:
     """Factor the supernodes begin..end-1; return True if a pivot was not positive.
 
     A task has its updates in its arena, all but the root's; above the tasks, `arena` is 0. `pivot` is lowered

@@ -30,8 +30,8 @@ class Adjacency:
     """The neighbors of each node, in compressed rows; within a row in the order of the edges."""
 
     pointers: IntArray
-    """(n + 1,) row i is `neighbours[pointers[i]:pointers[i + 1]]`."""
-    neighbours: Int32Array
+    """(n + 1,) row i is `neighbors[pointers[i]:pointers[i + 1]]`."""
+    neighbors: Int32Array
     """(2m,) node indices."""
     edge_of: Int32Array
     """(2m,) the edge behind each entry."""
@@ -77,15 +77,15 @@ def _adjacency(num_nodes: int, edges: Any) -> Any:
     for i in range(num_nodes):
         pointers[i + 1] += pointers[i]
     fill = pointers[:-1].copy()
-    neighbours = np.empty(2 * m, np.int32)
+    neighbors = np.empty(2 * m, np.int32)
     edge_of = np.empty(2 * m, np.int32)
     for e in range(m):
         i, j = edges[e, 0], edges[e, 1]
-        neighbours[fill[i]], edge_of[fill[i]] = j, e
-        neighbours[fill[j]], edge_of[fill[j]] = i, e
+        neighbors[fill[i]], edge_of[fill[i]] = j, e
+        neighbors[fill[j]], edge_of[fill[j]] = i, e
         fill[i] += 1
         fill[j] += 1
-    return pointers, neighbours, edge_of
+    return pointers, neighbors, edge_of
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,7 +233,7 @@ class LaplacianOperator:
         self._entries = np.empty(len(graph.edge_of), np.float32)
         self.reweigh(weights)
         self._workers = workers
-        entries = len(graph.neighbours)
+        entries = len(graph.neighbors)
         blocks = _ROW_BLOCKS if entries >= _ENTRIES_WORTH_A_THREAD and workers.threads > 1 else 1
         cuts = np.searchsorted(graph.pointers, np.arange(1, blocks) * (entries // blocks))
         self._bounds = [0, *(int(cut) for cut in cuts), graph.num_nodes]
@@ -255,7 +255,7 @@ class LaplacianOperator:
         graph, entries = self.graph, self._entries
 
         def job(first: int, last: int) -> Callable[[], object]:
-            return lambda: apply(first, last, graph.pointers, graph.neighbours, entries, x, out)
+            return lambda: apply(first, last, graph.pointers, graph.neighbors, entries, x, out)
 
         self._workers.run([job(a, b) for a, b in zip(self._bounds, self._bounds[1:], strict=False)])
         return out
@@ -278,12 +278,12 @@ def _degrees(pointers: Any, entries: Any, out: Any) -> None:
 
 @kernel(exact=True)
 def _apply_entries_3(
-    first: int, last: int, pointers: Any, neighbours: Any, entries: Any, x: Any, out: Any
+    first: int, last: int, pointers: Any, neighbors: Any, entries: Any, x: Any, out: Any
 ) -> None:
     for i in range(first, last):
         degree, s0, s1, s2 = 0.0, 0.0, 0.0, 0.0
         for p in range(pointers[i], pointers[i + 1]):
-            j, w = neighbours[p], np.float64(entries[p])
+            j, w = neighbors[p], np.float64(entries[p])
             degree += w
             s0 += w * x[j, 0]
             s1 += w * x[j, 1]
@@ -293,11 +293,11 @@ def _apply_entries_3(
 
 @kernel(exact=True)
 def _apply_entries(
-    first: int, last: int, pointers: Any, neighbours: Any, entries: Any, x: Any, out: Any
+    first: int, last: int, pointers: Any, neighbors: Any, entries: Any, x: Any, out: Any
 ) -> None:
     for i in range(first, last):
         for k in range(x.shape[1]):
             total = 0.0
             for p in range(pointers[i], pointers[i + 1]):
-                total += np.float64(entries[p]) * (x[i, k] - x[neighbours[p], k])
+                total += np.float64(entries[p]) * (x[i, k] - x[neighbors[p], k])
             out[i, k] = total

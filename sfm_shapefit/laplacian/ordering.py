@@ -42,7 +42,7 @@ def best_order(graph: Adjacency, method: Ordering = "auto") -> EliminationTree:
             where it can be better; the one whose factorization takes fewer operations is kept.
     """
     trees = [] if method == "minimum-degree" else [elimination_tree(graph, metis_order(graph))]
-    edges = len(graph.neighbours) // 2
+    edges = len(graph.neighbors) // 2
     worthwhile = edges <= _MINIMUM_DEGREE_LIMIT and all(t.flops <= _BAND_FLOPS * edges for t in trees)
     if method == "minimum-degree" or (method == "auto" and worthwhile):
         trees.append(elimination_tree(graph, minimum_degree_order(graph)))
@@ -53,9 +53,9 @@ def metis_order(graph: Adjacency) -> IntArray:
     """Return METIS's nested dissection order, (n,): node eliminated k-th."""
     import pymetis
 
-    if graph.num_nodes == 0 or len(graph.neighbours) == 0:
+    if graph.num_nodes == 0 or len(graph.neighbors) == 0:
         return np.arange(graph.num_nodes)
-    entries = (np.ones(len(graph.neighbours), np.int8), graph.neighbours, graph.pointers)
+    entries = (np.ones(len(graph.neighbors), np.int8), graph.neighbors, graph.pointers)
     matrix = csc_array(entries, shape=(graph.num_nodes, graph.num_nodes), copy=True)
     matrix.sum_duplicates()  # METIS demands each neighbor once
     csr = pymetis.CSRAdjacency(matrix.indptr.astype(np.int32), matrix.indices.astype(np.int32))
@@ -70,10 +70,10 @@ def minimum_degree_order(graph: Adjacency) -> IntArray:
     that order, which it then reports.
     """
     n = graph.num_nodes
-    if n <= 1 or len(graph.neighbours) == 0:
+    if n <= 1 or len(graph.neighbors) == 0:
         return np.arange(n)
     columns = np.repeat(np.arange(n), np.diff(graph.pointers))
-    rows = np.concatenate([graph.neighbours, np.arange(n)])
+    rows = np.concatenate([graph.neighbors, np.arange(n)])
     # The diagonal dominates so that no pivoting or breakdown interferes.
     values = np.concatenate([np.full(len(columns), -1.0), 2.0 * len(columns) * np.ones(n)])
     matrix = csc_array((values, (rows, np.concatenate([columns, np.arange(n)]))), shape=(n, n))
@@ -87,13 +87,13 @@ def widest_level(graph: Adjacency) -> int:
     A level separates what is nearer from what is farther. Where a graph looks the same everywhere, as a
     geometric one, no separator in halves is much smaller (METIS finds 0.75 of it on boxes of 1e4 and 1e5).
     """
-    last = _distances(graph.pointers, graph.neighbours, 0)[1]
-    distance, _ = _distances(graph.pointers, graph.neighbours, last)
+    last = _distances(graph.pointers, graph.neighbors, 0)[1]
+    distance, _ = _distances(graph.pointers, graph.neighbors, last)
     return int(np.bincount(distance[distance >= 0]).max())
 
 
 @kernel()
-def _distances(pointers: Any, neighbours: Any, start: int) -> Any:
+def _distances(pointers: Any, neighbors: Any, start: int) -> Any:
     """Return the graph distance of each node from `start`, -1 if not reached, and a farthest node."""
     distance = np.full(len(pointers) - 1, -1)
     queue = np.empty(len(distance), np.int64)
@@ -103,7 +103,7 @@ def _distances(pointers: Any, neighbours: Any, start: int) -> Any:
         v = queue[head]
         head += 1
         for p in range(pointers[v], pointers[v + 1]):
-            u = neighbours[p]
+            u = neighbors[p]
             if distance[u] < 0:
                 distance[u] = distance[v] + 1
                 queue[tail] = u

@@ -152,18 +152,18 @@ def elimination_tree(graph: Adjacency, order: npt.NDArray[np.integer]) -> Elimin
     """
     permutation = np.ascontiguousarray(order, dtype=np.int64)
     inverse = _inverse(permutation)
-    parent = _parents(graph.pointers, graph.neighbours, permutation, inverse)
+    parent = _parents(graph.pointers, graph.neighbors, permutation, inverse)
     post = _postorder(parent)
     permutation = permutation[post]
     rank = _inverse(post)
     inverse = _inverse(permutation)
     moved = parent[post]
     parent = np.where(moved < 0, -1, rank[moved])
-    counts = _column_counts(graph.pointers, graph.neighbours, permutation, inverse, parent)
+    counts = _column_counts(graph.pointers, graph.neighbors, permutation, inverse, parent)
     return EliminationTree(frozen(permutation), frozen(parent), frozen(counts))
 
 
-def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
+def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree) -> SymbolicFactor:
     """Find the supernodes, their rows, the slot of each edge and the offsets of the update stack.
 
     Args:
@@ -176,7 +176,7 @@ def plan_factorisation(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     inverse = _inverse(permutation)
     row_pointers = np.concatenate([[0], np.cumsum(below)])
     owner = np.repeat(np.arange(len(parent)), np.diff(first))
-    rows = _panel_rows(graph.pointers, graph.neighbours, permutation, inverse, owner, parent, row_pointers)
+    rows = _panel_rows(graph.pointers, graph.neighbors, permutation, inverse, owner, parent, row_pointers)
     relative = _relative_positions(first, parent, row_pointers, rows)
     sizes = np.diff(first) * (np.diff(first) + below)
     tasks, above = _tasks(parent, sizes)
@@ -220,7 +220,7 @@ def _inverse(permutation: IntArray) -> IntArray:
 
 
 @kernel()
-def _parents(pointers: Any, neighbours: Any, permutation: Any, inverse: Any) -> Any:
+def _parents(pointers: Any, neighbors: Any, permutation: Any, inverse: Any) -> Any:
     """Return the elimination tree: join the earlier neighbors' trees below each step (with compression)."""
     n = len(permutation)
     parent = np.full(n, -1, np.int64)
@@ -228,7 +228,7 @@ def _parents(pointers: Any, neighbours: Any, permutation: Any, inverse: Any) -> 
     for k in range(n):
         node = permutation[k]
         for p in range(pointers[node], pointers[node + 1]):
-            i = inverse[neighbours[p]]
+            i = inverse[neighbors[p]]
             while i < k and i != -1:
                 above = ancestor[i]
                 ancestor[i] = k
@@ -264,7 +264,7 @@ def _postorder(parent: Any) -> Any:
 
 
 @kernel()
-def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
+def _column_counts(pointers: Any, neighbors: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
     """Count the entries of each column of L.
 
     Row i of L is the subtree that joins i's earlier neighbors to i. Entry (i, j) is charged +1 at each
@@ -284,7 +284,7 @@ def _column_counts(pointers: Any, neighbours: Any, permutation: Any, inverse: An
             delta[parent[j]] -= 1
         node = permutation[j]
         for p in range(pointers[node], pointers[node + 1]):
-            i = inverse[neighbours[p]]
+            i = inverse[neighbors[p]]
             if i <= j or lowest[j] <= previous[i]:
                 continue  # an earlier neighbor of i lies below j: j is no leaf of row i
             delta[j] += 1
@@ -357,7 +357,7 @@ def _merge(label: Any, above: Any, width: Any, height: Any, limits: Any, shares:
 
 @kernel()
 def _panel_rows(
-    pointers: Any, neighbours: Any, permutation: Any, inverse: Any, owner: Any, parent: Any, row_pointers: Any
+    pointers: Any, neighbors: Any, permutation: Any, inverse: Any, owner: Any, parent: Any, row_pointers: Any
 ) -> Any:
     """Fill the rows below each supernode: row i is appended to all supernodes of its row subtree."""
     num = len(parent)
@@ -368,7 +368,7 @@ def _panel_rows(
         mark[owner[i]] = i
         node = permutation[i]
         for p in range(pointers[node], pointers[node + 1]):
-            j = inverse[neighbours[p]]
+            j = inverse[neighbors[p]]
             if j >= i:
                 continue
             s = owner[j]

@@ -200,7 +200,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
         raise InputError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
     found, weights, level = _fit_to_priors(source, priors, size, rotate=turns)
-    across = np.sqrt(np.linalg.svd(_centred(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
+    across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
         found, weights, level = _fit_to_priors(source, priors, size, rotate=False)
@@ -238,7 +238,7 @@ def _fit_to_priors(
     return found, weights, level
 
 
-def _centred(points: FloatArray, weights: FloatArray) -> FloatArray:
+def _center(points: FloatArray, weights: FloatArray) -> FloatArray:
     """Return sqrt(weight) times the points from their weighted mean, (n, 3)."""
     mean = weights @ points / weights.sum()
     return np.asarray(np.sqrt(weights)[:, None] * (points - mean))

@@ -25,8 +25,8 @@ from sfm_shapefit.refinement.starts import RefinedPlacement, refine_starts
 from sfm_shapefit.rigidity import RigidPiece, rigid_pieces
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, SolverResult
-from sfm_shapefit.solver.rigs import solve_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.rigs.solve import solve_groups
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
 

@@ -12,8 +12,8 @@ from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs import largest_tied
 from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # The largest offset, of the median baseline, below which the scale of the offsets means nothing.
 _LEAST_UNIT = 1e-6
@@ -35,7 +35,7 @@ def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:
     Without one the scale of the offsets is open.
     """
     nodes = np.unique(edges[groups.joins(edges)])
-    return bool(len(nodes)) and bool(groups.restricted_to(nodes).centred().offsets.any())
+    return bool(len(nodes)) and bool(groups.restricted_to(nodes).center().offsets.any())
 
 
 def find_tied_piece(measured: MeasuredGraph) -> RigidPiece:
@@ -74,7 +74,7 @@ def measure_unit(part: MeasuredGraph, locations: FloatArray) -> float:
     """
     assert part.groups is not None
     unit = float(part.groups.fit(locations)[0][-1])
-    size = float(np.linalg.norm(part.groups.centred().offsets, axis=1).max())
+    size = float(np.linalg.norm(part.groups.center().offsets, axis=1).max())
     baseline = float(np.median(np.linalg.norm(differences(locations, part.graph.edges), axis=1)))
     if not unit * size > _LEAST_UNIT * baseline:
         raise UnsolvableError(

@@ -10,14 +10,9 @@ eigenvalue of the first term. It counts by the arctangent kernel, with k = 3,
 
     minimize  sum_e w_e / 2 * k^2 atan(chi2_e / k^2),
 
-which forgets outliers as that of Geman and McClure does. On right directions alone the two compare like this:
-
-    kernel                error over that of least squares
-    arctangent            1.04
-    Geman and McClure     1.18
-
-While the level falls the latter is used all the same: it lets go of a wrong direction early, where the
-arctangent may settle for a larger level.
+which forgets outliers as that of Geman and McClure does. On right directions alone its error is 1.04 times
+that of least squares, theirs 1.18 times. While the level falls theirs is used all the same: it lets go of a
+wrong direction early, where the arctangent may settle for a larger level.
 
 The level starts at 2 degrees and falls to what the residuals inside the kernel say (graduated non-convexity).
 A step is one of Levenberg and Marquardt: d u_e = (I - u u^T) d(d_e) / |d_e| makes the normal matrix a block
@@ -42,7 +37,7 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor, plan_factorization
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
@@ -99,7 +94,7 @@ class AngularResult:
     """Locations refined in angles."""
 
     locations: FloatArray
-    """(n, d) centred, of unit norm."""
+    """(n, d) centered, of unit norm."""
     levels_rad: FloatArray
     """(number of classes,) the s at which it ended."""
     cost: float
@@ -109,18 +104,17 @@ class AngularResult:
 
 
 def plan_refinement(
-    graph: GraphShape, max_bytes: int = DEFAULT_FACTOR_BYTES
+    graph: ViewGraph | GraphShape, max_bytes: int = DEFAULT_FACTOR_BYTES
 ) -> SymbolicFactor | IterativeNormal | None:
     """Return what the refinement solves its steps with; None if its factor would take too much memory.
 
-    Where a factor is more work than it is worth, the graph is well connected, and conjugate gradients need
-    few steps. On long chains they need many, but there a factor is little work.
+    Where a factor is much work, the graph is well connected, and conjugate gradients need few steps.
     """
     neighbors = adjacency(graph.num_nodes, graph.edges)
     tree = best_order(neighbors)
     if tree.flops * graph.dimension**3 > _MAX_FLOPS:
         return IterativeNormal(graph)
-    plan = plan_factorisation(neighbors, graph.edges, tree)
+    plan = plan_factorization(neighbors, graph.edges, tree)
     return plan if plan.num_bytes(graph.dimension, np.float64) <= max_bytes else None
 
 
@@ -146,10 +140,7 @@ def refine_angles(
         Locations whose cost at the final levels is not above that of the start: these, if nothing better
         was found.
     """
-    factor: NormalFactor = (
-        allocate_factor(plan, graph.dimension) if isinstance(plan, SymbolicFactor) else plan
-    )
-    spread = _spread(graph, metric)
+    factor, spread = allocate_normal(plan, graph.dimension), _spread(graph, metric)
     first = _unit(start)
     other = None if other is None else _unit(other)
     t, damping, steps = first, DAMPING.first, 0
@@ -159,15 +150,16 @@ def refine_angles(
         settled = bool((lower >= (1.0 - _SETTLED) * levels).all())
         levels = levels if settled else lower
         information = _information(graph, spread, levels[metric.classes])
-        moved, damping, before, after = _step(graph, information, factor, t, damping, steep=not settled)
+        terms = AngularTerms(graph, information, steep=not settled)
+        moved, damping, before, after = take_step(terms, factor, t, damping)
         still = _motion(t, moved) <= _STILL or before - after <= _CONVERGED * before
         t, steps = moved, steps + 1
         if settled and still:
             break
-        if settled and other is not None and _is_decided(before, after, _cost(graph, information, other)):
+        if settled and other is not None and _is_decided(before, after, terms.cost(other)):
             break
-    information = _information(graph, spread, levels[metric.classes])
-    cost, first_cost = _cost(graph, information, t), _cost(graph, information, first)
+    terms = AngularTerms(graph, _information(graph, spread, levels[metric.classes]))
+    cost, first_cost = terms.cost(t), terms.cost(first)
     if first_cost < cost:
         t, cost = first, first_cost
     return AngularResult(locations=t, levels_rad=levels, cost=cost, iterations=steps)
@@ -179,44 +171,77 @@ def _is_decided(before: float, after: float, other_cost: float) -> bool:
 
 
 def robust_cost(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> float:
-    """Return the sum of the kernel over the pairs, each at most k^2 pi / 4 times its weight.
+    """Return the sum of the kernel over the pairs at locations (n, d), at the level of each class, radians.
 
-    Args:
-        graph: the view graph.
-        locations: (n, d).
-        metric: covariance and class of each pair.
-        levels: (number of classes,) in radians.
+    No pair adds more than k^2 pi / 4 times its weight.
     """
-    information = _information(graph, _spread(graph, metric), levels[metric.classes])
-    return _cost(graph, information, _unit(locations))
+    return AngularTerms(graph, information_at(graph, metric, levels)).cost(_unit(locations))
 
 
 class AngularTerms:
-    """The terms of the directions at given levels, for a refinement that adds others to them."""
+    """The robust cost of the directions, each with its own M_e, and its normal equations."""
 
-    def __init__(self, graph: ViewGraph, metric: Metric, levels: FloatArray) -> None:
-        self.graph = graph
-        self._information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    def __init__(self, graph: ViewGraph, information: FloatArray, *, steep: bool = False) -> None:
+        """Take M_e, (m, d, d); `steep` for the kernel of Geman and McClure in place of the arctangent."""
+        self._graph, self._information, self._steep = graph, information, steep
 
-    def cost(self, locations: FloatArray) -> float:
+    def cost(self, t: FloatArray) -> float:
         """Return the sum of the kernel over the pairs at locations (n, d) of any scale."""
-        return _cost(self.graph, self._information, locations)
+        return float(_sum_of_kernels(*self._arguments(t)))
 
-    def linearize(self, locations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def linearize(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
-        return _linearize(self.graph, self._information, locations)
+        m, d = self._graph.directions.shape
+        out = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
+        _linearize_pairs(*self._arguments(t), out)
+        return out
+
+    def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return the blocks, those of the damping, and the right-hand side (n, d) of a step from t."""
+        blocks, damped, gradient = self.linearize(t)
+        return blocks, damped, -adjoint(gradient, self._graph.edges, self._graph.num_nodes)
+
+    def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
+        """Return the locations (n, d) after a step from t."""
+        return _unit(t + step)
+
+    def _arguments(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, float, bool]:
+        """Return what the kernels take: baselines, v, w, M, the floor under |d|, and which kernel."""
+        graph = self._graph
+        baselines = differences(t, graph.edges)
+        floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
+        return baselines, graph.directions, graph.weights, self._information, floor, self._steep
+
+
+def allocate_normal(plan: SymbolicFactor | NormalFactor, dimension: int) -> NormalFactor:
+    """Return memory for a factor of what `plan_refinement` says."""
+    return allocate_factor(plan, dimension) if isinstance(plan, SymbolicFactor) else plan
+
+
+def take_step(
+    terms: AngularTerms, factor: NormalFactor, t: FloatArray, damping: float
+) -> tuple[FloatArray, float, float, float]:
+    """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
+    before = terms.cost(t)
+    blocks, damped, right = terms.normal_equations(t)
+
+    def propose(damping: float) -> tuple[FloatArray, float] | None:
+        try:
+            factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(t.shape[1]))
+        except UnsolvableError:  # too little of the matrix is left under these weights
+            return None
+        proposed = terms.move(t, factor.solve(right))
+        after = terms.cost(proposed)
+        return (proposed, after) if after < before else None
+
+    found, damping = take_damped_step(propose, damping, DAMPING)
+    moved, after = (t, before) if found is None else found
+    return moved, damping, before, after
 
 
 def agreeing_pairs(graph: ViewGraph, locations: FloatArray, metric: Metric, levels: FloatArray) -> BoolArray:
-    """Return which pairs fit the locations, (m,): those of chi2 below k^2.
-
-    Args:
-        graph: the view graph.
-        locations: (n, d).
-        metric: covariance and class of each pair.
-        levels: (number of classes,) in radians.
-    """
-    information = _information(graph, _spread(graph, metric), levels[metric.classes])
+    """Return which pairs fit locations (n, d), (m,): those of chi2 below k^2 at the level of each class."""
+    information = information_at(graph, metric, levels)
     residuals = _residuals(graph, _unit(locations))
     chi2 = np.einsum("ea,eab,eb->e", residuals, information, residuals)
     return np.asarray(chi2 < KERNEL_WIDTH**2)
@@ -227,18 +252,14 @@ def residual_levels(
 ) -> FloatArray:
     """Return the level of each class, from the median of the residuals that its kernel does not reject.
 
-    Args:
-        graph: the view graph.
-        locations: (n, d).
-        metric: whose classes are used; own covariances are part of the level.
-        levels: (number of classes,) the present ones, radians.
+    That kernel is the one at the present `levels`. Own covariances are part of a level.
     """
     freedom = graph.dimension - 1
     equations = freedom * graph.num_edges
     unknowns = graph.dimension * (graph.num_nodes - 1) - 1
     fitted = max(1.0 - unknowns / equations, 0.3)  # least squares leaves this share of the variance
     median_length = np.sqrt(chdtri(freedom, 0.5) * fitted)  # of a residual of unit variance per axis
-    chords = _chords(graph, _unit(locations))
+    chords = np.linalg.norm(_residuals(graph, _unit(locations)), axis=1)
     found = np.empty_like(levels)
     for c, level in enumerate(levels):
         own = chords[metric.classes == c]
@@ -246,6 +267,11 @@ def residual_levels(
         few = len(inside) < _LEAST_SHARE * len(own) or len(own) == 0
         found[c] = level if few else np.median(inside) / median_length
     return np.maximum(found, _LEAST_LEVEL_RAD)
+
+
+def information_at(graph: ViewGraph, metric: Metric, levels: FloatArray) -> FloatArray:
+    """Return M_e, (m, d, d), at the level of each class, (number of classes,) in radians."""
+    return _information(graph, _spread(graph, metric), levels[metric.classes])
 
 
 def _spread(graph: ViewGraph, metric: Metric) -> tuple[FloatArray, FloatArray] | None:
@@ -272,45 +298,17 @@ def _information(
     return information
 
 
-def _step(
-    graph: ViewGraph,
-    information: FloatArray,
-    factor: NormalFactor,
-    t: FloatArray,
-    damping: float,
-    *,
-    steep: bool = False,
-) -> tuple[FloatArray, float, float, float]:
-    """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
-    before = _cost(graph, information, t, steep)
-    blocks, damped, gradient = _linearize(graph, information, t, steep)
-    right = -adjoint(gradient, graph.edges, graph.num_nodes)
-
-    def propose(damping: float) -> tuple[FloatArray, float] | None:
-        try:
-            factor.refactor(blocks + (damping * damped)[:, None, None] * np.eye(graph.dimension))
-        except UnsolvableError:  # too little of the matrix is left under these weights
-            return None
-        proposed = _unit(t + factor.solve(right))
-        after = _cost(graph, information, proposed, steep)
-        return (proposed, after) if after < before else None
-
-    found, damping = take_damped_step(propose, damping, DAMPING)
-    moved, after = (t, before) if found is None else found
-    return moved, damping, before, after
-
-
 def _unit(t: FloatArray) -> FloatArray:
-    """Return the locations centred and of unit norm."""
-    centred = t - t.mean(axis=0)
-    return np.asarray(centred / np.sqrt(np.sum(centred * centred)))
+    """Return the locations centered and of unit norm."""
+    centered = t - t.mean(axis=0)
+    return np.asarray(centered / np.sqrt(np.sum(centered * centered)))
 
 
 def _motion(t: FloatArray, moved: FloatArray) -> float:
     """Return by how much nine tenths of the nodes moved at most, as a share of the extent.
 
-    A few loose nodes may wander for long while nothing else changes; in a long chain the cost may hardly
-    fall while all of it still moves.
+    A few loose nodes may wander for long; in a long chain the cost may hardly fall while all of it still
+    moves.
     """
     return float(np.quantile(np.linalg.norm(moved - t, axis=1), 0.9)) / median_spread(moved)
 
@@ -321,30 +319,6 @@ def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
     lengths = np.linalg.norm(baselines, axis=1, keepdims=True)
     units = baselines / np.maximum(lengths, _SHORTEST * np.median(lengths))
     return np.asarray(units - graph.directions)
-
-
-def _chords(graph: ViewGraph, t: FloatArray) -> FloatArray:
-    """Return |u_e - v_e|, (m,), which is the residual angle where that is small."""
-    return np.asarray(np.linalg.norm(_residuals(graph, t), axis=1))
-
-
-def _cost(graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False) -> float:
-    baselines = differences(t, graph.edges)
-    floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
-    return float(_sum_of_kernels(baselines, graph.directions, graph.weights, information, floor, steep))
-
-
-def _linearize(
-    graph: ViewGraph, information: FloatArray, t: FloatArray, steep: bool = False
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return the blocks of the normal matrix (m, d, d), of its damping (m,), and the gradient (m, d)."""
-    m, d = graph.directions.shape
-    baselines = differences(t, graph.edges)
-    floor = _SHORTEST * float(np.median(np.linalg.norm(baselines, axis=1)))
-    blocks, damped, gradient = np.empty((m, d, d)), np.empty(m), np.empty((m, d))
-    out = (blocks, damped, gradient)
-    _linearize_pairs(baselines, graph.directions, graph.weights, information, floor, steep, out)
-    return blocks, damped, gradient
 
 
 @kernel(exact=True)

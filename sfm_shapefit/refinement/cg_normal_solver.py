@@ -1,10 +1,10 @@
-"""The normal equations of the angular refinement without a factor: conjugate gradients, for graphs too large.
+"""The normal equations of the angular refinement on large graphs: conjugate gradients without a factor.
 
-A step need not be exact, for the next one starts where it ends. The preconditioner is an approximate Cholesky
-factor of the scalar Laplacian whose weights are the mean eigenvalues of the blocks.
+A step need not be exact. The preconditioner is an approximate Cholesky factor of the scalar Laplacian whose
+weights are the mean eigenvalues of the blocks.
 """
 
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.viewgraph import ViewGraph
 
 # A step is solved until its residual has fallen to this share.
 _REDUCTION = 1e-2
@@ -19,26 +20,19 @@ _MAX_STEPS = 80
 _SEED = 1
 
 
-class GraphShape(Protocol):
-    """What the normal equations need to know of a graph; a `ViewGraph` is one."""
+class GraphShape(NamedTuple):
+    """What the normal equations need to know of a `ViewGraph`."""
 
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
-
-    @property
-    def edges(self) -> IntArray:
-        """(m, 2) pairs of nodes."""
-
-    @property
-    def dimension(self) -> int:
-        """Size of the blocks, d."""
+    num_nodes: int
+    edges: IntArray
+    """(m, 2)"""
+    dimension: int
 
 
 class IterativeNormal:
     """What `angular.refine_angles` takes in place of a factor's plan; memory is linear in the edges."""
 
-    def __init__(self, graph: GraphShape) -> None:
+    def __init__(self, graph: ViewGraph | GraphShape) -> None:
         self._edges = graph.edges
         self._neighbors = adjacency(graph.num_nodes, graph.edges)
         self._blocks: FloatArray = np.zeros((0, graph.dimension, graph.dimension))
@@ -54,12 +48,7 @@ class IterativeNormal:
         """Return the step of the locations, (n, d), to a hundredth of the residual."""
         assert self._preconditioner is not None
         return conjugate_gradients(
-            self._apply,
-            self._preconditioner,
-            rhs,
-            tol=_REDUCTION,
-            max_iterations=_MAX_STEPS,
-            coupled=True,
+            self._apply, self._preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS, coupled=True
         ).x
 
     def _apply(self, x: FloatArray) -> FloatArray:

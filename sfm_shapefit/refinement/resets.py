@@ -1,11 +1,10 @@
 """Nodes that the refinement threw out of the scene, put back.
 
-A direction says nothing of distance, so that nothing holds a camera which fits two wrong directions by
-chance and whose others are rejected, or a group of cameras that see the rest in nearly one direction: it may
-slide to any distance, and does where that improves a residual a little. LUD, which bounds each length, has no
-such freedom. So groups of nodes that end far beyond its radius go back where it had them, unless the rest
-holds them where they are: at least two pairs with the rest agree, more than half do, and they leave the
-distance of the group open by less than a third.
+Nothing holds a camera which fits two wrong directions by chance and whose others are rejected, or a group of
+cameras that see the rest in nearly one direction: it may slide to any distance, and does where that improves
+a residual a little. LUD, which bounds each length, has no such freedom. So groups of nodes that end far
+beyond its radius go back where it had them, unless the rest holds them where they are: at least two pairs
+with the rest agree, more than half do, and they leave the distance of the group open by less than a third.
 
 How far a distance is open: the baseline d_e of a node at offset x_e from its group's middle changes direction
 by P_e (a + s x_e) / |d_e| if the group moves by a and grows by s, P_e = I - u_e u_e^T. The information
@@ -13,8 +12,8 @@ by P_e (a + s x_e) / |d_e| if the group moves by a and grows by s, P_e = I - u_e
     sum_e J_e^T J_e / sigma_e^2,    J_e = P_e [I, x_e] / |d_e|,
 
 bounds what is known of a and s, and so of each node's a + s x. Nearly parallel baselines leave a open along
-them, and a group that was blown up around the rest leaves s open, in whatever directions it is seen. A group
-far outside may have others that hang on it farther out: each tenfold radius is looked at by itself.
+them, and a group that was blown up around the rest leaves s open. Others may hang on a group farther out:
+each tenfold radius is looked at by itself.
 """
 
 import numpy as np
@@ -63,12 +62,7 @@ def find_strays(
 
 
 def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) -> BoolArray:
-    """Return the nodes that ended far outside the start's radius, (n,); scale and origin do not matter.
-
-    Args:
-        start, refined: (n, d) locations before and after the refinement.
-        reach: how far, in radii of the start.
-    """
+    """Return the nodes that ended farther out than `reach` radii of the start, (n,), whatever the scales."""
     far: BoolArray = _distances(refined) > reach * _distances(start).max()
     return far if np.sum(~far) >= _FEWEST_OTHERS else np.zeros_like(far)
 
@@ -111,9 +105,8 @@ def openness(t: FloatArray, edges: IntArray, group: IntArray, noise_rad: FloatAr
     middle, unit = t[own].mean(axis=0), float(np.median(lengths))
     motions = np.tile(np.eye(d, d + 1), (len(edges), 1, 1))
     motions[:, :, d] = (t[own] - middle) / unit
-    seen = (motions - u[:, :, None] * (u[:, None, :] @ motions)) * (unit / (lengths * noise_rad))[
-        :, None, None
-    ]
+    transverse = motions - u[:, :, None] * (u[:, None, :] @ motions)
+    seen = transverse * (unit / (lengths * noise_rad))[:, None, None]
     values, vectors = np.linalg.eigh(np.einsum("eax,eay->xy", seen, seen))
     values = np.where(values > _ROUNDING * values[-1], values, _UNKNOWN)
     moves = np.tile(np.eye(d, d + 1), (len(group), 1, 1))

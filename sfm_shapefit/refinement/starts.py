@@ -2,9 +2,9 @@
 
 ShapeFit's optimum concentrates length on the cleanest stretch of a long chain, and collapses under heavy
 corruption; LUD has a bound on each length and does not, but is less exact. Both are refined in angles, where
-neither bias exists, and the one of lower robust cost is kept. How far the two convex starts disagree says
-whether ShapeFit's optimum can be believed by itself: the standard deviation, over cameras, of the log ratio
-of their node lengths, a camera's node length being the median length of its pairs.
+neither bias exists, and the one of lower robust cost is kept. Whether ShapeFit's optimum can be believed by
+itself is seen by how far both disagree: the standard deviation, over cameras, of the log ratio of their node
+lengths, which are medians of the lengths of a camera's pairs.
 """
 
 from dataclasses import dataclass, replace
@@ -30,8 +30,10 @@ from sfm_shapefit.refinement.angular import (
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.resets import find_strays, put_back
 from sfm_shapefit.solver.options import SolverResult, Status
-from sfm_shapefit.solver.program import differences, normalized_locations, projected_length
-from sfm_shapefit.solver.rigs import ReducedFactor, lud_over_groups
+from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
+from sfm_shapefit.solver.rigs.lud import lud_over_groups
+from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -40,7 +42,7 @@ COLLAPSED = 0.3
 
 # Disagreement from which LUD is likely to be the better start.
 _UNEQUAL = 0.1
-# Iterations of LUD; more change nothing after the refinement.
+# More change nothing after the refinement.
 _LUD_STEPS = 50
 # Up to so many pairs LUD's own bound is computed, which costs about 100 more iterations.
 _LUD_CERTIFIED_PAIRS = 50_000
@@ -78,7 +80,7 @@ class RefinedPlacement:
     """The locations that are kept, and why."""
 
     locations: FloatArray
-    """(n, d) centred, scaled like the solver's."""
+    """(n, d) centered, scaled like the solver's."""
     start: str
     """The program they come from: "ShapeFit", "LUD", or the name of a baseline."""
     is_refined: bool
@@ -93,7 +95,7 @@ class RefinedPlacement:
     """Noise level of each class of directions: between cameras, then from cameras to points."""
     moved: tuple[float, float]
     """Median and largest move of a node by the refinement, as a share of the median distance from the
-    centre."""
+    center."""
     num_turned_pairs: int
     """Directions, those to points too, that fit the start and not the refined locations, or the other way
     round, at `levels_deg`."""
@@ -149,13 +151,15 @@ def refine_starts(
         options: which starts, and whether to refine.
     """
     graph, metric = measured.graph, Metric(measured.covariance, measured.classes)
-    if solved.status is Status.NOT_SOLVED:
-        return _keep_baseline(_Problem(measured, metric, None), solved)
-    lud, second = _find_second_start(measured, options.num_threads())
-    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if options.refines else None)
+    is_baseline = solved.status is Status.NOT_SOLVED
+    refines = options.refines and not is_baseline
+    lud, second = (None, None) if is_baseline else _find_second_start(measured, options.num_threads())
+    problem = _Problem(measured, metric, _plan_normal_solver(measured, options) if refines else None)
 
     apart = None if second is None else disagreement(graph, solved.locations, second)
-    candidates = [("ShapeFit", solved.locations)] + ([] if second is None else [("LUD", second)])
+    candidates = [(solved.method if is_baseline else "ShapeFit", solved.locations)]
+    if second is not None:
+        candidates.append(("LUD", second))
     if apart is not None and apart > _UNEQUAL:
         # The likely better one comes first: the other ends early where it loses.
         candidates.reverse()
@@ -165,14 +169,16 @@ def refine_starts(
         starts.append(_refine_start(problem, name, locations, fallback, starts[0].best if starts else None))
     levels = _common_levels(problem, starts)
     costs = {start.name: robust_cost(graph, start.best, metric, levels) for start in starts}
-    kept, reason = _choose(starts, costs, apart, options)
-    if problem.normal_solver is None and options.refines:
+    kept, reason = starts[0], "the baseline's own answer, as asked"
+    if not is_baseline:
+        kept, reason = _choose(starts, costs, apart, options)
+    if problem.normal_solver is None and refines:
         reason += "; not refined, since the factor for that would be too large"
     moved = _measure_moves(kept)
     # To the bit: the certificate is that of these very locations.
-    is_certified = kept.name == "ShapeFit" and moved[1] == 0.0
+    is_as_solved = kept.locations is solved.locations and moved[1] == 0.0
     return RefinedPlacement(
-        locations=solved.locations if is_certified else normalized_locations(graph, kept.best),
+        locations=solved.locations if is_as_solved else normalize_locations(graph, kept.best),
         start=kept.name,
         is_refined=moved[1] > 0.0,
         reason=reason,
@@ -189,7 +195,7 @@ def refine_starts(
 def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
 ) -> SymbolicFactor | NormalFactor | None:
-    """Return what the refinement solves its steps with, or None if its factor would be too large."""
+    """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.factor_memory_mb * 1_000_000
     if groups is None:
         return plan_refinement(graph, max_bytes)
@@ -200,11 +206,15 @@ def _plan_normal_solver(
 
 
 def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult | None, FloatArray | None]:
-    """Return LUD's solution, which groups have none of, and its locations."""
+    """Return LUD's solution after a few steps, which groups have none of, and its locations, if usable."""
     graph, classes, groups = measured.graph, measured.classes, measured.groups
     if groups is None:
-        lud = _solve_lud_start(graph, classes, threads) if has_second_start(graph) else None
-        return lud, None if lud is None else lud.locations
+        if not has_second_start(graph):
+            return None, None
+        certified, weighted = graph.num_edges <= _LUD_CERTIFIED_PAIRS, _weight_points(graph, classes)
+        lud = solve_lud(weighted, _LUD_STEPS, certified=certified, resources=Resources(threads))
+        is_usable = np.isfinite(lud.locations).all() and projected_length(graph, lud.locations) > 0.0
+        return (lud, lud.locations) if is_usable else (None, None)
     metric, opening = Metric(None, classes), np.full(int(classes.max()) + 1, _OPENING_RAD)
     found = []
     for point_weight in (_POINT_WEIGHT, 1.0 / _POINT_WEIGHT) if classes.any() else (1.0,):
@@ -214,36 +224,9 @@ def _find_second_start(measured: MeasuredGraph, threads: int) -> tuple[LudResult
     return None, min(found, key=lambda pair: pair[0])[1] if found else None
 
 
-def _solve_lud_start(graph: ViewGraph, classes: IntArray, threads: int) -> LudResult | None:
-    """Return LUD's solution after a few iterations, or None where it is not a placement at all."""
-    certified = graph.num_edges <= _LUD_CERTIFIED_PAIRS
-    found = solve_lud(_weight_points(graph, classes), _LUD_STEPS, certified=certified, threads=threads)
-    is_usable = np.isfinite(found.locations).all() and projected_length(graph, found.locations) > 0.0
-    return found if is_usable else None
-
-
 def _weight_points(graph: ViewGraph, classes: IntArray, point_weight: float = _POINT_WEIGHT) -> ViewGraph:
     """Return the graph with the weights that directions to points have in LUD."""
     return graph.with_weights(np.where(classes > 0, point_weight, 1.0) * graph.weights)
-
-
-def _keep_baseline(problem: _Problem, solved: SolverResult) -> RefinedPlacement:
-    """Return a baseline's answer as it is."""
-    start = _unrefined_start(solved.method, solved.locations)
-    levels = _common_levels(problem, [start])
-    return RefinedPlacement(
-        locations=solved.locations,
-        start=start.name,
-        is_refined=False,
-        reason="the baseline's own answer, as asked",
-        disagreement=None,
-        costs={start.name: robust_cost(problem.graph, start.best, problem.metric, levels)},
-        levels_deg=tuple(np.degrees(levels).tolist()),
-        moved=_measure_moves(start),
-        num_turned_pairs=0,
-        reset_nodes=start.reset_nodes,
-        lud=None,
-    )
 
 
 def has_second_start(graph: ViewGraph) -> bool:
@@ -253,8 +236,7 @@ def has_second_start(graph: ViewGraph) -> bool:
 
 def disagreement(graph: ViewGraph, a: FloatArray, b: FloatArray) -> float:
     """Return the standard deviation of the log ratio of node lengths of two sets of locations (n, d)."""
-    ratio = np.log(_node_lengths(graph, a) / _node_lengths(graph, b))
-    return float(np.std(ratio))
+    return float(np.std(np.log(_node_lengths(graph, a) / _node_lengths(graph, b))))
 
 
 def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -269,40 +251,28 @@ def _node_lengths(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return np.asarray(np.maximum(0.5 * (low + high), 1e-6 * np.mean(lengths)))
 
 
-def _unrefined_start(name: str, locations: FloatArray) -> Start:
-    """Return a start as it was solved."""
-    return Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
-
-
 def _refine_start(
     problem: _Problem, name: str, locations: FloatArray, fallback: FloatArray, other: FloatArray | None
 ) -> Start:
     """Return a start with what the refinement makes of it; nothing, if that turns all directions round.
 
-    Args:
-        problem: what it is refined on.
-        name: of the start.
-        locations: (n, d) as solved.
-        fallback: (n, d) locations that nodes are reset to which the refinement moves far out.
-        other: (n, d) the other start, refined: this one ends early where it cannot do better.
+    It ends early where the `other` start, refined, is better. Nodes moved far out are reset to the
+    `fallback`.
     """
+    as_solved = Start(name=name, locations=locations, refined=None, reset_nodes=np.empty(0, dtype=np.int64))
     if problem.normal_solver is None:
-        return _unrefined_start(name, locations)
+        return as_solved
     refined = refine_angles(problem.graph, locations, problem.metric, problem.normal_solver, other)
     refined, nodes = _reset_strays(problem, fallback, refined)
     if projected_length(problem.graph, refined.locations) <= 0.0:
-        return _unrefined_start(name, locations)
-    return Start(name=name, locations=locations, refined=refined, reset_nodes=nodes)
+        return as_solved
+    return replace(as_solved, refined=refined, reset_nodes=nodes)
 
 
 def _reset_strays(
     problem: _Problem, fallback: FloatArray, refined: AngularResult
 ) -> tuple[AngularResult, IntArray]:
-    """Return a refinement whose strays are reset to the fallback, and these nodes.
-
-    If the fallback as a whole fits better, all nodes are as it has them. Only nodes that are a group of their
-    own can be reset one by one.
-    """
+    """Return a refinement with lone strays reset, or all nodes where that fits better, and the strays."""
     graph, metric, levels = problem.graph, problem.metric, refined.levels_rad
     agreeing = agreeing_pairs(graph, refined.locations, metric, levels)
     nodes = find_strays(graph, fallback, refined.locations, agreeing, _noise(metric, levels))
@@ -374,9 +344,9 @@ def _choose(
 
 
 def _normalize(t: FloatArray) -> FloatArray:
-    """Return locations (n, d) centred and of norm 1."""
-    centred = t - t.mean(axis=0)
-    return np.asarray(centred / np.linalg.norm(centred))
+    """Return locations (n, d) centered and of norm 1."""
+    centered = t - t.mean(axis=0)
+    return np.asarray(centered / np.linalg.norm(centered))
 
 
 def _measure_moves(kept: Start) -> tuple[float, float]:

@@ -77,7 +77,7 @@ def is_parallel_rigid(num_nodes: int, edges: IntArray, dimension: int) -> bool:
     checked = _check_edges(num_nodes, edges, dimension)
     if len(checked):
         graph = adjacency(num_nodes, checked)
-        if _grows_from_first_pair(checked, graph.pointers, graph.neighbours):
+        if _grows_from_first_pair(checked, graph.pointers, graph.neighbors):
             return True
     few = checked[_among_first_links(num_nodes, checked, _FEW_LINKS)]
     if 2 * len(few) <= len(checked) and _is_one_piece(num_nodes, few, dimension):
@@ -113,7 +113,7 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
 
 
 @kernel()
-def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbours: Int32Array) -> bool:
+def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbors: Int32Array) -> bool:
     """Return whether the first pair grows to all nodes by nodes that are joined to two of its own.
 
     Sufficient for rigidity, and linear in the pairs: each such node has 2 (d - 1) >= d new copies of edges.
@@ -129,7 +129,7 @@ def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbours: Int32Ar
         node = members[done]
         done += 1
         for p in range(start[node], start[node + 1]):
-            other = neighbours[p]
+            other = neighbors[p]
             links[other] += last[other] != node
             if links[other] == 2 and last[other] != node:
                 members[size] = other

@@ -26,8 +26,8 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
     degree = graph.degrees()
     component = graph.components()
     main = component[pieces[0].nodes[0]] if pieces else -1
-    neighbour = np.empty(graph.num_nodes, dtype=np.int64)  # the only one, where there is one
-    neighbour[graph.edges.T] = graph.edges[:, ::-1].T
+    neighbor = np.empty(graph.num_nodes, dtype=np.int64)  # the only one, where there is one
+    neighbor[graph.edges.T] = graph.edges[:, ::-1].T
     home = _large_piece_of(graph.num_nodes, pieces)
 
     reasons: dict[int, str] = {}
@@ -37,7 +37,7 @@ def left_out_reasons(graph: ViewGraph, pieces: list[RigidPiece]) -> dict[int, st
         elif component[camera] != main:
             reasons[camera] = "another component"
         elif degree[camera] == 1:
-            reasons[camera] = f"pendant: joined by a single pair to {_name(graph, int(neighbour[camera]))}"
+            reasons[camera] = f"pendant: joined by a single pair to {_name(graph, int(neighbor[camera]))}"
         else:
             hinges = _hinges_of(camera, int(home[camera]), pieces, placed)
             reasons[camera] = "not rigidly tied to the largest piece"

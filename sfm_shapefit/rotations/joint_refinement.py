@@ -1,4 +1,4 @@
-"""Rotations and centres refined together on the matches themselves, without 3D points.
+"""Rotations and centers refined together on the matches themselves, without 3D points.
 
 A match of pair (i, j) is two unit rays a, b in world axes, as the given rotations place them. A camera that
 turns by the small rotation vector w_i turns its rays, a -> exp([w_i]) a. With the baseline
@@ -6,24 +6,22 @@ d = (C_i - C_j) / |C_i - C_j| the residual of the match is its Sampson error in 
 
     r = e / (sigma s),   e = <a x b, d>,   s^2 = |a x d|^2 + |b x d|^2 = 2 - <a, d>^2 - <b, d>^2,
 
-with sigma the angle of one pixel, as in `directions`. Its derivatives, all exact:
+with sigma the angle of one pixel. Its derivatives, all exact:
 
     e by w_i:  a x (b x d)        s^2 / 2 by w_i:  -<a, d> (a x d)
     e by w_j:  b x (d x a)        s^2 / 2 by w_j:  -<b, d> (b x d)
     e by d:    a x b              s^2 / 2 by d:    -<a, d> a - <b, d> b
 
 and d moves with C_i - C_j by (I - d d^T) / |C_i - C_j|. One pass over the matches sums, for each pair, the
-9 x 9 normal matrix of (w_i, w_j, C_i - C_j); memory is that of the pairs. The sum of Cauchy losses, its scale
-falling 8, 3, 1 px, plus a soft prior on the w_i, is minimized by Levenberg-Marquardt steps over 6 unknowns
-per camera. The prior fixes the common rotation; the damping takes care of shift and scale. Which of the
-refined rotations to believe is decided in `rotations`.
+normal matrix (9, 9) of (w_i, w_j, C_i - C_j). The sum of Cauchy losses plus a soft prior on the w_i is
+minimized by Levenberg-Marquardt steps over 6 unknowns per camera. The prior fixes the common rotation; the
+damping takes care of shift and scale.
 
 Sources: Sampson error: Hartley and Zisserman, "Multiple View Geometry", 2nd ed., section 11.4.3;
 Levenberg-Marquardt with robust weights: Triggs et al., "Bundle Adjustment - A Modern Synthesis", 1999,
 section 6; Cauchy weights: Zhang, "Parameter estimation techniques", IVC 1997, table 1.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -52,16 +50,15 @@ _OF_I, _OF_J = [0, 1, 2, 6, 7, 8], [3, 4, 5, 6, 7, 8]
 _SIGN_J = np.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class State:
-    """What is sought: rotations in world axes that turn each camera's rays, and the centres."""
+class State(NamedTuple):
+    """What is sought: rotations in world axes that turn each camera's rays, and the centers."""
 
     turns: FloatArray
     """(n, 3, 3)"""
     centers: FloatArray
     """(n, 3)"""
 
-    def moved(self, step: FloatArray) -> "State":
+    def move(self, step: FloatArray) -> "State":
         """Return the state after a step (n, 6)."""
         turned = Rotation.from_rotvec(step[:, :3]).as_matrix() @ self.turns
         return State(turned, self.centers + step[:, 3:])
@@ -172,8 +169,7 @@ def _add_pairs(
         )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class NormalEquations:
+class NormalEquations(NamedTuple):
     """Normal equations of every pair, at what the pair sees of its two cameras."""
 
     matrices: FloatArray
@@ -187,29 +183,19 @@ class NormalEquations:
 def normal_equations(
     matches: RayMatches, turns: tuple[FloatArray, FloatArray], baselines: FloatArray, scale_px: float
 ) -> NormalEquations:
-    """Sum the matches of each pair in one pass.
+    """Sum the matches of each pair in one pass, at one scale of the Cauchy loss.
 
     Args:
         matches: k pairs.
         turns: for camera i and for camera j of each pair, (k, 3, 3) what turns its rays.
         baselines: (k, 3) C_i - C_j.
-        scale_px: scale of the Cauchy loss.
+        scale_px: of the loss.
     """
     k = len(matches.pairs)
     found = NormalEquations(np.zeros((k, 9, 9)), np.zeros((k, 9)), np.zeros(k))
-    _add_pairs(
-        matches.offsets,
-        matches.rays_i,
-        matches.rays_j,
-        np.ascontiguousarray(turns[0]),
-        np.ascontiguousarray(turns[1]),
-        np.ascontiguousarray(baselines),
-        matches.pixel_angles,
-        scale_px,
-        found.matrices,
-        found.vectors,
-        found.costs,
-    )
+    turns_i, turns_j, baselines = map(np.ascontiguousarray, (*turns, baselines))
+    rays = matches.offsets, matches.rays_i, matches.rays_j
+    _add_pairs(*rays, turns_i, turns_j, baselines, matches.pixel_angles, scale_px, *found)
     return found
 
 
@@ -221,16 +207,11 @@ def at_state(matches: RayMatches, state: State, scale_px: float) -> NormalEquati
 
 
 Blocks = tuple[FloatArray, FloatArray, FloatArray]
-"""Normal equations of cameras; see `camera_blocks`."""
+"""Diagonal blocks (n, 6, 6), each pair's block of camera i by camera j (k, 6, 6), and the gradient (n, 6)."""
 
 
 def camera_blocks(normal: NormalEquations, pairs: IntArray, num_cameras: int) -> Blocks:
-    """Return the normal equations of (w, C) of all cameras.
-
-    Returns:
-        The diagonal blocks (n, 6, 6), each pair's block of camera i by camera j (k, 6, 6), and the
-        gradient (n, 6).
-    """
+    """Return the normal equations of (w, C) of all cameras; see `Blocks`."""
     i, j = pairs.T
     diagonal, gradient = np.zeros((num_cameras, 6, 6)), np.zeros((num_cameras, 6))
     np.add.at(diagonal, i, normal.matrices[:, _OF_I][:, :, _OF_I])
@@ -240,12 +221,10 @@ def camera_blocks(normal: NormalEquations, pairs: IntArray, num_cameras: int) ->
     return diagonal, normal.matrices[:, _OF_I][:, :, _OF_J] * _SIGN_J, gradient
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class TurnPrior:
-    """A heavy-tailed prior of the turns, px^2: sum 2 log(1 + |w|^2 / level^2), and the cameras that may turn.
+class TurnPrior(NamedTuple):
+    """A prior of the turns with Cauchy tails, px^2: sum 2 log(1 + |w|^2 / level^2), and who may turn.
 
-    It is the negative logarithm of a Cauchy density in three dimensions: most cameras turn by about the
-    level, a few by as much as their matches demand.
+    Most cameras turn by about the level, a few by as much as their matches demand.
     """
 
     level: float
@@ -272,11 +251,22 @@ def turn_vectors(turns: FloatArray) -> FloatArray:
 
 def minimize(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> State:
     """Return the state after Levenberg-Marquardt steps on all matches at one scale of the Cauchy loss."""
-    fit, damping = _evaluate(matches, state, scale_px, prior), _DAMPING.first
+
+    def evaluate(state: State) -> _Fit:
+        normal = at_state(matches, state, scale_px)
+        return _Fit(state, normal, float(normal.costs.sum()) + prior.cost(state))
+
+    def propose(damping: float) -> _Fit | None:
+        moved = fit.state.move(_step(system, matches.pairs, prior.free, damping))
+        candidate = evaluate(moved)
+        return candidate if candidate.cost <= fit.cost else None
+
+    fit, damping = evaluate(state), _DAMPING.first
     for _ in range(_STEPS):
-        before = fit.cost
-        better, damping = _improve(matches, fit, scale_px, prior, damping)
-        fit = fit if better is None else better
+        system = camera_blocks(fit.normal, matches.pairs, len(fit.state.centers))
+        prior.add_to(fit.state, system[0], system[2])
+        better, damping = take_damped_step(propose, damping, _DAMPING)
+        before, fit = fit.cost, fit if better is None else better
         if before - fit.cost <= _SETTLED * fit.cost:
             break
     return fit.state
@@ -288,27 +278,6 @@ class _Fit(NamedTuple):
     state: State
     normal: NormalEquations
     cost: float
-
-
-def _evaluate(matches: RayMatches, state: State, scale_px: float, prior: TurnPrior) -> _Fit:
-    """Return the fit of a state."""
-    normal = at_state(matches, state, scale_px)
-    return _Fit(state, normal, float(normal.costs.sum()) + prior.cost(state))
-
-
-def _improve(
-    matches: RayMatches, fit: _Fit, scale_px: float, prior: TurnPrior, damping: float
-) -> tuple[_Fit | None, float]:
-    """Take a step that does not raise the cost; None if there is none, and the damping for the next one."""
-    system = camera_blocks(fit.normal, matches.pairs, len(fit.state.centers))
-    prior.add_to(fit.state, system[0], system[2])
-
-    def propose(damping: float) -> _Fit | None:
-        moved = fit.state.moved(_step(system, matches.pairs, prior.free, damping))
-        candidate = _evaluate(matches, moved, scale_px, prior)
-        return candidate if candidate.cost <= fit.cost else None
-
-    return take_damped_step(propose, damping, _DAMPING)
 
 
 def _step(system: Blocks, pairs: IntArray, free: BoolArray, damping: float) -> FloatArray:

@@ -16,13 +16,13 @@ The division is what costs: one pair that is moved out of its ball by 1 % lowers
   u_e, mostly along the surface, and hardly at all where its residual is long: H_e = w_e / max(||r_e||, r).
   That is the Hessian of w ||r|| tamed so far that the scalar Laplacian of the weights H remains a good
   preconditioner. It asks nothing of the solver: r_e are the residuals of the given locations.
-- *Rounds.* What leaves its ball is clipped, and the equality is restored again, a few times. These
-  rounds need crude solves only; one solve to rounding comes last. From a dual of the splitting the bound is
-  then 100 to 1000 times closer than from one repair with S = P.
+- *Rounds.* What leaves its ball is clipped, and the equality is restored again, a few times, by crude solves;
+  one to rounding comes last. From a dual of the splitting the bound is then 100 to 1000 times closer than
+  from one repair with S = P.
 
 The systems are solved by conjugate gradients with that Laplacian, factored in float32 or, where it would
-fill in, approximately, as preconditioner; the number of steps does not grow with n. A dual that satisfies the
-equality already, as that of a Newton method does, is taken as it is.
+fill in, approximately, as preconditioner. A dual that satisfies the equality already, as that of a Newton
+method does, is taken as it is.
 
 Uniqueness. An optimal T' has w_e ||r'_e|| = <y_e, r'_e> for every pair and every optimal dual: r'_e = 0
 where ||y_e|| < w_e, and r'_e points along y_e where ||y_e|| = w_e. If translations and T are all that
@@ -35,7 +35,7 @@ and w_e v_e v_e^T is added for one pair, which excludes T: then Cholesky tells w
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -46,14 +46,14 @@ from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
-from sfm_shapefit.laplacian.cholesky import factorise
+from sfm_shapefit.laplacian.cholesky import factorize
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
 from sfm_shapefit.laplacian.operators import Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import plan_factorisation
+from sfm_shapefit.laplacian.symbolic import plan_factorization
 from sfm_shapefit.solver.factor_choice import prefers_dense_factor
 from sfm_shapefit.solver.program import adjoint, along, differences, objective
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 # Rounds of clipping: three do mostly, but on loose communities the sixth still gained half of the gap.
@@ -63,14 +63,16 @@ _ROUND_REDUCTION = 0.1
 # The rounds end when the excess costs less than this share of the gap; the second share is that where the gap
 # misses what was asked for in any case.
 _NEGLIGIBLE, _NEGLIGIBLE_MISSED = 0.03, 0.3
-# The least residual, relative to the mean one, that the metric takes seriously.
-_RESIDUAL_FLOOR = 0.1
+RESIDUAL_FLOOR = 0.1
+"""The least residual, relative to the mean one, that the metric takes seriously."""
+
 # The share of the metric across the surface of a ball that is taken away.
 _ALONG_SURFACE = 0.97
 # A pair counts as on the surface of its ball from this ||y_e|| / w_e on.
 _ON_SURFACE = 0.99
-# Each repair shrinks the equality residual to the rounding of the previous one.
-_REPAIRS = 4
+REPAIRS = 4
+"""Each repair shrinks the equality residual to the rounding of the previous one."""
+
 # Conjugate gradients need 10 to 60 steps on all but long chains.
 _CG_STEPS = 500
 # From so many pairs on, the passes over them run by so many blocks, on several threads.
@@ -84,11 +86,14 @@ _LEAST_EXACT, _LARGEST_EXACT = 1e-12, 5e-10
 _ENOUGH, _EXCESS_GROWTH = 0.8, 5.0
 # No bound may rest on a larger equality residual, relative to the largest degree.
 _UNREPAIRED = 1e-9
-# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
-_STRICT = 1e-3
-# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this; in single
-# precision it must be far above the rounding of the factor, n d eps.
-_REGULAR, _REGULAR_SINGLE = 1e-9, 1e-3
+STRICT = 1e-3
+"""A pair counts as held by its fit if ||y_e|| < (1 - this) w_e."""
+
+REGULAR = 1e-9
+"""A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this."""
+
+# In single precision it must be far above the rounding of the factor, n d eps.
+_REGULAR_SINGLE = 1e-3
 # From so many unknowns on a factor in single precision is tried first.
 _SINGLE_FROM = 450
 # Uniqueness is not examined beyond so many pairs, whose ordering alone takes seconds, or so many operations.
@@ -125,63 +130,40 @@ def certify(
     *,
     tol: float = 0.0,
     uniqueness: bool = False,
-    factor: LaplacianFactor | None = None,
     threads: int = 1,
-    overwrite_dual: bool = False,
 ) -> Certificate:
     """Return the bound that `dual`, made feasible, proves for `locations`. It trusts no solver.
 
     Args:
         graph: a connected view graph.
-        locations: (n, d) camera centres, in any scale, with L(T) > 0.
+        locations: (n, d) camera centers, in any scale, with L(T) > 0.
         dual: (m, d) approximate dual; any finite array gives a valid, perhaps useless, bound.
         tol: a gap that is small enough: where a better bound takes time, none is looked for. 0: the best one.
         uniqueness: also examine whether the optimum is unique; costs one sparse factorization.
-        factor: solver for the graph's Laplacian that may be overwritten, to save a new analysis of the
-            graph; it serves as preconditioner and cannot make the bound wrong.
         threads: of a repair; the bound does not depend on it.
-        overwrite_dual: make `dual` itself feasible where that saves a copy of it.
 
     Raises:
         InputError: if an array has the wrong shape, is not finite, or the locations have L(T) <= 0.
-        UnsolvableError: if the dual must be repaired, no factor is given, and the graph is not connected.
+        UnsolvableError: if the dual must be repaired and the graph is not connected.
     """
-    y = np.array(dual, dtype=np.float64, order="C", copy=None if overwrite_dual else True)
-    found = _proved(graph, locations, y, tol, np.inf, uniqueness, factor, threads)
+    y = np.array(dual, dtype=np.float64, order="C")
+    found = certify_in_place(graph, locations, y, tol, np.inf, Resources(threads))
     assert found is not None, "no gap is above infinity"
-    return found
+    if not uniqueness:
+        return found
+    return replace(found, unique=_is_unique(graph, locations - locations.mean(axis=0), found.dual))
 
 
 @one_blas_thread()
-def certify_within(
-    graph: ViewGraph,
-    locations: FloatArray,
-    dual: FloatArray,
-    tol: float,
-    *,
-    factor: LaplacianFactor | None = None,
-    threads: int = 1,
+def certify_in_place(
+    graph: ViewGraph, locations: FloatArray, y: FloatArray, tol: float, hopeless: float, resources: Resources
 ) -> Certificate | None:
-    """Return what `certify` would if its gap is at most `tol`, else None, as soon as that is clear.
+    """Return what `certify` does, with y itself made feasible; None if the gap is above `hopeless`.
 
-    `dual` is overwritten. On loosely joined communities a proof takes as long as hundreds of iterations of a
-    solver, and more than half of that is saved where the dual is not good enough yet.
+    A factor among the resources is a preconditioner, and cannot make the bound wrong. A hopeless gap shows
+    early: on loosely joined communities, where a proof takes as long as hundreds of iterations of a solver,
+    that saves more than half of it.
     """
-    found = _proved(graph, locations, dual, tol, tol, False, factor, threads)
-    return found if found is not None and found.gap <= tol else None
-
-
-def _proved(
-    graph: ViewGraph,
-    locations: FloatArray,
-    y: FloatArray,
-    tol: float,
-    hopeless: float,
-    uniqueness: bool,
-    factor: LaplacianFactor | None,
-    threads: int,
-) -> Certificate | None:
-    """Make y feasible in place and return what it proves; None if the gap is going to be above `hopeless`."""
     t = np.ascontiguousarray(locations - locations.mean(axis=0))
     value = _checked_objective(graph, locations, t, y)
     n, d, w = graph.num_nodes, graph.dimension, graph.weights
@@ -190,7 +172,7 @@ def _proved(
     degree = float(degrees.max())
     multiplier = _multiplier(total, c, t)
     if _unbalanced(total, c, multiplier) > degree * _exact(value - multiplier / max(1.0, worst)):
-        repair = _repair(graph, t, y, factor, threads)
+        repair = _repair(graph, t, y, resources)
         gap = _clip_in_rounds(repair, c, t, value, tol, hopeless)
         if gap > hopeless:
             return None
@@ -207,12 +189,10 @@ def _proved(
     # y = 0 is feasible and proves at least 0; a dual that could not be repaired proves nothing.
     if not (bound > 0.0 and violation <= _UNREPAIRED * degree):
         y, bound, violation = np.zeros_like(y), 0.0, 0.0
+    if not value - bound <= hopeless:
+        return None
     return Certificate(
-        objective=value,
-        dual_bound=bound,
-        dual=frozen(y),
-        equality_residual=violation / degree,
-        unique=_is_unique(graph, t, y) if uniqueness else None,
+        objective=value, dual_bound=bound, dual=frozen(y), equality_residual=violation / degree
     )
 
 
@@ -278,31 +258,24 @@ class _Repair(NamedTuple):
         return total
 
 
-def _repair(
-    graph: ViewGraph, t: FloatArray, y: FloatArray, factor: LaplacianFactor | None, threads: int
-) -> _Repair:
+def _repair(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources) -> _Repair:
     """Return the metric of the residuals at t, with no pair on the surface of its ball so far."""
     edges, v = np.ascontiguousarray(graph.edges), np.ascontiguousarray(graph.directions)
     stiffness = _stiffness(graph, t).astype(np.float32)
     normal, axes = np.zeros(graph.num_edges, np.float32), tuple(range(graph.dimension))
     metric = _Metric(edges, v, graph.weights, stiffness, y, normal, axes)
     blocks = _EDGE_BLOCKS if graph.num_edges >= _LARGE else 1
-    precondition = _preconditioner(graph, stiffness, factor, threads)
-    return _Repair(metric, precondition, Workers(threads), np.empty((blocks, *t.shape)))
+    precondition = _preconditioner(graph, stiffness, resources)
+    return _Repair(metric, precondition, Workers(resources.threads), np.empty((blocks, *t.shape)))
 
 
 def _clip_in_rounds(
     repair: _Repair, c: FloatArray, t: FloatArray, value: float, tol: float, hopeless: float
 ) -> float:
-    """Clip y and restore the equality roughly, in turns, until its excess costs little.
+    """Clip y and restore the equality roughly, in turns; return about the gap that the dual proves.
 
-    Args:
-        value: the objective at t, to tell how far the bound is.
-        tol: the gap wanted; it ends somewhat below it in any case.
-        hopeless: a gap from which an end has no use; from the second clipping on, lambda hardly rises again.
-
-    Returns:
-        About the gap that the dual proves.
+    The rounds end when the excess costs little of the gap to `value`, the objective at t; somewhat below the
+    gap `tol` in any case; and above `hopeless`, for from the second clipping on lambda hardly rises again.
     """
     gap = value
     for k in range(_ROUNDS):
@@ -323,13 +296,12 @@ def _clip_in_rounds(
 def _restore_exactly(repair: _Repair, c: FloatArray, t: FloatArray, allowed: float) -> float:
     """Move y to D^T y = lambda c up to `allowed` at a camera; return max_e ||y_e|| / w_e.
 
-    The metric is H_e P_e here: what is still to be moved costs little, and the conjugate gradients need half
-    of the steps.
+    The metric is H_e P_e here, with which the conjugate gradients need half of the steps.
     """
     repair.metric.normal[:] = 0.0
     fine = 0.1 * allowed * float(np.sqrt(len(c)))  # no camera is much worse than the mean one
     worst = 1.0
-    for _ in range(_REPAIRS):
+    for _ in range(REPAIRS):
         violation = _violation(repair.metric, c, t)[1]
         reduction = fine / max(float(np.linalg.norm(violation)), fine)
         worst = _restore(repair, violation, reduction)
@@ -347,15 +319,11 @@ def _violation(metric: _Metric, c: FloatArray, t: FloatArray) -> tuple[float, Fl
 
 def _restore(repair: _Repair, violation: FloatArray, tol: float) -> float:
     """Move y by S D h so that `violation` shrinks to `tol` times itself; return max_e ||y_e|| / w_e."""
-    h = conjugate_gradients(
-        repair.product,
-        repair.precondition,
-        violation,
-        tol=min(tol, 0.5),
-        max_iterations=_CG_STEPS,
-        coupled=True,
-    ).x
-    return float(_move(repair.metric, h))
+    product, precondition, tol = repair.product, repair.precondition, min(tol, 0.5)
+    found = conjugate_gradients(
+        product, precondition, violation, tol=tol, max_iterations=_CG_STEPS, coupled=True
+    )
+    return float(_move(repair.metric, found.x))
 
 
 def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
@@ -365,23 +333,23 @@ def _stiffness(graph: ViewGraph, t: FloatArray) -> FloatArray:
     mean = float(np.vdot(graph.weights, residuals) / graph.weights.sum())
     if not mean > 0.0:
         return graph.weights
-    np.maximum(residuals, _RESIDUAL_FLOOR * mean, out=residuals)
+    np.maximum(residuals, RESIDUAL_FLOOR * mean, out=residuals)
     np.divide(graph.weights, residuals, out=residuals)  # in place: on large graphs memory is short here
     residuals *= mean
     return residuals
 
 
-def _preconditioner(
-    graph: ViewGraph, stiffness: npt.NDArray[Any], factor: LaplacianFactor | None, threads: int
-) -> Preconditioner:
+def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Resources) -> Preconditioner:
     """Return an approximate inverse of the Laplacian of `stiffness`."""
-    if factor is None:  # whoever has a factor has looked, and on large graphs the look takes much memory
+    if (
+        resources.factor is None
+    ):  # whoever has a factor has looked, and on large graphs the look takes much memory
         components = int(graph.components().max()) + 1
         if components > 1:
             raise UnsolvableError(
                 f"the graph falls into {components} connected components; certify each one separately"
             )
-        factor = laplacian_factor(graph, threads=threads)
+    factor = laplacian_factor(graph, resources)
     try:
         factor.refactor(stiffness)
     except UnsolvableError:  # connected, but too long for float32
@@ -406,11 +374,7 @@ def _residuals(edges: Any, v: Any, t: Any, out: Any) -> None:
 
 @kernel(exact=True)
 def _project(edges: Any, v: Any, w: Any, y: Any, c: Any, total: Any, degrees: Any) -> float:
-    """Remove the part of y along v; add D^T (w v), D^T y and the sums of w at the cameras.
-
-    Returns:
-        max_e ||y_e|| / w_e.
-    """
+    """Remove the part of y along v; add D^T (w v), D^T y and the sums of w; return max_e ||y_e|| / w_e."""
     worst = 0.0
     for e in range(len(w)):
         i, j = edges[e, 0], edges[e, 1]
@@ -492,36 +456,33 @@ def _is_unique(graph: ViewGraph, t: FloatArray, y: FloatArray) -> bool | None:
     """Return whether the feasible dual excludes other optima; None if the factor would be too large."""
     if graph.num_edges > _UNIQUENESS_EDGES:
         return None
-    v, w = graph.directions, graph.weights
-    longest = int(np.argmax(along(differences(t, graph.edges), v)))
-    n, d = graph.num_nodes, graph.dimension
+    n, d, v = graph.num_nodes, graph.dimension, graph.directions
     order = cache(lambda: best_order(adjacency(n, graph.edges)))
-    if prefers_dense_factor(graph, lambda: order().flops * d**3):
-        return _is_regular_dense(graph, y, longest)
-    if order().flops * d**3 > _UNIQUENESS_FLOPS:
+    is_dense = prefers_dense_factor(graph, lambda: order().flops * d**3)
+    if not is_dense and order().flops * d**3 > _UNIQUENESS_FLOPS:
         return None
-    symbolic = plan_factorisation(adjacency(n, graph.edges), graph.edges, order())
+    longest = int(np.argmax(along(differences(t, graph.edges), v)))
     blocks = np.empty((graph.num_edges, d, d))
-    _set_conditions(v, w, y, longest, blocks)
+    _set_conditions(v, graph.weights, y, longest, blocks)
+    if is_dense:
+        return _is_regular_dense(graph, blocks)
+    symbolic = plan_factorization(adjacency(n, graph.edges), graph.edges, order())
     try:
-        return factorise(symbolic, blocks).smallest_pivot > _REGULAR
+        return factorize(symbolic, blocks).smallest_pivot > REGULAR
     except UnsolvableError:
         return False
 
 
-def _is_regular_dense(graph: ViewGraph, y: FloatArray, longest: int) -> bool:
-    """Return whether the conditions of uniqueness have a regular matrix, by a dense factor of it."""
+def _is_regular_dense(graph: ViewGraph, blocks: FloatArray) -> bool:
+    """Return whether the Laplacian of the blocks is regular, by a dense factor of it."""
     n, d = graph.num_nodes, graph.dimension
-    blocks = np.empty((graph.num_edges, d, d))
-    _set_conditions(graph.directions, graph.weights, y, longest, blocks)
     diagonal = np.zeros((n, d, d))
-    with one_blas_thread():
-        if n * d >= _SINGLE_FROM:
-            matrix = np.zeros((n * d) ** 2, np.float32)
-            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(np.float32)) > _REGULAR_SINGLE:
+    for dtype, regular in ((np.float32, _REGULAR_SINGLE), (np.float64, REGULAR)):
+        if n * d >= _SINGLE_FROM or dtype is np.float64:
+            matrix = np.zeros((n * d) ** 2, dtype)
+            if _least_pivot(graph.edges, blocks, diagonal, matrix, blas_of(dtype)) > regular:
                 return True
-        double, blas = np.zeros((n * d) ** 2), blas_of(np.float64)
-        return bool(_least_pivot(graph.edges, blocks, diagonal, double, blas) > _REGULAR)
+    return False
 
 
 @kernel(exact=True)
@@ -532,7 +493,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
         square = 0.0
         for k in range(d):
             square += y[e, k] ** 2
-        bend = w[e] / square if np.sqrt(square) >= (1.0 - _STRICT) * w[e] else 0.0
+        bend = w[e] / square if np.sqrt(square) >= (1.0 - STRICT) * w[e] else 0.0
         for k in range(d):
             for q in range(d):
                 x = w[e] if k == q else 0.0
@@ -580,7 +541,7 @@ def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any)
 
 
 def _checked_objective(graph: ViewGraph, locations: FloatArray, t: FloatArray, dual: FloatArray) -> float:
-    """Return the objective at the locations, t when centred, or raise InputError."""
+    """Return the objective at the locations, t when centered, or raise InputError."""
     shapes = (graph.num_nodes, graph.dimension), graph.directions.shape
     if locations.shape != shapes[0] or dual.shape != shapes[1]:
         raise InputError(

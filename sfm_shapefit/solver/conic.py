@@ -1,15 +1,14 @@
 """The reference solver: the ShapeFit program as a generic second-order cone program.
 
-The door to cvxpy and Clarabel. One cone of d rows per edge, in an orthonormal basis B_e of the
-complement of v_e; camera 0 is grounded, which is sum_i t_i = 0 after centring:
+The door to cvxpy and Clarabel. One cone of d rows per edge, in an orthonormal basis B_e of the complement of
+v_e; camera 0 is grounded, which is sum_i t_i = 0 after centering:
 
     minimize    sum_e w_e s_e
     subject to  ||z_e|| <= s_e,    z_e = B_e^T (t_i - t_j),    <c, T> = kappa,    t_0 = 0
 
-With groups (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, group 0 grounded.
-
-The multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow beside a solver made
-for the program, and trusted: every other solver is tested against it.
+With groups (`sfm_shapefit.solver.rigs.groups`) t = A x, and x takes the place of t, group 0 grounded. The
+multipliers of z_e = B_e^T (t_i - t_j) are the dual y_e in that basis. Slow, and trusted: every other solver
+is tested against it.
 """
 
 import contextlib
@@ -112,8 +111,7 @@ def _reduction(group_of: IntArray, offsets: FloatArray) -> csr_array:
 def _run(program: Any, tolerance: float, max_iterations: int) -> int:
     """Run Clarabel on a cvxpy problem; return its number of steps. An inaccurate point is still a point.
 
-    Clarabel now and then ends without any point at a tolerance near rounding, and has one at ten or a
-    hundred times that.
+    At a tolerance near rounding it now and then has none, and one at ten or a hundred times that.
     """
     import cvxpy as cp
 

@@ -23,13 +23,10 @@ class DampingRange(NamedTuple):
 def take_damped_step(
     propose: Callable[[float], Point | None], damping: float, limits: DampingRange
 ) -> tuple[Point | None, float]:
-    """Return the first proposal that helps, and the damping for the next step.
+    """Return the first proposal that helps, or None, and the damping for the next step.
 
-    Args:
-        propose: returns the point that a step of this damping leads to; None if its equations are singular,
-            or the cost there is not low enough.
-        damping: that of the first attempt.
-        limits: of the damping. Where none of these helps the answer is None and the first damping.
+    `propose` returns the point that a step of this damping leads to; None if its equations are singular, or
+    the cost there is not low enough.
     """
     while damping <= limits.most:
         proposed = propose(damping)

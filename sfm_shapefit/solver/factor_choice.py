@@ -14,12 +14,10 @@ _DENSE_SHARE = 0.3
 
 
 def prefers_dense_factor(graph: ViewGraph, predict_flops: Callable[[], float]) -> bool:
-    """Return whether the matrix of edge blocks (d, d) is better factored as a dense one.
+    """Return whether the matrix of edge blocks (d, d) of a graph is better factored as a dense one.
 
-    Args:
-        graph: whose pairs are the blocks.
-        predict_flops: returns the operations of the sparse factorization in blocks; asked only where the
-            size and the density of the graph leave the answer open.
+    `predict_flops` returns the operations of the sparse factorization; it is asked only where the size and
+    the density of the graph leave the answer open.
     """
     n, unknowns = graph.num_nodes, graph.num_nodes * graph.dimension
     if unknowns <= FEW_UNKNOWNS:

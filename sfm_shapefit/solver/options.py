@@ -6,7 +6,7 @@ Pure data, no numerics, so that the command line, the tests and the benchmark ca
 import enum
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from sfm_shapefit.display import Displayed
@@ -22,9 +22,6 @@ NO_FACTOR = 0
 
 MAX_THREADS = 256
 """Threads that may be asked for; work is cut into as many shares, so that millions would never end."""
-
-NO_FACTOR = 0
-"""The `factor_memory` with which nothing is factored that can be left out."""
 
 
 class Status(enum.Enum):
@@ -60,6 +57,27 @@ class IterationInfo:
 
 OnIteration = Callable[[IterationInfo], bool | None]
 """Called after each iteration; returning False, or raising, cancels the solve."""
+
+
+def asks_to_stop(on_iteration: OnIteration | None, info: IterationInfo) -> bool:
+    """Tell the callback, if any, of an iteration; return whether it cancels, as a numpy False does."""
+    answer = None if on_iteration is None else on_iteration(info)
+    return answer is not None and not answer
+
+
+class Watch:
+    """Passes iterations on to the user's callback, and remembers whether it cancelled."""
+
+    def __init__(self, on_iteration: OnIteration | None, *, limit: int = 0, done: int = 0) -> None:
+        """Pass on `limit`, and iterations that follow `done` earlier ones."""
+        self._on_iteration, self._limit, self._done = on_iteration, limit, done
+        self.cancelled = False
+
+    def __call__(self, info: IterationInfo) -> bool:
+        """Pass one iteration on; return whether to go on."""
+        passed = replace(info, iteration=self._done + info.iteration, limit=self._limit)
+        self.cancelled = asks_to_stop(self._on_iteration, passed)
+        return not self.cancelled
 
 
 @explained
@@ -114,7 +132,7 @@ class SolverResult(Displayed):
     """A solve's answer together with the evidence that it is one."""
 
     locations: "FloatArray"
-    """(n, d) camera centres with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
+    """(n, d) camera centers with centroid 0, scaled so that sum_e w_e <t_i - t_j, v_e> = sum_e w_e."""
     status: Status
     objective: float
     """R(T) / L(T) of the paper at `locations`: a length-weighted mean tangent of the angular errors."""

@@ -22,6 +22,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -74,11 +75,17 @@ def objective(graph: ViewGraph, t: FloatArray) -> float:
     return residual / length if length > 0.0 else float("inf")
 
 
-def normalized_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
-    """Return `t` centred and scaled so that L(T) = kappa = sum of the weights."""
-    centred: FloatArray = t - t.mean(axis=0)
-    scale = float(graph.weights.sum()) / projected_length(graph, centred)
-    return centred * scale
+def normalize_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
+    """Return `t` centered and scaled so that L(T) = kappa = sum of the weights.
+
+    Raises:
+        UnsolvableError: if they are not finite or point against the directions.
+    """
+    centered: FloatArray = t - t.mean(axis=0)
+    length = projected_length(graph, centered)
+    if not (np.isfinite(centered).all() and length > 0.0):
+        raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
+    return centered * (float(graph.weights.sum()) / length)
 
 
 @kernel(exact=True)

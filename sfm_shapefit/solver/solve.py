@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -17,20 +16,9 @@ from sfm_shapefit.solver.certificate import Certificate, certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.factor_choice import FEW_UNKNOWNS, prefers_dense_factor
 from sfm_shapefit.solver.newton import solve_newton_dense, solve_newton_sparse
-from sfm_shapefit.solver.options import (
-    IterationInfo,
-    OnIteration,
-    SolverOptions,
-    SolverResult,
-    Status,
-)
-from sfm_shapefit.solver.program import (
-    normalized_locations,
-    objective,
-    projected_length,
-    scale_functional,
-)
-from sfm_shapefit.solver.splitting.linear import Prediction, predict_factor
+from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult, Status, Watch
+from sfm_shapefit.solver.program import normalize_locations, scale_functional
+from sfm_shapefit.solver.splitting.linear import Prediction, Resources, predict_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -38,7 +26,7 @@ from sfm_shapefit.viewgraph import ViewGraph
 _DIRECTIONS_CANCEL = 1e-9
 # The bound is not to be called rigorous where the dual violates its equality by more.
 _LARGEST_RESIDUAL = 1e-9
-ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
+_ITERATION_LIMITS = {"newton": 100, "admm": 2000, "conic": 200}
 # From so many operations of one block factorization on, splitting is faster to the same gap.
 _LARGEST_NEWTON_FLOPS = 4e9
 
@@ -75,8 +63,7 @@ def solve(
         result = solve(graph)
         result.locations, result.gap, result.unique
 
-    This is the certified program alone, whose optimum collapses on long chains and under heavy corruption; to
-    place the cameras of a graph, call `sfm_shapefit.place`.
+    Its optimum collapses on long chains and under heavy corruption; `sfm_shapefit.place` copes with that.
 
     Args:
         graph: n cameras, m pairs, directions in any dimension d >= 2.
@@ -97,45 +84,36 @@ def solve(
     options = merge_options(options, SolverOptions, overrides)
     start = time.perf_counter()
     _refuse_undetermined(graph)
-    choice = choose_method(graph, options)
-    limit = options.max_iterations or ITERATION_LIMITS[choice.method]
-    watch = Watch(on_iteration, limit)
-    run = choice.run(graph, options, limit, watch if on_iteration else None)
-    locations = scaled_locations(graph, run.locations)
-    certificate = certify(
-        graph,
-        locations,
-        run.dual,
-        tol=options.tol,
-        uniqueness=options.uniqueness,
-        threads=options.num_threads(),
-    )
-    status = judge_status(certificate, options.tol, run.iterations >= limit, watch.cancelled)
-    return describe_run(run, choice, certificate, locations, status, start)
+    choice, threads = choose_method(graph, options), options.num_threads()
+    prove = partial(certify, graph, tol=options.tol, uniqueness=options.uniqueness, threads=threads)
+    return run_choice(graph, choice, options, on_iteration, prove, start)
 
 
-def scaled_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:
-    """Return a solver's locations centred and in the program's scale.
-
-    Raises:
-        UnsolvableError: if they are not finite or point against the directions.
-    """
-    centred = locations - locations.mean(axis=0)
-    length = projected_length(graph, centred)
-    if not (np.isfinite(centred).all() and length > 0.0):
-        raise UnsolvableError("the solver found no finite locations; check the directions of the graph")
-    return np.asarray(centred * (float(graph.weights.sum()) / length))
-
-
-def describe_run(
-    run: Run,
+def run_choice(
+    graph: ViewGraph,
     choice: Choice,
-    certificate: Certificate,
-    locations: FloatArray,
-    status: Status,
+    options: SolverOptions,
+    on_iteration: OnIteration | None,
+    prove: Callable[[FloatArray, FloatArray], Certificate],
     start: float,
 ) -> SolverResult:
-    """Return the result of a run that began at `start`, by `time.perf_counter()`."""
+    """Run the chosen solver and return what it found; the solve began at `start`, by `time.perf_counter()`.
+
+    `prove` returns the certificate of locations (n, d) in the program's scale and a dual (m, d).
+
+    Raises:
+        UnsolvableError: if the locations found are not finite or point against the directions.
+    """
+    limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
+    watch = Watch(on_iteration, limit=limit)
+    run = choice.run(graph, options, limit, watch if on_iteration else None)
+    locations = normalize_locations(graph, run.locations)
+    certificate = prove(locations, run.dual)
+    status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
+    if certificate.gap <= options.tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
+        status = Status.CONVERGED
+    elif watch.cancelled:
+        status = Status.CANCELLED
     return SolverResult(
         locations=frozen(locations),
         status=status,
@@ -151,41 +129,13 @@ def describe_run(
     )
 
 
-def uncertified(
-    graph: ViewGraph, locations: FloatArray, status: Status, method: str, reason: str, start: float
-) -> SolverResult:
-    """Return locations (n, d) that something else found, in ShapeFit's scale; they have no certificate.
-
-    Args:
-        graph: connected and parallel rigid.
-        locations: finite, and pointing the way the directions do on the whole.
-        status: why there is none.
-        method, reason: what found them, and why that.
-        start: `time.perf_counter()` when it began.
-    """
-    scaled = normalized_locations(graph, locations)
-    return SolverResult(
-        locations=frozen(scaled),
-        status=status,
-        objective=objective(graph, scaled),
-        dual_bound=0.0,
-        dual=frozen(np.zeros_like(graph.directions)),
-        equality_residual=0.0,
-        unique=None,
-        iterations=0,
-        seconds=time.perf_counter() - start,
-        method=method,
-        method_reason=reason,
-    )
-
-
 def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
     asked = options.solver != "auto"
     if options.solver == "conic":
         return Choice("conic", _run_conic, "asked for")
     if options.solver == "admm":
-        return Choice("admm", _run_admm, "asked for")
+        return Choice("admm", partial(_run_admm, None), "asked for")
     predict = cache(partial(predict_factor, graph))
 
     def flops() -> float:
@@ -199,9 +149,8 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     if flops() < np.inf:
         predicted = f"{flops() / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops() <= _LARGEST_NEWTON_FLOPS:
-        run_sparse = partial(_run_sparse, prediction=predict())
-        return Choice("newton", run_sparse, "asked for" if asked else predicted)
-    return Choice("admm", partial(_run_admm, prediction=predict()), f"{predicted}: splitting is faster")
+        return Choice("newton", partial(_run_sparse, predict()), "asked for" if asked else predicted)
+    return Choice("admm", partial(_run_admm, predict()), f"{predicted}: splitting is faster")
 
 
 def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
@@ -209,54 +158,26 @@ def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIt
 
 
 def _run_sparse(
-    graph: ViewGraph,
-    options: SolverOptions,
-    limit: int,
-    watch: OnIteration | None,
-    prediction: Prediction | None = None,
+    prediction: Prediction, graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None
 ) -> Run:
-    tree = None if prediction is None else prediction.tree
-    return Run(*solve_newton_sparse(graph, options.tol, limit, watch, tree=tree))
+    return Run(*solve_newton_sparse(graph, options.tol, limit, watch, plan=prediction.tree))
 
 
 def _run_admm(
+    prediction: Prediction | None,
     graph: ViewGraph,
     options: SolverOptions,
     limit: int,
     watch: OnIteration | None,
-    prediction: Prediction | None = None,
 ) -> Run:
-    found = solve_hybrid(
-        graph,
-        options.tol,
-        limit,
-        threads=options.num_threads(),
-        memory_bytes=options.factor_memory_mb * 1_000_000,
-        prediction=prediction,
-        on_iteration=watch,
-    )
+    resources = Resources(options.num_threads(), options.factor_memory_mb * 1_000_000)
+    found = solve_hybrid(graph, options.tol, limit, resources, prediction, watch)
     note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
     return Run(found.locations, found.certificate.dual, found.iterations, note)
 
 
 def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None) -> Run:
     return Run(*solve_conic(graph, options.tol, limit))
-
-
-class Watch:
-    """Passes iterations on to the user's callback, with their limit, and remembers whether it cancelled."""
-
-    def __init__(self, on_iteration: OnIteration | None, limit: int) -> None:
-        self._on_iteration = on_iteration
-        self._limit = limit
-        self.cancelled = False
-
-    def __call__(self, info: IterationInfo) -> bool:
-        """Pass one iteration on; return whether to go on."""
-        if self._on_iteration is not None:
-            answer = self._on_iteration(replace(info, limit=self._limit))
-            self.cancelled = answer is not None and not answer
-        return not self.cancelled
 
 
 def _refuse_undetermined(graph: ViewGraph) -> None:
@@ -276,12 +197,3 @@ def _refuse_undetermined(graph: ViewGraph) -> None:
     c = scale_functional(graph)
     if np.linalg.norm(c) <= _DIRECTIONS_CANCEL * graph.weights.sum():
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-
-
-def judge_status(certificate: Certificate, tol: float, at_limit: bool, cancelled: bool) -> Status:
-    """Return what a certified run amounts to."""
-    if certificate.gap <= tol and certificate.equality_residual <= _LARGEST_RESIDUAL:
-        return Status.CONVERGED
-    if cancelled:
-        return Status.CANCELLED
-    return Status.MAX_ITERATIONS if at_limit else Status.INACCURATE

@@ -108,9 +108,9 @@ def box_graph_problem(n: int, degree: float = 20.0, **noise: Unpack[Noise]) -> G
     """
     rng = _rng(noise)
     locations = rng.random((n, 3)) * [1.0, 1.0, 0.1]
-    neighbours = _nearest(locations, round(degree / 1.25))
-    camera = np.repeat(np.arange(n), neighbours.shape[1])
-    return _measure(locations, _unique_pairs(np.column_stack([camera, neighbours.ravel()])), rng, noise)
+    neighbors = _nearest(locations, round(degree / 1.25))
+    camera = np.repeat(np.arange(n), neighbors.shape[1])
+    return _measure(locations, _unique_pairs(np.column_stack([camera, neighbors.ravel()])), rng, noise)
 
 
 def trajectory_graph_problem(

@@ -84,8 +84,8 @@ def test_standard_deviations_cover_the_errors_of_least_squares(stated):
         found = fitted(t, edges, v)
         given = MeasuredGraph(ViewGraph(14, edges, v), covariance=covariances(len(edges), stated * SIGMA))
         judged = assess(given, found)
-        centred, truth = found - found.mean(axis=0), t - t.mean(axis=0)
-        errors = centred - truth * np.sum(centred**2) / np.sum(centred * truth)
+        centered, truth = found - found.mean(axis=0), t - t.mean(axis=0)
+        errors = centered - truth * np.sum(centered**2) / np.sum(centered * truth)
         within.append(np.abs(errors) < judged.sigmas)
     # 840 errors: 1.6 % at one sigma, the noise's level is known to 5 % per seed; 68 % within 20 % is asked.
     assert np.mean(within) == pytest.approx(0.683, abs=0.07)

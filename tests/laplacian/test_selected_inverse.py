@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sfm_shapefit.laplacian.cholesky import analyse, factorise
+from sfm_shapefit.laplacian.cholesky import analyze, factorize
 from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
@@ -17,7 +17,7 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     n, edges = 150, problem(150, 10.0, seed=b).edges
     edges = np.where(rng.random(len(edges))[:, None] < 0.5, edges, edges[:, ::-1])  # either way round
     weights = random_blocks(len(edges), b, seed=b)
-    factor = factorise(analyse(n, edges), weights, ground=7.0)
+    factor = factorize(analyze(n, edges), weights, ground=7.0)
     found = selected_inverse(factor, edges)
 
     matrix = assemble(laplacian_pattern(n, edges), weights).toarray().reshape(n, b, n, b)
@@ -32,7 +32,7 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
 
 def test_entries_are_right_where_the_factor_is_cut_into_tasks():
     edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
-    factor = factorise(analyse(6000, edges), np.ones(len(edges)), ground=7.0)
+    factor = factorize(analyze(6000, edges), np.ones(len(edges)), ground=7.0)
     assert len(factor.symbolic.tasks) > 1
     found = selected_inverse(factor, edges)
     for node in range(0, 6000, 600):
@@ -47,6 +47,6 @@ def test_entries_are_right_where_the_factor_is_cut_into_tasks():
 
 def test_a_single_precision_factor_is_refused():
     edges = box_graph_problem(20, 8.0).edges
-    factor = factorise(analyse(20, edges), np.tile(np.eye(3), (len(edges), 1, 1)), dtype=np.float32)
+    factor = factorize(analyze(20, edges), np.tile(np.eye(3), (len(edges), 1, 1)), dtype=np.float32)
     with pytest.raises(ValueError, match="float64"):
         selected_inverse(factor, edges)

@@ -86,8 +86,8 @@ def test_locate_makes_a_known_distance_true_and_says_so(tmp_path):
     known = ("--known-distance", "0003.jpg", "0007.jpg", "42.5")
     result = run("locate", RING_MODEL, tmp_path / "out", "--json", *known)
     model = pycolmap.Reconstruction(tmp_path / "out")
-    centres = {image.name: image.projection_center() for image in model.images.values()}
-    assert np.linalg.norm(centres["0003.jpg"] - centres["0007.jpg"]) == pytest.approx(42.5, rel=1e-12)
+    centers = {image.name: image.projection_center() for image in model.images.values()}
+    assert np.linalg.norm(centers["0003.jpg"] - centers["0007.jpg"]) == pytest.approx(42.5, rel=1e-12)
     assert "0003.jpg and 0007.jpg are 42.5 apart" in json.loads(result.stdout)["scale"]
 
 
@@ -272,10 +272,10 @@ def test_locate_turns_the_whole_model_onto_priors(ring, tmp_path):
     truth = 2.0 * ring.centers @ TURN.T + [1000.0, 0.0, -50.0]
     table = write_table(tmp_path / "priors.txt", ring, truth)
     found = locate(RING_MODEL, priors=table)
-    for image_id, centre in zip(ring.image_ids.tolist(), truth, strict=True):
+    for image_id, center in zip(ring.image_ids.tolist(), truth, strict=True):
         image, before = found.reconstruction.image(image_id), plain.reconstruction.image(image_id)
         apart = np.linalg.norm(before.projection_center() - ring.centers[ring.image_ids == image_id][0])
-        assert np.linalg.norm(image.projection_center() - centre) <= 2.0 * apart + 0.05
+        assert np.linalg.norm(image.projection_center() - center) <= 2.0 * apart + 0.05
         # A turn of the world by the axes A: cam_from_world becomes R A^T.
         expected = before.cam_from_world().rotation.matrix() @ found.gauge.axes.T
         np.testing.assert_allclose(image.cam_from_world().rotation.matrix(), expected, atol=1e-12)
@@ -348,8 +348,8 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     off = []
     for folder in ("plain", "out"):
         model = pycolmap.Reconstruction(tmp_path / folder)
-        centres = {image.name: image.projection_center() for image in model.images.values()}
-        off.append([np.linalg.norm(centres[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
+        centers = {image.name: image.projection_center() for image in model.images.values()}
+        off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
     assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
 
 

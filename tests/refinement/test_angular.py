@@ -6,6 +6,7 @@ import pytest
 from sfm_shapefit.geometry import median_spread, normalized, tangent_bases
 from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement.angular import (
+    AngularTerms,
     Metric,
     plan_refinement,
     refine_angles,
@@ -115,7 +116,7 @@ def test_a_start_is_kept_if_nothing_better_is_found(monkeypatch):
     problem = random_graph_problem(20, 0.6, sigma=0.01, seed=3)
     graph = problem.view_graph
     worse = shape(shaken(problem, 0.5))
-    monkeypatch.setattr(angular, "_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
+    monkeypatch.setattr(angular, "take_step", lambda *_, **__: (worse, 1e-4, 1.0, 1.0))
     found = refined(graph, problem.locations)
     np.testing.assert_allclose(found.locations, shape(problem.locations), rtol=1e-12)
 
@@ -140,13 +141,13 @@ def test_a_camera_without_any_pull_is_held_where_it_was():
     """Rejected pairs weigh next to nothing; the damping alone must not let their camera go."""
     problem = random_graph_problem(30, 0.8, seed=1)
     graph, start = problem.view_graph, shape(problem.locations)
-    information = angular._information(graph, None, np.full(graph.num_edges, 1e-4))
+    terms = AngularTerms(graph, angular._information(graph, None, np.full(graph.num_edges, 1e-4)))
     far = start.copy()
     far[3] += [0.3, -0.2, 0.1]
     plan = plan_refinement(graph)
     assert plan is not None
     factor = angular.allocate_factor(plan, 3)
-    moved = angular._step(graph, information, factor, angular._unit(far), angular.DAMPING.least)[0]
+    moved = angular.take_step(terms, factor, angular._unit(far), angular.DAMPING.least)[0]
     assert np.linalg.norm(moved - angular._unit(far), axis=1)[3] < 0.2
 
 
@@ -170,13 +171,14 @@ def test_the_linearisation_is_that_of_the_cost_above_and_below_the_shortest_leng
     floor = angular._SHORTEST * np.median(np.linalg.norm(differences(t, graph.edges), axis=1))
     t[1] = t[0] + 0.8 * floor * np.array([0.6, 0.0, 0.8])
     information = angular._information(graph, None, np.full(graph.num_edges, 0.05))
-    _, _, per_edge = angular._linearize(graph, information, t, steep)
+    terms = AngularTerms(graph, information, steep=steep)
+    _, _, per_edge = terms.linearize(t)
     gradient = angular.adjoint(per_edge, graph.edges, 12)
     h = 1e-9
     for camera, axis in [(0, 0), (1, 2), (5, 1)]:
         shift = np.zeros_like(t)
         shift[camera, axis] = h
-        up, down = (angular._cost(graph, information, t + s * shift, steep) for s in (1.0, -1.0))
+        up, down = (terms.cost(t + s * shift) for s in (1.0, -1.0))
         # Differences of a cost of some hundreds have 1e-13 / 1e-9 of rounding.
         assert gradient[camera, axis] == pytest.approx((up - down) / (2.0 * h), rel=1e-3, abs=1e-2)
 

@@ -240,7 +240,7 @@ def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
 
     def grows(n, edges):
         graph = adjacency(n, edges)
-        return rigidity.pieces._grows_from_first_pair(edges, graph.pointers, graph.neighbours)
+        return rigidity.pieces._grows_from_first_pair(edges, graph.pointers, graph.neighbors)
 
     assert grows(n, edges) == (len(members) == n)
     fan = np.array([(0, 1), *((i, k) for k in range(2, n) for i in (k - 2, k - 1))])

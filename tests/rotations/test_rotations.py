@@ -59,7 +59,7 @@ def moved(state, pair, step):
     """The state after a step in the 9 unknowns of one pair; of C_i - C_j the whole step moves C_i."""
     steps = np.zeros((len(state.centers), 6))
     steps[pair[0], :3], steps[pair[1], :3], steps[pair[0], 3:] = step[:3], step[3:6], step[6:]
-    return state.moved(steps)
+    return state.move(steps)
 
 
 def test_the_gradient_is_the_slope_of_the_cost_and_the_matrix_that_of_least_squares():

@@ -9,16 +9,15 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.approximate import approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.solver import certificate
-from sfm_shapefit.solver.certificate import certify
+from sfm_shapefit.solver.certificate import certify, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.program import across, adjoint, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import solve_admm
 from sfm_shapefit.solver.splitting import split_then_newton as hybrid
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, laplacian_factor
+from sfm_shapefit.solver.splitting.linear import IterativeSolver, Resources, laplacian_factor
 from sfm_shapefit.solver.splitting.split_then_newton import HybridStop, solve_hybrid
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import FAMILIES
-from tests.problems import exact_graph, measure_graph
+from tests.problems import exact_graph, measure_graph, solve_admm
 
 
 def draw_family(family, n, degree, *, sigma=0.01, q=0.2, seed=1):
@@ -270,7 +269,8 @@ def test_a_solver_without_fill_serves_as_well():
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
     iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
-    certificate = certify(graph, split.locations, split.dual, factor=iterative)
+    resources = Resources(factor=iterative)
+    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, resources)
     assert_feasible(graph, certificate)
     # The rounds stop at a tenth of the violation, not at the same point of it.
     assert certificate.gap <= 3.0 * direct.gap
@@ -282,7 +282,7 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
     given = split.dual.copy()
     aside = certify(graph, split.locations, split.dual)
     assert np.array_equal(split.dual, given)
-    in_place = certify(graph, split.locations, split.dual, overwrite_dual=True)
+    in_place = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, Resources())
     assert np.shares_memory(in_place.dual, split.dual)
     assert np.array_equal(in_place.dual, aside.dual)
     assert in_place.dual_bound == aside.dual_bound
@@ -326,7 +326,7 @@ def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
     assert result.stop is HybridStop.NEWTON
     assert result.factorizations > 0
     assert result.certificate.gap <= 1e-8
-    assert solve_hybrid(graph, 1e-8, 2000, memory_bytes=300_000).stop is HybridStop.TOO_LARGE
+    assert solve_hybrid(graph, 1e-8, 2000, Resources(memory_bytes=300_000)).stop is HybridStop.TOO_LARGE
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
@@ -354,11 +354,15 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
     graph = draw_family("comm", 1200, 30)
     split = solve_admm(graph, 1e-4, 200)
     whole = certify(graph, split.locations, split.dual)
-    within = certificate.certify_within(graph, split.locations, split.dual.copy(), 2.0 * whole.gap)
+
+    def certify_within(tol):
+        return certify_in_place(graph, split.locations, split.dual.copy(), tol, tol, Resources())
+
+    within = certify_within(2.0 * whole.gap)
     assert whole.gap <= within.gap <= 2.0 * whole.gap  # rounds may end earlier than for the best bound
     assert_feasible(graph, within)
     monkeypatch.setattr(certificate, "_restore_exactly", None)  # out of reach, it comes to no exact repair
-    assert certificate.certify_within(graph, split.locations, split.dual.copy(), 0.3 * whole.gap) is None
+    assert certify_within(0.3 * whole.gap) is None
 
 
 def test_newton_steps_are_counted_on_and_can_be_cancelled():

@@ -16,7 +16,7 @@ from sfm_shapefit.solver.program import (
     across,
     adjoint,
     differences,
-    normalized_locations,
+    normalize_locations,
     objective,
     scale_functional,
 )
@@ -53,7 +53,7 @@ def test_it_agrees_with_the_conic_reference(seed, d, sigma, q, solver):
     # Both objectives are within their gaps of the optimum; ours was asked for 1e-11.
     assert objective(graph, t) <= objective(graph, reference) + 1e-11
     assert bound <= objective(graph, reference) + 1e-14
-    ours, theirs = normalized_locations(graph, t), normalized_locations(graph, reference)
+    ours, theirs = normalize_locations(graph, t), normalize_locations(graph, reference)
     diameter = np.linalg.norm(np.ptp(theirs, axis=0))
     # Where noise makes the minimum flat, the reference's locations are off by about the root of what its
     # objective is above our bound, which is up to 1e-12; elsewhere 1e-7 is met.

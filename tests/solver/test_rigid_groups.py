@@ -10,20 +10,23 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.conic import solve_conic
-from sfm_shapefit.solver.newton.reduction import factor_pinned
+from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.options import SolverOptions, Status
 from sfm_shapefit.solver.program import adjoint, along, differences, scale_functional
-from sfm_shapefit.solver.rigs import certify_groups, largest_tied, lud_over_groups, solve_groups
 from sfm_shapefit.solver.rigs import solve as groups_solve
+from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.rigs.solve import solve_groups
+from sfm_shapefit.solver.rigs.tied import largest_tied
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.solver.splitting import solve_lud
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import outer, rig_problem
 
 
-def centred(t):
+def centered(t):
     return t - t.mean(axis=0)
 
 
@@ -54,7 +57,7 @@ def test_groups_with_fixed_nodes_become_one_whole_frames_with_them():
     np.testing.assert_array_equal(joined.group_of, [0, 0, 0, 0, 1])
     # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own centre.
     expected = np.array([[5.0, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, 0]])
-    np.testing.assert_allclose(centred(joined.offsets[:4]), centred(expected), atol=1e-14)
+    np.testing.assert_allclose(centered(joined.offsets[:4]), centered(expected), atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -98,14 +101,12 @@ def test_the_reduced_factor_and_its_systems_solve_the_matrix_written_out(metric)
     factor.refactor(blocks)
     g = adjoint(rng.normal(size=v.shape), edges, n)
     x = np.linalg.pinv(matrix) @ (expand.T @ g.ravel())
-    np.testing.assert_allclose(centred(factor.solve(g)), centred((expand @ x).reshape(-1, 3)), atol=1e-10)
+    np.testing.assert_allclose(centered(factor.solve(g)), centered((expand @ x).reshape(-1, 3)), atol=1e-10)
     # Of one pinned pair, tau v v^T is taken away again.
     tau, pinned = 2.5, 4
-    lifted = blocks.copy()
-    lifted[pinned] += tau * np.outer(v[pinned], v[pinned])
     c = unit.reduce(scale_functional(between))
     i, j = edges[pinned]
-    system = factor_pinned(factor, lifted, c, ((int(i), int(j)), v[pinned]), tau)
+    system = factor_pinned(factor, blocks.copy(), c, Pin(pinned, edges[pinned], v[pinned], tau))
     right = unit.reduce(g)
     multiplier, x = system.solve(right, 0.7)
     np.testing.assert_allclose(matrix @ x, multiplier * c + right, atol=1e-9)
@@ -137,7 +138,7 @@ def test_exact_directions_give_the_metric_shape_in_spite_of_a_fifth_wrong():
     assert result.unique
     assert apart < 1e-12
     # Certified to 1e-8 in an objective of 0.1; errors are of that order.
-    np.testing.assert_allclose(centred(result.locations) / x[-1], centred(t), atol=1e-6)
+    np.testing.assert_allclose(centered(result.locations) / x[-1], centered(t), atol=1e-6)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.05])
@@ -147,11 +148,11 @@ def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
     locations, dual, _ = solve_conic(outer(graph, groups)[0], 1e-9, 200, groups)
     every = np.zeros_like(graph.directions)
     every[groups.joins(graph.edges)] = dual
-    reference = certify_groups(graph, groups, centred(locations), every)
+    reference = certify_groups(graph, groups, centered(locations), every)
     assert reference.gap < 1e-9  # so the two optima agree to the sum of both gaps
     assert result.objective == pytest.approx(reference.objective, abs=1e-8)
     # The objective is sharp here: locations agree to a few times its error.
-    np.testing.assert_allclose(result.locations, centred(locations), atol=1e-6)
+    np.testing.assert_allclose(result.locations, centered(locations), atol=1e-6)
 
 
 def test_groups_of_one_node_are_the_plain_program_and_s_stays_zero():
@@ -322,8 +323,8 @@ def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():
     locations = lud_over_groups(between, groups)
     x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
-    errors = np.linalg.norm(locations / x[-1] - centred(t), axis=1)
-    assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centred(t), axis=1))
+    errors = np.linalg.norm(locations / x[-1] - centered(t), axis=1)
+    assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centered(t), axis=1))
 
 
 def test_lud_over_single_nodes_has_the_optimum_of_lud():
@@ -344,7 +345,7 @@ def test_the_placement_has_the_errors_that_it_states():
     for seed in range(3):
         graph, groups, t = rig_problem(20 + seed, frames=20, noise=noise, share=0.3)
         placed = place(MeasuredGraph(graph, groups=groups))
-        errors.append(centred(placed.locations / placed.unit) - centred(t))
+        errors.append(centered(placed.locations / placed.unit) - centered(t))
         stated.append(placed.assessment.sigmas / placed.unit)
         assert placed.refined.is_refined
         assert placed.assessment.trust.min() > 0.9

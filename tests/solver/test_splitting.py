@@ -10,15 +10,7 @@ from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.program import adjoint, along, differences, objective, scale_functional
-from sfm_shapefit.solver.splitting import (
-    IterativeSolver,
-    Stop,
-    engine,
-    laplacian_factor,
-    linear,
-    solve_admm,
-    solve_lud,
-)
+from sfm_shapefit.solver.splitting import engine, linear
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import (
     ALONG,
@@ -29,8 +21,14 @@ from sfm_shapefit.solver.splitting.edges import (
     EdgePasses,
     edge_data,
 )
-from sfm_shapefit.solver.splitting.engine import Iteration
-from sfm_shapefit.solver.splitting.linear import predict_factor
+from sfm_shapefit.solver.splitting.engine import Iteration, Stop
+from sfm_shapefit.solver.splitting.linear import (
+    IterativeSolver,
+    Resources,
+    laplacian_factor,
+    predict_factor,
+)
+from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
 from sfm_shapefit.synthetic import (
     box_graph_problem,
@@ -40,7 +38,7 @@ from sfm_shapefit.synthetic import (
 )
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
-from tests.problems import shape
+from tests.problems import shape, solve_admm
 
 
 def view_graph(edges, t, *, sigma, q, seed, weights=None):
@@ -152,20 +150,23 @@ def test_two_threads_give_the_bits_of_one(sigma):
     edges, t = geo(1500, 40, 2)
     graph = view_graph(edges, t, sigma=sigma, q=0.2, seed=2)
     assert graph.num_edges > 20_000  # enough for several chunks of edges
-    one, two = (solve_admm(graph, 1e-4, 30, threads=k) for k in (1, 2))
+    one, two = (solve_admm(graph, 1e-4, 30, Resources(k)) for k in (1, 2))
     assert np.array_equal(one.locations, two.locations)
     assert np.array_equal(one.dual, two.dual)
-    lud_one, lud_two = (solve_lud(graph, 10, certified=False, threads=k) for k in (1, 2))
+    lud_one, lud_two = (solve_lud(graph, 10, certified=False, resources=Resources(k)) for k in (1, 2))
     assert np.array_equal(lud_one.locations, lud_two.locations)
 
 
 def test_a_factor_that_would_not_fit_is_replaced_by_conjugate_gradients_with_the_same_answer():
     edges, t = comm(600, 40, 1)
     graph = view_graph(edges, t, sigma=0.01, q=0.2, seed=1)
-    iterative = laplacian_factor(graph, memory_bytes=1000)
+    iterative = laplacian_factor(graph, Resources(memory_bytes=1000))
     assert isinstance(iterative, IterativeSolver)
     assert not isinstance(laplacian_factor(graph), IterativeSolver)
-    direct, inexact = solve_admm(graph, 1e-7, 1000), solve_admm(graph, 1e-7, 1000, iterative)
+    direct, inexact = (
+        solve_admm(graph, 1e-7, 1000),
+        solve_admm(graph, 1e-7, 1000, Resources(factor=iterative)),
+    )
     assert inexact.stop is Stop.ACCURATE
     assert objective(graph, inexact.locations) == pytest.approx(objective(graph, direct.locations), rel=1e-6)
 
@@ -183,7 +184,7 @@ class _Useless:
 def test_solves_that_are_too_inexact_are_reported_as_a_stall():
     edges, t = seq(200, 12, 1)
     graph = view_graph(edges, t, sigma=0.01, q=0.1, seed=1)
-    result = solve_admm(graph, 1e-8, 2000, _Useless())
+    result = solve_admm(graph, 1e-8, 2000, Resources(factor=_Useless()))
     assert result.stop is Stop.STALLED
     assert "allow more memory" in result.stop.value
 
@@ -347,7 +348,7 @@ def test_slow_communities_are_freed_by_smaller_penalties_late():
     problem = community_graph_problem(3000, 67.0, sigma=0.01, q=0.2, seed=1)
     graph = problem.view_graph
     factor, objectives = laplacian_factor(graph), []
-    solve_admm(graph, 1e-9, 300, factor, on_iteration=lambda info: objectives.append(info.objective))
+    solve_admm(graph, 1e-9, 300, Resources(factor=factor), lambda info: objectives.append(info.objective))
     # 117 iterations to 1e-5 with the same balance at every renewal
     assert objectives[110] <= min(objectives) * (1.0 + 1e-5)
 
@@ -434,6 +435,6 @@ def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
 def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
     problem = family(6000, 20.0, sigma=0.01, q=0.1, seed=1)
     graph = problem.view_graph
-    one, two = (solve_hybrid(graph, 1e-4, 200, threads=threads) for threads in (1, 2))
+    one, two = (solve_hybrid(graph, 1e-4, 200, Resources(threads)) for threads in (1, 2))
     np.testing.assert_array_equal(one.locations, two.locations)
     np.testing.assert_array_equal(one.certificate.dual, two.certificate.dual)

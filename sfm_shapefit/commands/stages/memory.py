@@ -15,10 +15,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.laplacian.cholesky import analyse
+from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.options import NO_FACTOR
@@ -206,11 +206,11 @@ def _plan_factor(measured: MeasuredGraph) -> SymbolicFactor | None:
     edges = np.ascontiguousarray(measured.graph.edges)
     if measured.groups is not None:
         ends = measured.groups.group_of[edges[measured.groups.joins(edges)]]
-        return analyse(measured.groups.num_groups, np.ascontiguousarray(ends))
+        return analyze(measured.groups.num_groups, np.ascontiguousarray(ends))
     if predict_factor(measured.graph).tree is None:
         return None
-    neighbours = adjacency(measured.graph.num_nodes, edges)
-    return plan_factorisation(neighbours, edges, best_order(neighbours))
+    neighbors = adjacency(measured.graph.num_nodes, edges)
+    return plan_factorization(neighbors, edges, best_order(neighbors))
 
 
 def _peaks(work: Workload, economy: Economy) -> dict[str, float]:

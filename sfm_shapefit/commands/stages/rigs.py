@@ -21,8 +21,8 @@ from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
-from sfm_shapefit.solver.rigs import largest_tied
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # Extent of the fixed centres, of their distance from the origin, that counts as none.
 _COINCIDENT = 1e-9

@@ -23,17 +23,16 @@ What makes it fast and safe:
 - *Two duals.* y+ fulfils the equality, and divided by its excess max ||y+_e|| / w_e the ball too; the
   best bound proven so is kept. But the excess is that of one pair, and scaling sets all others back. So the
   steps go on from y+ clipped to its balls pair by pair: they need no equality, the next y+ fulfils it anew.
-  With noise that saves a quarter of the factorizations. In the plane, where the program is nearly linear,
-  clipped duals can make M singular: after a cycle that leaves more than half of the gap the steps go on from
-  the feasible dual, moved towards y+ as far as the ball allows or replaced by y+ / excess, whichever has
-  the larger lambda.
+  With noise that saves a quarter of the factorizations. In the plane clipped duals can make M singular: after
+  a cycle that leaves more than half of the gap the steps go on from the feasible dual, moved towards y+ as
+  far as the ball allows or replaced by y+ / excess, whichever has the larger lambda.
 - *A start near the optimum.* On dense graphs with many wrong directions a few reweighted least-squares
-  problems, solved roughly by passes over the edges (`approach`), save the first factorization and one or two
-  more. On all others the steps begin at the least-squares locations, whose residuals are a feasible dual.
-- *Steps with an old matrix.* After a step the conditions are evaluated anew and solved again with the
-  factor in hand: g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, rho' and S from the factorization. That costs a
-  few passes over the edges. It goes on while the last step gained more per unit of work than the
-  cycle since the factorization did on average, and nearly halves the number of factorizations.
+  problems (`irls_start`) save the first factorization and one or two more. On all others the steps begin at
+  the least-squares locations, whose residuals are a feasible dual.
+- *Steps with an old matrix.* After a step the conditions are evaluated anew and solved again with the factor
+  in hand: g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, rho' and S from the factorization. It goes on while the
+  last step gained more per unit of work than the cycle since the factorization did on average, and nearly
+  halves the number of factorizations.
 
 Source: Andersen, Christiansen, Conn, Overton, "An efficient primal-dual interior-point method for
 minimizing a sum of Euclidean norms", SIAM J. Sci. Comput. 22 (2000), for the symmetrized step. Hintermueller,

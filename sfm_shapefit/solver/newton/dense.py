@@ -23,7 +23,7 @@ from sfm_shapefit.solver.newton.steps import (
     extend_step,
     is_cancelled,
     linearize,
-    measure_from_python,
+    measure_plain,
     pays,
     scalars,
     set_gradient,
@@ -73,19 +73,9 @@ class DenseFactor(NamedTuple):
 def solve_newton_dense(
     graph: ViewGraph, tol: float, max_iterations: int, on_iteration: OnIteration | None = None
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a dense Cholesky factor of nd x nd; for n up to about a thousand.
+    """Solve the program with a dense Cholesky factor of nd x nd; as `solve_newton_sparse` otherwise.
 
-    Args:
-        graph: a connected, parallel-rigid view graph whose c is not 0.
-        tol: the gap wanted, in units of the objective.
-        max_iterations: limit of factorizations.
-        on_iteration: called after every factorization and its steps.
-
-    Returns:
-        locations (n, d), the dual (m, d), and the number of factorizations.
-
-    Raises:
-        UnsolvableError: if the directions do not determine any locations.
+    For n up to about a thousand.
     """
     problem, iterate, linearization, step = allocate(graph)
     n, d = problem.c.shape
@@ -94,7 +84,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure_from_python(problem, iterate)
+        progress = Progress(*measure_plain(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:

@@ -6,11 +6,10 @@ residuals of the one before,
     min  sum_e s_e ||r_e||^2    subject to    <c, T> = kappa,        rho_e = sqrt(||r_e||^2 + (eps R)^2)
 
 where R is the mean residual and eps shrinks. The constraint is kept by projecting the gradient along the
-preconditioner, the weighted degrees of the cameras. On a graph without bottlenecks the gradients
-converge at a rate that does not depend on n: twenty passes over the edges lead nearer to the optimum than the
-factorization of M for the plain least-squares locations and a Newton cycle from there. On the graphs of most
-real scenes they do not converge, or nearly exact data make the least-squares locations the better start; both
-show in what the first steps leave of the energy.
+preconditioner, the weighted degrees of the cameras. On a graph without bottlenecks twenty passes over the
+edges lead nearer to the optimum than the factorization of M for the least-squares locations and a Newton
+cycle from there. On the graphs of most real scenes the gradients do not converge, or nearly exact data make
+the least-squares locations the better start; both show in what the first steps leave of the energy.
 
 Source: Daubechies, DeVore, Fornasier, Gunturk, "Iteratively reweighted least squares minimization for sparse
 recovery", Comm. Pure Appl. Math. 63 (2010), also for the shrinking eps.

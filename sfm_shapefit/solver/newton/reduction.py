@@ -1,6 +1,6 @@
 """The unknowns x of a Newton step, t = A x, and the factored matrix of their equations.
 
-A is the identity (`NodeUnknowns`), or it places the nodes of rigid groups
+A is the identity (`Reduction` itself), or it places the nodes of rigid groups
 (`sfm_shapefit.solver.rigs.reduced.ReducedFactor`). Along the solution itself the matrix tends to singular
 whatever the data, for the objective is homogeneous. So one pair is pinned: with M = A^T D^T S D A and
 q = A^T D^T of v_e at that pair,
@@ -12,59 +12,32 @@ lambda and sigma = tau <q, x> solve the two equations <c, x> = what is wanted, <
 Translations are taken away by grounding one node.
 """
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
 
 
-class Reduction(Protocol):
-    """The map A from unknowns to locations, and memory for a factor of A^T D^T S D A."""
+class Reduction:
+    """The map A from unknowns to locations, and memory for a factor of A^T D^T S D A; here A is the identity.
 
-    @property
-    def factor(self) -> CholeskyFactor:
-        """The sparse factor behind it, which says what a factorization and a solve cost."""
+    A reduction to fewer unknowns overrides all methods.
+    """
 
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
+    def __init__(self, factor: CholeskyFactor) -> None:
+        """Keep the sparse factor behind it, which says what a factorization and a solve cost."""
+        self.factor = factor
 
     def expand(self, x: FloatArray, /) -> FloatArray:
         """Return A x, (n, d)."""
-
-    def reduce(self, g: FloatArray, /) -> FloatArray:
-        """Return A^T g for g (n, d), in the shape of x."""
-
-    def refactor(self, blocks: FloatArray, /) -> None:
-        """Factor the matrix of the blocks S_e, (m, d, d), or raise UnsolvableError."""
-
-    def solve_reduced(self, right: FloatArray, /) -> FloatArray:
-        """Return x for a right-hand side in the shape of x."""
-
-    def solve_two_reduced(self, first: FloatArray, second: FloatArray, /) -> tuple[FloatArray, FloatArray]:
-        """Return x for two right-hand sides."""
-
-
-class NodeUnknowns:
-    """Every node moves freely: x are the locations."""
-
-    def __init__(self, factor: CholeskyFactor) -> None:
-        self.factor = factor
-
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
-        return self.factor.symbolic.num_nodes
-
-    def expand(self, x: FloatArray, /) -> FloatArray:
-        """Return x."""
         return x
 
     def reduce(self, g: FloatArray, /) -> FloatArray:
-        """Return g."""
+        """Return A^T g for g (n, d), in the shape of x."""
         return g
 
     def refactor(self, blocks: FloatArray, /) -> None:
@@ -72,7 +45,7 @@ class NodeUnknowns:
         self.factor.refactor(blocks)
 
     def solve_reduced(self, right: FloatArray, /) -> FloatArray:
-        """Return x (n, d) for a right-hand side of that shape."""
+        """Return x for a right-hand side in the shape of x."""
         return self.factor.solve(right)
 
     def solve_two_reduced(self, first: FloatArray, second: FloatArray, /) -> tuple[FloatArray, FloatArray]:
@@ -107,33 +80,37 @@ class System(NamedTuple):
         return multiplier, np.asarray(z - multiplier * self.a)
 
 
-def factor_pinned(
-    reduction: Reduction,
-    blocks: FloatArray,
-    c: FloatArray,
-    pin: tuple[tuple[int, int], FloatArray],
-    stiffness: float,
-) -> System | None:
+class Pin(NamedTuple):
+    """The pair that is pinned."""
+
+    pair: int
+    nodes: npt.NDArray[np.integer[Any]]
+    """(2,) i and j."""
+    v: FloatArray
+    stiffness: float
+    """tau."""
+
+
+def factor_pinned(reduction: Reduction, blocks: FloatArray, c: FloatArray, pin: Pin) -> System | None:
     """Factor the matrix of the blocks with one pair pinned; None if it is not positive definite.
 
     Args:
         reduction: whose factor is overwritten.
-        blocks: (m, d, d) S_e, with tau v v^T added to the pinned pair's.
+        blocks: (m, d, d) S_e; tau v v^T is added to the pinned pair's.
         c: A^T D^T (w v), in the shape of x.
-        pin: the nodes of the pinned pair, and its v.
-        stiffness: tau.
+        pin: which pair.
     """
-    (i, j), v = pin
-    at_nodes = np.zeros((reduction.num_nodes, len(v)))
-    at_nodes[i], at_nodes[j] = v, -v
+    at_nodes = np.zeros_like(reduction.expand(c))
+    at_nodes[pin.nodes] = pin.v, -pin.v
     q = reduction.reduce(at_nodes)
+    blocks[pin.pair] += pin.stiffness * np.outer(pin.v, pin.v)
     try:
         reduction.refactor(blocks)
     except UnsolvableError:
         return None
     a, p = reduction.solve_two_reduced(c, q)
     rows = np.stack([c.ravel(), q.ravel()])
-    matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / stiffness])
+    matrix = rows @ np.stack([a.ravel(), p.ravel()], axis=1) - np.diag([0.0, 1.0 / pin.stiffness])
     if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 0.0):
         return None
     return System(reduction, a, p, rows, matrix)

@@ -17,35 +17,10 @@ from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
-from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorisation
-from sfm_shapefit.solver.newton.reduction import NodeUnknowns, Reduction, System, factor_pinned
-from sfm_shapefit.solver.newton.steps import (
-    EDGE_WORK,
-    REFINEMENTS,
-    SOLVE_WORK,
-    STALL,
-    STEPS_PER_FACTOR,
-    Iterate,
-    Linearization,
-    Problem,
-    Progress,
-    Step,
-    allocate,
-    allowed_violation,
-    answer,
-    close_cycle_from_python,
-    dot,
-    extend_step,
-    is_cancelled,
-    linearize,
-    measure_from_python,
-    pays,
-    set_gradient,
-    set_residuals,
-    smoothing,
-    start_from,
-    take_step_from_python,
-)
+from sfm_shapefit.laplacian.symbolic import EliminationTree, SymbolicFactor, plan_factorization
+from sfm_shapefit.solver.newton import steps
+from sfm_shapefit.solver.newton.reduction import Pin, Reduction, System, factor_pinned
+from sfm_shapefit.solver.newton.steps import Iterate, Linearization, Problem, Progress, Work
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import along, differences
 from sfm_shapefit.viewgraph import ViewGraph
@@ -61,10 +36,9 @@ def solve_newton_sparse(
     on_iteration: OnIteration | None = None,
     *,
     start: tuple[FloatArray, FloatArray] | None = None,
-    plan: SymbolicFactor | None = None,
-    tree: EliminationTree | None = None,
+    plan: SymbolicFactor | EliminationTree | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program with a sparse Cholesky factor in d x d blocks; as `solve_newton_dense` otherwise.
+    """Solve the program with a sparse Cholesky factor in d x d blocks.
 
     Args:
         graph: a connected, parallel-rigid view graph whose c is not 0.
@@ -73,8 +47,7 @@ def solve_newton_sparse(
         on_iteration: called after every factorization and its steps.
         start: locations (n, d) with L(T) > 0 and a feasible dual (m, d), such as that of a `Certificate`; the
             steps then begin with the smoothing that their gap allows. The closer, the fewer factorizations.
-        plan: of the factorization of the graph's Laplacian, if it is there already.
-        tree: or at least its order of elimination.
+        plan: of the factorization of the graph's Laplacian, or its order of elimination, if there already.
 
     Returns:
         locations (n, d), the dual (m, d), and the number of factorizations.
@@ -82,11 +55,11 @@ def solve_newton_sparse(
     Raises:
         UnsolvableError: if the directions do not determine any locations.
     """
-    if plan is None:
+    if not isinstance(plan, SymbolicFactor):
         neighbors = adjacency(graph.num_nodes, graph.edges)
-        plan = plan_factorisation(neighbors, graph.edges, tree or best_order(neighbors))
-    nodes = NodeUnknowns(allocate_factor(plan, graph.dimension))
-    return solve_newton_reduced(graph, nodes, tol, max_iterations, on_iteration, start)
+        plan = plan_factorization(neighbors, graph.edges, plan or best_order(neighbors))
+    reduction = Reduction(allocate_factor(plan, graph.dimension))
+    return solve_newton_reduced(graph, reduction, tol, max_iterations, on_iteration, start)
 
 
 def solve_newton_reduced(
@@ -97,105 +70,87 @@ def solve_newton_reduced(
     on_iteration: OnIteration | None = None,
     start: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray, int]:
-    """Solve the program over the unknowns of a reduction; see `solve_newton_sparse`.
+    """Solve the program over the unknowns of a reduction, which the pairs determine.
 
-    Args:
-        graph: a connected view graph whose pairs determine the unknowns.
-        reduction: of its locations, with memory for the factor.
-        tol, max_iterations, on_iteration, start: as in `solve_newton_sparse`.
+    All else is as in `solve_newton_sparse`.
     """
-    problem, iterate, linearization, step = allocate(graph)
+    work = steps.allocate(graph)
+    problem, iterate = work.problem, work.iterate
     if start is None:
-        system = _factorize(problem, linearization, reduction, int(np.argmax(problem.w)))
+        system = _factorize(problem, work.linearization, reduction, int(np.argmax(problem.w)))
         first = None if system is None else system.solve(0.0 * reduction.reduce(problem.c), 1.0)[1]
-        if first is None or not start_from(problem, reduction.expand(first), iterate):
+        if first is None or not steps.start_from(problem, reduction.expand(first), iterate):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = measure_from_python(problem, iterate)
     else:
-        progress = _begin_at(problem, *start, iterate)
-    count, stalled = 0, 0
-    while progress.gap > tol and count < max_iterations and stalled < STALL:
+        _begin_at(problem, *start, iterate)
+    progress, count, stalled = Progress(*steps.measure_plain(problem, iterate)), 0, 0
+    while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
-        progress = _cycle(problem, iterate, linearization, reduction, step, progress, tol)
+        progress = _cycle(work, reduction, progress, tol)
         stalled = 0 if progress.gap < 0.9 * before else stalled + 1
         count += 1
-        if is_cancelled(on_iteration, count, progress):
+        if steps.is_cancelled(on_iteration, count, progress):
             break
-    return *answer(problem, iterate, progress, tol), count
+    return *steps.answer(problem, iterate, progress, tol), count
 
 
-def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate: Iterate) -> Progress:
+def _begin_at(problem: Problem, locations: FloatArray, dual: FloatArray, iterate: Iterate) -> None:
     """Take over locations and a feasible dual."""
-    centred = locations - locations.mean(axis=0)
-    iterate.t[:] = (problem.kappa / dot(problem.c, centred)) * centred
-    set_residuals(problem, iterate.t, iterate.r)
+    centered = locations - locations.mean(axis=0)
+    iterate.t[:] = (problem.kappa / steps.dot(problem.c, centered)) * centered
+    steps.set_residuals(problem, iterate.t, iterate.r)
     iterate.y[:] = iterate.feasible[:] = np.einsum("ekq,ek->eq", problem.basis, dual)
-    return measure_from_python(problem, iterate)
 
 
-def _cycle(
-    problem: Problem,
-    iterate: Iterate,
-    linearization: Linearization,
-    reduction: Reduction,
-    step: Step,
-    progress: Progress,
-    tol: float,
-) -> Progress:
+def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> Progress:
     """Factor once, then step with that factor while it pays."""
+    problem, iterate, linearization, step = work
     first = progress.gap
-    mu = smoothing(progress, progress.mu)
-    set_residuals(problem, iterate.t, iterate.r)
-    linearize(problem, iterate, mu, linearization)
+    mu = steps.smoothing(progress, progress.mu)
+    steps.set_residuals(problem, iterate.t, iterate.r)
+    steps.linearize(problem, iterate, mu, linearization)
     ends = problem.edges.astype(np.int64)
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorize(problem, linearization, reduction, longest)
     if system is None:
-        return close_cycle_from_python(iterate, progress, mu, first)
-    factor, edge_work = reduction.factor, EDGE_WORK * len(problem.w)
-    step_work = edge_work + SOLVE_WORK * factor.panels.size
-    work = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
-    for _ in range(STEPS_PER_FACTOR):
+        return Progress(*steps.close_cycle_plain(iterate, progress, mu, first))
+    factor, edge_work = reduction.factor, steps.EDGE_WORK * len(problem.w)
+    step_work = edge_work + steps.SOLVE_WORK * factor.panels.size
+    done = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
+    for _ in range(steps.STEPS_PER_FACTOR):
         previous = progress.gap
-        mu = smoothing(progress, mu)
-        target, exact = _propose(problem, iterate, linearization, system, step, mu, previous)
+        mu = steps.smoothing(progress, mu)
+        target, exact = _propose(work, system, mu, previous)
         if not exact:
             break
-        progress = take_step_from_python(problem, iterate, step, mu, progress, target)
-        work += step_work
-        if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
+        progress = Progress(*steps.take_step_plain(problem, iterate, step, mu, progress, target))
+        done += step_work
+        if progress.gap <= tol or not steps.pays(first, previous, progress.gap, done, step_work):
             break
-    return close_cycle_from_python(iterate, progress, progress.mu, first)
+    return Progress(*steps.close_cycle_plain(iterate, progress, progress.mu, first))
 
 
-def _propose(
-    problem: Problem,
-    iterate: Iterate,
-    linearization: Linearization,
-    system: System,
-    step: Step,
-    mu: float,
-    gap: float,
-) -> tuple[float, bool]:
+def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:
     """Solve for the step with the factor in hand, refined until A^T D^T y+ = lambda+ A^T c.
 
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
+    problem, iterate, linearization, step = work
     reduction = system.reduction
     c = reduction.reduce(problem.c)
-    allowed = allowed_violation(problem, gap)
-    set_gradient(problem, iterate, linearization, mu, step)
-    drift = problem.kappa - dot(problem.c, iterate.t)
+    allowed = steps.allowed_violation(problem, gap)
+    steps.set_gradient(problem, iterate, linearization, mu, step)
+    drift = problem.kappa - steps.dot(problem.c, iterate.t)
     multiplier, dx = system.solve(-reduction.reduce(step.nodes), drift)
-    extend_step(problem, linearization, reduction.expand(dx), step)
-    for _ in range(REFINEMENTS):
+    steps.extend_step(problem, linearization, reduction.expand(dx), step)
+    for _ in range(steps.REFINEMENTS):
         violation = multiplier * c - reduction.reduce(step.nodes)
         if np.abs(violation).max() <= allowed:
             return multiplier, True
-        shift, dx = system.solve(violation, drift - dot(problem.c, step.t))
+        shift, dx = system.solve(violation, drift - steps.dot(problem.c, step.t))
         multiplier += shift
-        extend_step(problem, linearization, reduction.expand(dx), step)
+        steps.extend_step(problem, linearization, reduction.expand(dx), step)
     return multiplier, bool(np.abs(multiplier * c - reduction.reduce(step.nodes)).max() <= allowed)
 
 
@@ -204,14 +159,12 @@ def _factorize(
 ) -> System | None:
     """Factor M' of the unknowns, with more ridge if it is not positive definite; None if it never is."""
     m, d = problem.v.shape
-    v, (i, j) = problem.v[pinned], problem.edges[pinned].tolist()
-    blocks = np.empty((m, d, d))
-    c = reduction.reduce(problem.c)
+    blocks, c = np.empty((m, d, d)), reduction.reduce(problem.c)
     stiffness = float(np.mean(problem.w * linearization.inverse))
+    pin = Pin(pinned, problem.edges[pinned], problem.v[pinned], stiffness)
     for ridge in _RIDGES:
         _set_blocks(problem, linearization, ridge, blocks)
-        blocks[pinned] += stiffness * np.outer(v, v)
-        system = factor_pinned(reduction, blocks, c, ((i, j), v), stiffness)
+        system = factor_pinned(reduction, blocks, c, pin)
         if system is not None:
             return system
     return None

@@ -14,7 +14,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -28,8 +28,8 @@ LEAST_MU = 1e-8
 REFINEMENTS = 3
 # After so many factorizations without progress more will not help.
 STALL = 6
-# A step passes over one edge in the time of so many operations of a factorization, and over one entry of the
-# factor in that of so many: memory decides there, not arithmetic.
+# A step passes over one edge, and over one entry of the factor, in the time of so many operations of a
+# factorization: memory decides there, not arithmetic.
 EDGE_WORK, SOLVE_WORK = 500.0, 5.0
 
 # The allowed violation of D^T y = lambda c, per mean degree: per squared gap, and in any case.
@@ -119,7 +119,16 @@ class Progress(NamedTuple):
     """Whether the next steps go on from the clipped dual."""
 
 
-def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Linearization, Step]:
+class Work(NamedTuple):
+    """The problem as arrays, and room for the iteration."""
+
+    problem: Problem
+    iterate: Iterate
+    linearization: Linearization
+    step: Step
+
+
+def allocate(graph: ViewGraph) -> Work:
     """Return the problem as arrays, and room for the iteration.
 
     Raises:
@@ -127,38 +136,27 @@ def allocate(graph: ViewGraph) -> tuple[Problem, Iterate, Linearization, Step]:
     """
     n, m, d = graph.num_nodes, graph.num_edges, graph.dimension
 
-    def nodes() -> FloatArray:
+    def at_nodes() -> FloatArray:
         return np.empty((n, d))
 
-    def edges() -> FloatArray:
+    def at_edges() -> FloatArray:
         return np.empty((m, d - 1))
 
-    basis, tilt = np.empty((m, d, d - 1)), np.empty(m)
-    linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), nodes())
-    set_up(graph.directions, graph.weights, basis, tilt, linearization.s)
-    problem = Problem(
-        graph.edges.astype(np.uint32),
-        graph.directions,
-        basis,
-        tilt,
-        graph.weights,
-        scale_functional(graph),
-        float(graph.weights.sum()),
-        tuple(range(d)),
-        tuple(range(d - 1)),
-    )
+    v, w, basis, tilt = graph.directions, graph.weights, np.empty((m, d, d - 1)), np.empty(m)
+    linearization = Linearization(np.empty((m, d - 1, d - 1)), np.ones(m), at_nodes())
+    set_up(v, w, basis, tilt, linearization.s)
+    edges, c, kappa, axes = graph.edges.astype(np.uint32), scale_functional(graph), float(w.sum()), range(d)
+    problem = Problem(edges, v, basis, tilt, w, c, kappa, tuple(axes), tuple(axes[:-1]))
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-    step = Step(nodes(), edges(), edges(), nodes(), edges(), np.empty(m), np.empty(m))
-    return problem, Iterate(nodes(), edges(), edges(), edges()), linearization, step
+    step = Step(at_nodes(), at_edges(), at_edges(), at_nodes(), at_edges(), np.empty(m), np.empty(m))
+    return Work(problem, Iterate(at_nodes(), at_edges(), at_edges(), at_edges()), linearization, step)
 
 
 def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Progress) -> bool:
     """Tell the callback where the solver stands; return whether it asks to stop."""
-    if on_iteration is None:
-        return False
     bound = progress.objective - progress.gap
-    return on_iteration(IterationInfo(iteration, progress.objective, bound)) is False
+    return asks_to_stop(on_iteration, IterationInfo(iteration, progress.objective, bound))
 
 
 @kernel()
@@ -487,8 +485,7 @@ def dot(x: Any, y: Any) -> float:
 #
 # What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while
 # the kernel ran would be raised there, and end the process by a segmentation fault: kernels that Python
-# calls return plain tuples. So each operation has three names: the inlined kernel, the kernel around it that
-# returns plain numbers, and the function that makes a NamedTuple of these.
+# calls return plain tuples, of which `Progress(*...)` makes the scalars again.
 
 Scalars = tuple[float, float, float, float, bool]
 
@@ -500,34 +497,20 @@ def scalars(progress: Any) -> Scalars:
 
 
 @kernel()
-def _measure_plain(problem: Any, iterate: Any) -> Scalars:
+def measure_plain(problem: Any, iterate: Any) -> Scalars:
+    """Return the scalars at the iterate; see `measure`."""
     return scalars(measure(problem, iterate))
 
 
 @kernel()
-def _take_step_plain(
+def take_step_plain(
     problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float
 ) -> Scalars:
+    """Take a step and return the scalars after it; see `take_step`."""
     return scalars(take_step(problem, iterate, step, mu, progress, target))
 
 
 @kernel()
-def _close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
-    return scalars(close_cycle(iterate, progress, mu, first))
-
-
-def measure_from_python(problem: Problem, iterate: Iterate) -> Progress:
-    """Return the scalars at the iterate; see `measure`."""
-    return Progress(*_measure_plain(problem, iterate))
-
-
-def take_step_from_python(
-    problem: Problem, iterate: Iterate, step: Step, mu: float, progress: Progress, target: float
-) -> Progress:
-    """Take a step and return the scalars after it; see `take_step`."""
-    return Progress(*_take_step_plain(problem, iterate, step, mu, progress, target))
-
-
-def close_cycle_from_python(iterate: Iterate, progress: Progress, mu: float, first: float) -> Progress:
+def close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
     """Return the scalars after a cycle; see `close_cycle`."""
-    return Progress(*_close_cycle_plain(iterate, progress, mu, first))
+    return scalars(close_cycle(iterate, progress, mu, first))

@@ -29,11 +29,3 @@ is what makes <q, h> = 0 for the pinned pair's row q (see `reduced`): the matrix
 A pair inside a group says nothing of f and s; it would only shift the objective by a multiple of s. Such
 pairs take no part, and have dual 0.
 """
-
-from sfm_shapefit.solver.rigs.certificate import certify_groups
-from sfm_shapefit.solver.rigs.lud import lud_over_groups
-from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.solver.rigs.solve import solve_groups
-from sfm_shapefit.solver.rigs.tied import largest_tied
-
-__all__ = ["ReducedFactor", "certify_groups", "largest_tied", "lud_over_groups", "solve_groups"]

@@ -8,8 +8,8 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.solver.certificate import Certificate
-from sfm_shapefit.solver.newton.reduction import System, factor_pinned
+from sfm_shapefit.solver.certificate import REGULAR, REPAIRS, RESIDUAL_FLOOR, STRICT, Certificate
+from sfm_shapefit.solver.newton.reduction import Pin, factor_pinned
 from sfm_shapefit.solver.program import across, adjoint, along, differences, objective, scale_functional
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
@@ -19,14 +19,6 @@ from sfm_shapefit.viewgraph import ViewGraph
 _OFF_GROUPS = 1e-9
 # An equality residual that needs no repair.
 _EXACT = 1e-12
-# Each repair shrinks the equality residual to the rounding of the previous one.
-_REPAIRS = 4
-# The least residual, relative to the mean one, that the metric of the repair takes seriously.
-_RESIDUAL_FLOOR = 0.1
-# A pair counts as held by its fit if ||y_e|| < (1 - this) w_e.
-_STRICT = 1e-3
-# A matrix counts as regular if its least pivot, relative to its diagonal entry, is above this.
-_REGULAR = 1e-9
 
 
 def certify_groups(
@@ -68,7 +60,7 @@ def certify_groups(
     degree = float(np.bincount(ends.ravel(), weights=np.repeat(w, 2)).max())
 
     y = across(np.ascontiguousarray(dual[outer]), v)
-    y, total = _balanced(between, unit, locations, y, c, _EXACT * degree)
+    y, total = _balance(between, unit, locations, y, _EXACT * degree)
     scale = 1.0 / max(1.0, float(np.max(np.linalg.norm(y, axis=1) / w)))
     y, total = scale * y, scale * total
     bound = float(total @ c / (c @ c))
@@ -108,21 +100,26 @@ def _largest(violation: FloatArray, dimension: int) -> float:
     return float(max(at_groups.max(), abs(violation[-1])))
 
 
-def _balanced(
-    graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray, c: FloatArray, allowed: float
+def _balance(
+    graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray, allowed: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the dual moved to A^T D^T y = lambda A^T c, and A^T D^T y."""
-    n, d = graph.num_nodes, graph.dimension
+    """Return the dual moved to A^T D^T y = lambda A^T c, up to `allowed`, and A^T D^T y."""
+    n, d, c = graph.num_nodes, graph.dimension, groups.reduce(scale_functional(graph))
     total = groups.reduce(adjoint(y, graph.edges, n))
     multiplier = float(total @ c / (c @ c))
     if _largest(total - multiplier * c, d) <= allowed:
         return y, total
-    stiffness = _stiffness(graph, locations)
-    system = _projected_system(graph, groups, locations, stiffness, c)
-    for _ in range(_REPAIRS):
+    stiffness, v = _stiffness(graph, locations), graph.directions
+    blocks = stiffness[:, None, None] * (np.eye(d) - v[:, :, None] * v[:, None, :])
+    longest = _longest(graph, locations)
+    pin = Pin(longest, graph.edges[longest], v[longest], float(np.mean(stiffness)))
+    system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, pin)
+    if system is None:
+        raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
+    for _ in range(REPAIRS):
         multiplier, h = system.balance(total)
-        moved = across(differences(groups.expand(h), graph.edges), graph.directions)
-        y = across(y - stiffness[:, None] * moved, graph.directions)
+        moved = across(differences(groups.expand(h), graph.edges), v)
+        y = across(y - stiffness[:, None] * moved, v)
         total = groups.reduce(adjoint(y, graph.edges, n))
         if _largest(total - multiplier * c, d) <= allowed:
             break
@@ -135,38 +132,27 @@ def _stiffness(graph: ViewGraph, locations: FloatArray) -> FloatArray:
     mean = float(np.average(residuals, weights=graph.weights))
     if not mean > 0.0:
         return graph.weights
-    return np.asarray(graph.weights / np.maximum(residuals / mean, _RESIDUAL_FLOOR))
+    return np.asarray(graph.weights / np.maximum(residuals / mean, RESIDUAL_FLOOR))
 
 
-def _projected_system(
-    graph: ViewGraph, groups: RigidGroups, locations: FloatArray, stiffness: FloatArray, c: FloatArray
-) -> System:
-    """Factor A^T D^T S P D A with its longest pair pinned."""
-    v = graph.directions
-    blocks = stiffness[:, None, None] * (np.eye(graph.dimension) - v[:, :, None] * v[:, None, :])
-    longest = int(np.argmax(along(differences(locations, graph.edges), v)))
-    tau = float(np.mean(stiffness))
-    blocks[longest] += tau * np.outer(v[longest], v[longest])
-    i, j = graph.edges[longest].tolist()
-    system = factor_pinned(ReducedFactor(graph.edges, groups), blocks, c, ((i, j), v[longest]), tau)
-    if system is None:
-        raise UnsolvableError("the dual cannot be repaired: the pairs do not determine the groups")
-    return system
+def _longest(graph: ViewGraph, locations: FloatArray) -> int:
+    """Return the pair whose baseline is the longest along its direction."""
+    return int(np.argmax(along(differences(locations, graph.edges), graph.directions)))
 
 
 def _is_unique(graph: ViewGraph, groups: RigidGroups, locations: FloatArray, y: FloatArray) -> bool:
     """Return whether the feasible dual excludes other optima, up to translation and scale."""
     v, w = graph.directions, graph.weights
     norms = np.linalg.norm(y, axis=1)
-    held: BoolArray = norms < (1.0 - _STRICT) * w
+    held: BoolArray = norms < (1.0 - STRICT) * w
     u = np.where(held[:, None], 0.0, y / np.maximum(norms, 1e-300)[:, None])
     conditions = np.eye(graph.dimension) - v[:, :, None] * v[:, None, :] - u[:, :, None] * u[:, None, :]
     blocks = w[:, None, None] * conditions
-    longest = int(np.argmax(along(differences(locations, graph.edges), v)))
+    longest = _longest(graph, locations)
     blocks[longest] += w[longest] * np.outer(v[longest], v[longest])
     factor = ReducedFactor(graph.edges, groups)
     try:
         factor.refactor(blocks)
     except UnsolvableError:
         return False
-    return factor.smallest_pivot > _REGULAR
+    return factor.smallest_pivot > REGULAR

@@ -1,15 +1,15 @@
 """Rigid groups of cameras: rigs, whose frames are the unknowns, and cameras that must stay where they are.
 
-Camera k belongs to group b(k) and stands at a known offset from its group's centre, in world axes and in one
+Camera k belongs to group b(k) and stands at a known offset from its group's center, in world axes and in one
 unit that all groups share:
 
     t_k = f_b(k) + s o_k
 
-Unknown are the centres f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
-linear in x = (f, s), and dividing by s gives the centres in the unit of the offsets.
+Unknown are the centers f_b of the groups and s, the length of that unit in the scale of t. So t = A x is
+linear in x = (f, s), and dividing by s gives the centers in the unit of the offsets.
 
-    rig            a frame is a group; o_k = R_frame^T (centre of the sensor in the rig), metric
-    fixed cameras  all of them are one group; o_k = their given centres
+    rig            a frame is a group; o_k = R_frame^T (center of the sensor in the rig), metric
+    fixed cameras  all of them are one group; o_k = their given centers
     other camera   a group of its own; o_k = 0
 
 Rotations are known throughout, so a group only moves, it does not turn.
@@ -69,49 +69,47 @@ class RigidGroups:
 
     def expand(self, x: FloatArray) -> FloatArray:
         """Return A x, the locations (n, d) for x = (f, s)."""
-        centres = x[:-1].reshape(-1, self.offsets.shape[1])
-        return np.asarray(centres[self.group_of] + x[-1] * self.offsets)
+        centers = x[:-1].reshape(-1, self.offsets.shape[1])
+        return np.asarray(centers[self.group_of] + x[-1] * self.offsets)
 
     def reduce(self, g: FloatArray) -> FloatArray:
         """Return A^T g for g (n, d): its sum over each group, and its inner product with the offsets."""
-        sums = np.stack(
-            [np.bincount(self.group_of, column, minlength=self.num_groups) for column in g.T], axis=1
+        return np.append(self._sum(g).ravel(), np.vdot(g, self.offsets))
+
+    def _sum(self, values: FloatArray) -> FloatArray:
+        """Return the sum of values (n, d) over each group, (B, d)."""
+        return np.stack(
+            [np.bincount(self.group_of, column, minlength=self.num_groups) for column in values.T], axis=1
         )
-        return np.append(sums.ravel(), np.vdot(g, self.offsets))
 
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
         """Return the x whose A x is nearest to locations (n, d), and its largest distance from them.
 
         s is 0 if every group stands at a single point.
         """
-        centred = self.centred()
-        spread = float(np.sum(centred.offsets**2))
-        sums = np.zeros((self.num_groups, locations.shape[1]))
-        np.add.at(sums, self.group_of, locations)
+        centered = self.center()
+        spread = float(np.sum(centered.offsets**2))
         sizes = np.bincount(self.group_of)[:, None]
-        s = float(np.vdot(centred.offsets, locations)) / spread if spread > 0.0 else 0.0
-        means = np.zeros_like(sums)
-        np.add.at(means, self.group_of, self.offsets)
-        x = np.append(((sums - s * means) / sizes).ravel(), s)
+        s = float(np.vdot(centered.offsets, locations)) / spread if spread > 0.0 else 0.0
+        x = np.append(((self._sum(locations) - s * self._sum(self.offsets)) / sizes).ravel(), s)
         apart = np.linalg.norm(self.expand(x) - locations, axis=1)
         return x, float(apart.max(initial=0.0))
 
-    def centred(self) -> "RigidGroups":
+    def center(self) -> "RigidGroups":
         """Return the same groups with the mean offset of each at 0, and what is rounding exactly 0."""
-        sums = np.zeros((self.num_groups, self.offsets.shape[1]))
-        np.add.at(sums, self.group_of, self.offsets)
-        moved = self.offsets - (sums / np.bincount(self.group_of)[:, None])[self.group_of]
+        means = self._sum(self.offsets) / np.bincount(self.group_of)[:, None]
+        moved = self.offsets - means[self.group_of]
         sizes = np.linalg.norm(moved, axis=1)
         largest = float(np.abs(self.offsets).max(initial=0.0))
         moved[sizes <= _COINCIDENT * largest] = 0.0
         return RigidGroups(group_of=self.group_of, offsets=moved)
 
     def normalize(self) -> "RigidGroups":
-        """Return the same groups centred, in a unit in which their offsets have root mean square 1."""
-        centred = self.centred()
-        moved = np.linalg.norm(centred.offsets, axis=1)
+        """Return the same groups centered, in a unit in which their offsets have root mean square 1."""
+        centered = self.center()
+        moved = np.linalg.norm(centered.offsets, axis=1)
         size = float(np.sqrt(np.mean(moved[moved > 0.0] ** 2))) if moved.any() else 1.0
-        return RigidGroups(group_of=self.group_of, offsets=centred.offsets / size)
+        return RigidGroups(group_of=self.group_of, offsets=centered.offsets / size)
 
     def restricted_to(self, nodes: IntArray) -> "RigidGroups":
         """Return the groups of some nodes, renumbered in the same order."""
@@ -135,7 +133,7 @@ class RigidGroups:
         """Return the groups with all of those that hold a fixed node joined to one, the first.
 
         Args:
-            fixed: (n,) the nodes that keep their centres relative to each other.
+            fixed: (n,) the nodes that keep their centers relative to each other.
             centers: (n, d) in the unit of the offsets; those of nodes that share no group with a fixed one
                 are not read.
         """

@@ -6,6 +6,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
+from sfm_shapefit.solver.splitting.linear import Resources
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -14,18 +15,15 @@ _MAX_STEPS = 150
 
 
 def lud_over_groups(graph: ViewGraph, groups: RigidGroups, max_steps: int = _MAX_STEPS) -> FloatArray | None:
-    """Return LUD's locations (n, d), centred, after some steps; None if the system breaks down.
+    """Return LUD's locations (n, d), centered, after some steps; None if the system breaks down.
 
-    The splitting sees the groups through its linear solve alone, which moves the locations by A x.
-
-    Args:
-        graph: connected over the groups; every pair joins two of them.
-        groups: of its nodes.
-        max_steps: limit of steps of the splitting.
+    The splitting sees the groups through its linear solve alone, which moves the locations by A x. Every pair
+    of the graph joins two groups, and all groups are connected.
     """
     try:
         factor = ReducedFactor(graph.edges, groups.normalize())
-        locations = solve_lud(graph, max_steps, factor, certified=False).locations
+        resources = Resources(factor=factor)
+        locations = solve_lud(graph, max_steps, certified=False, resources=resources).locations
     except UnsolvableError:
         return None
     return locations if np.isfinite(locations).all() else None

@@ -14,14 +14,15 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.laplacian.cholesky import CholeskyFactor, allocate_factor, analyse
+from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
+from sfm_shapefit.solver.newton.reduction import Reduction
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 # What is left of s when all groups may move is rounding below this share of eta.
 _LEAST_SCHUR = 1e-13
 
 
-class ReducedFactor:
+class ReducedFactor(Reduction):
     """Memory for the factor of A^T D^T S D A; `refactor` overwrites it, `solve` reads it.
 
     It answers in locations, A (A^T D^T S D A)^-1 A^T g, so that whatever works with a Laplacian of cameras
@@ -35,7 +36,7 @@ class ReducedFactor:
 
         Args:
             edges: (m, 2) pairs of nodes, each of two different groups, which they connect.
-            groups: of the nodes; offsets best centred.
+            groups: of the nodes; offsets best centered.
             threads: of the factor; its answers do not depend on it.
             max_bytes: what the factor may take; predicted before it is allocated.
 
@@ -47,21 +48,16 @@ class ReducedFactor:
         self._offsets = groups.offsets[edges[:, 0]] - groups.offsets[edges[:, 1]]
         self._metric = bool(self._offsets.any())
         dimension = groups.offsets.shape[1]
-        plan = analyse(groups.num_groups, self._ends)
+        plan = analyze(groups.num_groups, self._ends)
         needed = plan.num_bytes(dimension, np.float64, threads)
         if max_bytes is not None and needed > max_bytes:
             raise UnsolvableError(
                 f"the factor over {groups.num_groups} groups takes {needed / 1e6:.0f} MB, and only "
                 f"{max_bytes / 1e6:.0f} MB are allowed; allow more memory for a factor"
             )
-        self.factor: CholeskyFactor = allocate_factor(plan, dimension, threads=threads)
+        super().__init__(allocate_factor(plan, dimension, threads=threads))
         self.smallest_pivot = 0.0
         """Least pivot relative to its diagonal entry, that of s included; see `refactor`."""
-
-    @property
-    def num_nodes(self) -> int:
-        """Number of nodes, n."""
-        return self.groups.num_nodes
 
     def expand(self, x: FloatArray, /) -> FloatArray:
         """Return A x, (n, d)."""

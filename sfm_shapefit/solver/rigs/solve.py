@@ -5,8 +5,10 @@ from functools import partial
 
 import numpy as np
 
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.solver.certificate import Certificate
 from sfm_shapefit.solver.conic import solve_conic
 from sfm_shapefit.solver.newton.sparse import solve_newton_reduced
 from sfm_shapefit.solver.options import OnIteration, SolverOptions, SolverResult
@@ -14,15 +16,7 @@ from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.solver.solve import (
-    ITERATION_LIMITS,
-    Choice,
-    Run,
-    Watch,
-    describe_run,
-    judge_status,
-    scaled_locations,
-)
+from sfm_shapefit.solver.solve import Choice, Run, run_choice
 from sfm_shapefit.viewgraph import ViewGraph
 
 # A^T c counts as 0 below this size, relative to the sum of weights.
@@ -45,9 +39,8 @@ def solve_groups(
         on_iteration: called after each iteration (not by "conic"); returning False cancels the solve.
 
     Returns:
-        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group. The equality
-        that holds for it is the balance per group and that for the scale; `equality_residual` is its largest
-        violation.
+        Locations A x in the program's own scale, and a feasible dual, 0 on pairs inside a group;
+        `equality_residual` is as in `certify_groups`.
 
     Raises:
         InputError: if a method is asked for that does not exist over groups.
@@ -64,16 +57,13 @@ def solve_groups(
     c = unit.reduce(scale_functional(between))
     if not np.linalg.norm(c) > _DIRECTIONS_CANCEL * between.weights.sum():
         raise UnsolvableError("the directions cancel at every group, so no scale can be fixed")
-    choice = _choose_method(unit, options)
-    limit = options.max_iterations or ITERATION_LIMITS[choice.method]
-    watch = Watch(on_iteration, limit)
-    run = choice.run(between, options, limit, watch if on_iteration else None)
-    locations = scaled_locations(between, run.locations)
-    dual = np.zeros_like(graph.directions)
-    dual[outer] = run.dual
-    certificate = certify_groups(graph, groups, locations, dual, uniqueness=options.uniqueness)
-    status = judge_status(certificate, options.tol, run.iterations >= limit, watch.cancelled)
-    return describe_run(run, choice, certificate, locations, status, start)
+
+    def prove(locations: FloatArray, dual_between: FloatArray) -> Certificate:
+        dual = np.zeros_like(graph.directions)
+        dual[outer] = dual_between
+        return certify_groups(graph, groups, locations, dual, uniqueness=options.uniqueness)
+
+    return run_choice(between, _choose_method(unit, options), options, on_iteration, prove, start)
 
 
 def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
@@ -82,9 +72,8 @@ def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
         raise InputError(
             "solver 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
         )
-    reason = "asked for"
-    if options.solver == "auto":
-        reason = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
+    reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
         return Choice("conic", partial(_run_conic, groups), reason)
     return Choice("newton", partial(_run_newton, groups), reason)

@@ -7,10 +7,9 @@ places relative to one another. If all groups are in one class, s and f are dete
 one common factor: a null vector that changes s is the solution itself, plus one that does not.
 
 Random null vectors tell the classes with probability 1: z <- (K + eps N)^-1 eps N z with N the plain
-Laplacian tends to the projection of z on the null space. That is a sparse solve or a few, at any size.
-
-Whether pairs tie groups in general is asked at random positions with the given offsets, for a group's offsets
-are part of the problem and not general; whether they do at a solution, at its baselines.
+Laplacian tends to the projection of z on the null space. Whether pairs tie groups in general is asked at
+random positions with the given offsets, which are part of the problem; whether they do at a solution, at its
+baselines.
 """
 
 import numpy as np

@@ -1,26 +1,10 @@
 """Splitting for large view graphs: ShapeFit and LUD by ADMM with the scalar graph Laplacian.
 
-edges      the proximal step, fused into one pass over the edges
-anderson   acceleration of the iteration
-linear     the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
-engine     the iteration that both programs share
-shapefit   solve_admm
-lud        solve_lud
+edges              the proximal step, fused into one pass over the edges
+anderson           acceleration of the iteration
+linear             the Laplacian solve: Cholesky where it fits, conjugate gradients elsewhere
+engine             the iteration that both programs share
+shapefit           a run of ShapeFit that can be continued
+split_then_newton  ShapeFit to a proven gap
+lud                LUD
 """
-
-from sfm_shapefit.solver.splitting.engine import Stop
-from sfm_shapefit.solver.splitting.linear import IterativeSolver, LaplacianFactor, laplacian_factor
-from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
-from sfm_shapefit.solver.splitting.shapefit import AdmmResult, Splitting, solve_admm
-
-__all__ = [
-    "AdmmResult",
-    "IterativeSolver",
-    "LaplacianFactor",
-    "LudResult",
-    "Splitting",
-    "Stop",
-    "laplacian_factor",
-    "solve_admm",
-    "solve_lud",
-]

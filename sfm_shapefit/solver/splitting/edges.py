@@ -61,6 +61,13 @@ class EdgeData:
         """(0, ..., d - 1); its length tells the compiler the dimension, so that it unrolls loops over it."""
         return tuple(range(self.directions.shape[1]))
 
+    def between(self, first: int, last: int) -> "_Edges":
+        """Return what kernels take first to work on some of the edges."""
+        return self.axes, first, last, self.ends, self.directions, self.weights, self.least
+
+
+_Edges = tuple[tuple[int, ...], int, int, IntArray, FloatArray, FloatArray, float]
+
 
 def edge_data(graph: ViewGraph, least: float) -> EdgeData:
     """Return the edges of a graph, sorted and cut into chunks; shared with the graph if sorted already."""
@@ -98,25 +105,15 @@ class EdgePasses:
     def step(
         self, x: FloatArray, x_next: FloatArray, t: FloatArray, rho: FloatArray, relaxation: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Take one proximal step: x_next = relaxation D t + (1 - relaxation) y + u.
-
-        Args:
-            x: (m, d) state before.
-            x_next: (m, d) state after, written; may be `x` itself.
-            t: (n, d) locations.
-            rho: (m,) penalties.
-            relaxation: in (0, 2).
+        """Take one proximal step: x_next = relaxation D t + (1 - relaxation) y + u, written; may be x itself.
 
         Returns:
             D^T rho (y - u - D t) of the new state, (n, d), and the five sums of the pass.
         """
-        data, axes = self.data, self.data.axes
 
         def chunk(k: int, first: int, last: int) -> None:
-            _step(
-                axes, first, last, data.ends, data.directions, data.weights, data.least,
-                rho, relaxation, t, x, x_next, self._sums[k], self._totals[k],
-            )  # fmt: skip
+            edges = self.data.between(first, last)
+            _step(*edges, rho, relaxation, t, x, x_next, self._sums[k], self._totals[k])
 
         self._totals[...] = 0.0
         pull = self._accumulate(chunk)
@@ -124,24 +121,7 @@ class EdgePasses:
 
     def pull(self, x: FloatArray, t: FloatArray, rho: FloatArray) -> FloatArray:
         """Return D^T rho (y - u - D t), (n, d): the right-hand side of the correction of t."""
-        data, axes = self.data, self.data.axes
-
-        def chunk(k: int, first: int, last: int) -> None:
-            _pull(
-                axes,
-                first,
-                last,
-                data.ends,
-                data.directions,
-                data.weights,
-                data.least,
-                rho,
-                t,
-                x,
-                self._sums[k],
-            )
-
-        return self._accumulate(chunk)
+        return self._accumulate(lambda k, a, b: _pull(*self.data.between(a, b), rho, t, x, self._sums[k]))
 
     def dual(self, x: FloatArray, rho: FloatArray) -> FloatArray:
         """Return rho u, (m, d), in the edge order of the passes."""
@@ -173,16 +153,8 @@ class EdgePasses:
         self, x_before: FloatArray, x: FloatArray, t: FloatArray, rho: FloatArray
     ) -> tuple[float, float]:
         """Return sum rho ||D t - y||^2 and sum rho ||y - y_before||^2: the primal and the dual residual."""
-        data, axes = self.data, self.data.axes
-        totals = np.zeros((len(data.bounds) - 1, 2))
-
-        def chunk(k: int, first: int, last: int) -> None:
-            _imbalance(
-                axes, first, last, data.ends, data.directions, data.weights, data.least, rho, t,
-                x_before, x, totals[k],
-            )  # fmt: skip
-
-        self.over_chunks(chunk)
+        totals = np.zeros((len(self.data.bounds) - 1, 2))
+        self.over_chunks(lambda k, a, b: _imbalance(*self.data.between(a, b), rho, t, x_before, x, totals[k]))
         primal, dual = totals.sum(axis=0)
         return float(primal), float(dual)
 
@@ -316,18 +288,9 @@ def _advance(axes: Any, block: Any, count: int, least: float, relaxation: float,
 
 @kernel()
 def _pull(
-    axes: Any,
-    first: int,
-    last: int,
-    ends: Any,
-    v: Any,
-    w: Any,
-    least: float,
-    rho: Any,
-    t: Any,
-    x: Any,
-    sums: Any,
-) -> None:
+    axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
+    rho: Any, t: Any, x: Any, sums: Any,
+) -> None:  # fmt: skip
     d = len(axes)
     for e in range(first, last):
         i, j = ends[e, 0], ends[e, 1]

@@ -21,12 +21,13 @@ method of multipliers" (2011), sections 3.4.1 and 3.4.3.
 """
 
 import enum
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.splitting.anderson import Anderson
 from sfm_shapefit.solver.splitting.edges import CHANGE, INTERIOR, OBJECTIVE, EdgePasses
 from sfm_shapefit.solver.splitting.linear import LaplacianFactor
@@ -37,12 +38,12 @@ _PENALTY = 0.5
 _FLOORS = (0.1, 0.03, 0.01)
 # While the iteration is accelerated every renewal has this floor: even penalties leave more to acceleration.
 _ANDERSON_FLOOR = 0.3
-# A renewal leaves the scale of the penalties alone where primal over dual residual has this value.
+# A renewal leaves the scale of the penalties alone where primal over dual residual has this value: with
+# acceleration the first, else those of the successive renewals, of which the last one stays. What has not
+# converged by the third, as communities that hang together by few pairs, creeps along smooth modes, and
+# smaller penalties free them (community graph of 1e4 cameras to 1e-4: 133 iterations instead of 222).
 _BALANCE = 1.0
-# The same from the third renewal on, without acceleration. What has not converged by then, as communities
-# that hang together by few pairs, creeps along smooth modes, and smaller penalties free them (community graph
-# of 1e4 cameras to 1e-4: 133 iterations instead of 222).
-_LATE_BALANCES = (4.0, 2.0)
+_BALANCES = (_BALANCE, _BALANCE, 4.0, 2.0)
 _ANDERSON_MEMORY = 6
 # Over-relaxation and acceleration get in each other's way.
 _ANDERSON_RELAXATION = 1.0
@@ -76,14 +77,19 @@ class Stop(enum.Enum):
     CANCELLED = "cancelled by on_iteration"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """How the iteration runs."""
+class Goal(NamedTuple):
+    """When a run ends."""
 
     tol: float
+    """Relative error of the objective, estimated."""
     absolute_tol: float
     """Error of the objective, in its own units, that is accurate enough whatever `tol` says."""
     max_iterations: int
+
+
+class Tuning(NamedTuple):
+    """How the iteration runs for one program."""
+
     relaxation: float
     renewals: tuple[int, ...]
     """Iterations after which the penalties are renewed; none leaves them constant."""
@@ -120,8 +126,7 @@ class State:
     """The history, while the iteration is accelerated."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Outcome:
+class Outcome(NamedTuple):
     """Where the iteration ended."""
 
     state: State
@@ -133,45 +138,35 @@ class Iteration:
     """One run: the program, its factor and passes, and the steps between them."""
 
     def __init__(
-        self,
-        passes: EdgePasses,
-        factor: LaplacianFactor,
-        settings: Settings,
-        c: FloatArray | None,
-        kappa: float,
+        self, passes: EdgePasses, factor: LaplacianFactor, tuning: Tuning, c: FloatArray | None, kappa: float
     ) -> None:
         """Set up the program <c, T> = kappa over the edges of `passes`; no such constraint if c is None."""
-        self.passes = passes
-        self.factor = factor
-        self.settings = settings
-        self.c = c
-        self.kappa = kappa
+        self.passes, self.factor, self.tuning, self.c, self.kappa = passes, factor, tuning, c, kappa
         self._factored = 1.0  # the factor is that of the Laplacian of rho / _factored
         self._astray = np.inf  # objective from which acceleration has led away from the solution
 
-    def run(self, on_iteration: OnIteration | None, resumed: Outcome | None = None) -> Outcome:
+    def run(self, goal: Goal, on_iteration: OnIteration | None, resumed: Outcome | None = None) -> Outcome:
         """Iterate from the least-squares locations, or from where a run ended, until a reason to stop.
 
         Between two runs the factor may have been used for other weights; it is computed anew.
         """
-        settings = self.settings
         state, done = (self._start(), 0) if resumed is None else (resumed.state, resumed.iterations)
         if resumed is not None:
             self._factor(state)
         best, best_at = np.inf, done
-        for k in range(done + 1, settings.max_iterations + 1):
+        for k in range(done + 1, goal.max_iterations + 1):
             if k > 1:
                 self._move(state)
-            renew = k in settings.renewals
+            renew = k in self.tuning.renewals
             before = state.x.copy() if renew else None
             self._pass(state)
-            if _cancelled(on_iteration, k, self.objective(state)):
+            if asks_to_stop(on_iteration, IterationInfo(k, self.objective(state), None)):
                 return Outcome(state=state, iterations=k, stop=Stop.CANCELLED)
             if self._is_astray(state, k):
                 state, best, best_at = self._begin_again(), np.inf, k
                 continue
             residual = self._residual(state)
-            allowed = max(settings.tol * self.objective(state), settings.absolute_tol)
+            allowed = max(goal.tol * self.objective(state), goal.absolute_tol)
             if max(residual, self._error(state)) <= allowed:
                 return Outcome(state=state, iterations=k, stop=Stop.ACCURATE)
             if residual < 0.5 * best:
@@ -179,13 +174,16 @@ class Iteration:
             elif k - best_at > max(_STALL_WINDOW, k // 2):
                 return Outcome(state=state, iterations=k, stop=Stop.STALLED)
             if before is not None:
-                renewal = settings.renewals.index(k)
                 state.anderson = self._accelerator(state)
-                wanted = self._wanted_balance(renewal, state.anderson)
+                floor, wanted = _ANDERSON_FLOOR, _BALANCE
+                if state.anderson is None:
+                    renewal = self.tuning.renewals.index(k)
+                    floor = _FLOORS[min(renewal, len(_FLOORS) - 1)]
+                    wanted = _BALANCES[min(renewal, len(_BALANCES) - 1)]
                 state.scale *= np.sqrt(self._balance(state, before, wanted) / wanted)
                 before = None  # its memory is needed for the factor
-                self._renew(state, self._floor(renewal, state.anderson))
-        return Outcome(state=state, iterations=settings.max_iterations, stop=Stop.MAX_ITERATIONS)
+                self._renew(state, floor)
+        return Outcome(state=state, iterations=goal.max_iterations, stop=Stop.MAX_ITERATIONS)
 
     def objective(self, state: State) -> float:
         """Return the objective at the locations of the last pass, relative to kappa."""
@@ -200,7 +198,7 @@ class Iteration:
 
     def _begin_again(self) -> State:
         """Return the state of the beginning, and accelerate no more."""
-        self.settings = replace(self.settings, accelerate=False)
+        self.tuning = self.tuning._replace(accelerate=False)
         state = self._start()
         state.pull = self.passes.pull(state.x, state.t, state.rho)
         return state
@@ -216,7 +214,7 @@ class Iteration:
         self._factor(state)
         state.pull = self.passes.pull(state.x, state.t, state.rho)
         self._move(state)
-        self._factored = self.settings.penalty / _mean(self.passes.residuals(state.t), data.weights)
+        self._factored = self.tuning.penalty / _mean(self.passes.residuals(state.t), data.weights)
         state.rho *= self._factored
         state.unit /= self._factored
         state.multiplier *= self._factored
@@ -243,7 +241,7 @@ class Iteration:
     def _pass(self, state: State) -> None:
         """Take the proximal step, accelerated if there is a history."""
         anderson = state.anderson
-        relaxation = self.settings.relaxation if anderson is None else _ANDERSON_RELAXATION
+        relaxation = self.tuning.relaxation if anderson is None else _ANDERSON_RELAXATION
         if anderson is not None and state.spare.shape != state.x.shape:
             state.spare = np.empty_like(state.x)
         target = state.x if anderson is None else state.spare
@@ -271,18 +269,8 @@ class Iteration:
         """
         return state.steps_left * float(state.sums[CHANGE]) / self.kappa
 
-    def _floor(self, renewal: int, anderson: Anderson | None) -> float:
-        """Return the least residual that penalties take seriously, relative to the mean residual."""
-        return _FLOORS[min(renewal, len(_FLOORS) - 1)] if anderson is None else _ANDERSON_FLOOR
-
-    def _wanted_balance(self, renewal: int, anderson: Anderson | None) -> float:
-        """Return the balance of the residuals at which the penalties are left as they are."""
-        if anderson is not None or renewal < 2:
-            return _BALANCE
-        return _LATE_BALANCES[min(renewal - 2, len(_LATE_BALANCES) - 1)]
-
     def _renew(self, state: State, floor: float) -> None:
-        """Replace the penalties by w / residual and factor anew; y and the dual rho u stay."""
+        """Replace the penalties by w / max(residual, floor * mean) and factor anew; y and rho u stay."""
         passes = self.passes
         rho = passes.residuals(state.t)
         np.maximum(rho, floor * _mean(rho, passes.data.weights), out=rho)
@@ -293,10 +281,7 @@ class Iteration:
         state.pull = passes.pull(state.x, state.t, state.rho)
 
     def _balance(self, state: State, before: FloatArray, otherwise: float) -> float:
-        """Return the norm of the primal residual, D T - y, over that of the dual one, rho (y - y before).
-
-        `otherwise`, if one of them is 0.
-        """
+        """Return the norm of D T - y over that of rho (y - y before); `otherwise` where one of them is 0."""
         primal, dual = self.passes.imbalance(before, state.x, state.t, state.rho)
         if not (primal > 0.0 and dual > 0.0):
             return otherwise
@@ -305,12 +290,11 @@ class Iteration:
     def _accelerator(self, state: State) -> Anderson | None:
         """Return an empty history if so many edges fit exactly that acceleration pays, else None.
 
-        With noise, the edges inside their ball become few as the iteration converges; without, they
-        stay. The first renewal only takes note, for noise has not had time to show.
+        With noise, fewer and fewer edges are inside their ball. The first renewal only takes note of them.
         """
         before, state.interior = state.interior, float(state.sums[INTERIOR]) / len(state.x)
         pays = state.interior >= max(_ANDERSON_INTERIOR, _ANDERSON_KEPT * before)
-        if not (self.settings.accelerate and pays):
+        if not (self.tuning.accelerate and pays):
             return None
         if state.anderson is None:
             return Anderson(self.passes, state.x.shape, _ANDERSON_MEMORY)
@@ -326,8 +310,7 @@ def _mean(residuals: FloatArray, weights: FloatArray) -> float:
 def _steps_left(state: State) -> float:
     """Return how many steps of the present length are left, if they go on to shrink as they do.
 
-    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. Just after a renewal, when the
-    steps jump, the last answer is kept.
+    With steps that shrink by q the fixed point is 1 / (1 - q) of them away. After a renewal the steps jump.
     """
     if len(state.steps) <= _CONTRACTION_WINDOW:
         return state.steps_left
@@ -336,11 +319,3 @@ def _steps_left(state: State) -> float:
         return _STEPS_LEFT
     shrinking = (now / before) ** (0.5 / _CONTRACTION_WINDOW)  # the steps are squared
     return float(np.clip(1.0 / max(1.0 - shrinking, 1.0 / _MOST_STEPS_LEFT), _STEPS_LEFT, None))
-
-
-def _cancelled(on_iteration: OnIteration | None, iteration: int, objective: float) -> bool:
-    """Report an iteration; True if the caller asks to stop."""
-    if on_iteration is None:
-        return False
-    answer = on_iteration(IterationInfo(iteration, objective, None))
-    return answer is not None and not answer  # a numpy False cancels too

@@ -1,13 +1,11 @@
 """The linear solve inside ADMM: a float32 Cholesky factor where it fits, conjugate gradients elsewhere.
 
-Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta
-(delta form). An error of delta is then an error relative to the *step*: a float32 factor loses nothing,
-and conjugate gradients that reduce their residual tenfold count as solved, since what is left enters the
-next right-hand side.
+Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta. An
+error of delta is relative to the *step* and enters the next right-hand side: a float32 factor loses nothing,
+and conjugate gradients that reduce their residual tenfold count as solved.
 """
 
-from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -21,7 +19,7 @@ from sfm_shapefit.laplacian.approximate import (
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import Adjacency, LaplacianOperator, Workers, adjacency
 from sfm_shapefit.laplacian.ordering import best_order, widest_level
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorisation
+from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, EliminationTree, plan_factorization
 from sfm_shapefit.viewgraph import ViewGraph
 
 # A solve by approximate Cholesky costs about 9 us per edge in all (5 set-ups, 40 x 3 steps), five float32
@@ -49,11 +47,23 @@ class LaplacianFactor(Protocol):
 
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,) in the order of the graph's edges."""
-        ...
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with L x = rhs, (n, d), up to a constant per column; the columns of rhs sum to 0."""
-        ...
+
+
+class Resources(NamedTuple):
+    """What a solve may use; its answer does not depend on the threads."""
+
+    threads: int = 1
+    memory_bytes: int = DEFAULT_FACTOR_BYTES
+    """What one factor may take, predicted before it is allocated."""
+    factor: LaplacianFactor | None = None
+    """A solver for the graph's Laplacian that may be overwritten, where there is one already."""
+
+
+ONE_THREAD = Resources()
+"""What a solve uses where nothing else is said."""
 
 
 class IterativeSolver:
@@ -70,19 +80,15 @@ class IterativeSolver:
     def refactor(self, weights: FloatArray) -> None:
         """Take new edge weights, (m,), and choose the preconditioner by a probe."""
         self._operator.reweigh(weights)
-        self._preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
-        if not _diagonal_suffices(self._operator, self._preconditioner):
-            self._preconditioner = approximate_cholesky(self._graph, weights, _SEED)
-
-    @property
-    def preconditioner(self) -> Preconditioner:
-        """The preconditioner of the last weights: a fixed linear map, as `solve` is not."""
-        return self._preconditioner
+        # A fixed linear map, as `solve` is not.
+        self.preconditioner: Preconditioner = JacobiPreconditioner(self._operator.diagonal())
+        if not _diagonal_suffices(self._operator, self.preconditioner):
+            self.preconditioner = approximate_cholesky(self._graph, weights, _SEED)
 
     def solve(self, rhs: FloatArray) -> FloatArray:
         """Return x with ||rhs - L x|| at most a tenth of ||rhs||, column by column, (n, d)."""
         return conjugate_gradients(
-            self._operator, self._preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
+            self._operator, self.preconditioner, rhs, tol=_REDUCTION, max_iterations=_MAX_STEPS
         ).x
 
 
@@ -92,8 +98,7 @@ def _diagonal_suffices(operator: LaplacianOperator, jacobi: Preconditioner) -> b
     return conjugate_gradients(operator, jacobi, probe, tol=1e-2, max_iterations=_JACOBI_STEPS).converged
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prediction:
+class Prediction(NamedTuple):
     """What is known of a graph's factor before any number: the order of elimination, if one is of use."""
 
     tree: EliminationTree | None
@@ -109,10 +114,9 @@ def predict_factor(graph: ViewGraph) -> Prediction:
     """Return the order of elimination that `laplacian_factor` would use.
 
     A graph on which the diagonal is a good preconditioner has a large spectral gap, so no small separators
-    (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, and the ordering, which takes longer
-    than a solve by conjugate gradients, is saved. So it is on huge graphs whose levels are so wide that the
-    factor would take longer than it saves; some of them may have better separators than their levels, but
-    approximate Cholesky serves them as well.
+    (Lipton, Rose, Tarjan 1979): its factor fills in whatever the order, so none is looked for. Nor is it on
+    huge graphs whose levels are so wide that the factor would take longer than it saves; if some of them have
+    better separators than their levels, approximate Cholesky serves them as well.
     """
     neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
     if graph.num_nodes >= _LARGE:
@@ -127,29 +131,27 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 
 
 def laplacian_factor(
-    graph: ViewGraph,
-    memory_bytes: int = DEFAULT_FACTOR_BYTES,
-    *,
-    prediction: Prediction | None = None,
-    threads: int = 1,
+    graph: ViewGraph, resources: Resources = ONE_THREAD, prediction: Prediction | None = None
 ) -> LaplacianFactor:
-    """Return a float32 Cholesky factor of the graph's Laplacian, or an iterative solver where that is better.
+    """Return the factor of the resources; if None, a float32 Cholesky factor of the graph's Laplacian.
 
-    It is better where the factor would not fit, or would take longer than it saves.
+    Or an iterative solver where that factor would not fit, or would take longer than it saves.
 
     Args:
         graph: a connected view graph.
-        memory_bytes: what the factor may take; predicted before anything is allocated.
+        resources: threads and memory of the factor.
         prediction: from `predict_factor` on the same graph, if it is there already.
-        threads: of the factor; its answers do not depend on it.
     """
+    if resources.factor is not None:
+        return resources.factor
     tree = (predict_factor(graph) if prediction is None else prediction).tree
-    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    edges = np.ascontiguousarray(graph.edges)
+    neighbors = adjacency(graph.num_nodes, edges)
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
-        return IterativeSolver(neighbors, threads)
-    if tree.num_nonzeros * np.dtype(np.float32).itemsize > memory_bytes:
-        return IterativeSolver(neighbors, threads)
-    plan = plan_factorisation(neighbors, np.ascontiguousarray(graph.edges), tree)
-    if plan.num_bytes(1, np.float32) > memory_bytes:
-        return IterativeSolver(neighbors, threads)
-    return allocate_factor(plan, 1, np.float32, threads=threads)
+        return IterativeSolver(neighbors, resources.threads)
+    if tree.num_nonzeros * np.dtype(np.float32).itemsize > resources.memory_bytes:
+        return IterativeSolver(neighbors, resources.threads)
+    plan = plan_factorization(neighbors, edges, tree)
+    if plan.num_bytes(1, np.float32) > resources.memory_bytes:
+        return IterativeSolver(neighbors, resources.threads)
+    return allocate_factor(plan, 1, np.float32, threads=resources.threads)

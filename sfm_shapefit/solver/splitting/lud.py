@@ -2,8 +2,8 @@
 
     minimize  sum_e w_e || t_i - t_j - s_e v_e ||    subject to  s_e >= 1
 
-The bound on each length is a gauge that no stretch of a chain can escape, where ShapeFit's single
-constraint <c, T> = kappa lets all length gather on the cleanest stretch. The dual is
+No stretch of a chain escapes the bound on each length, where ShapeFit's single constraint <c, T> = kappa lets
+all length gather on the cleanest stretch. The dual is
 
     maximize  sum_e nu_e,  nu_e = -<y_e, v_e>    subject to  D^T y = 0,  ||y_e|| <= w_e,  nu_e >= 0
 
@@ -24,11 +24,12 @@ from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import across, adjoint, along, differences
 from sfm_shapefit.solver.splitting.edges import EdgePasses, edge_data
-from sfm_shapefit.solver.splitting.engine import Iteration, Settings, Stop
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, laplacian_factor
+from sfm_shapefit.solver.splitting.engine import Goal, Iteration, Stop, Tuning
+from sfm_shapefit.solver.splitting.linear import ONE_THREAD, Resources, laplacian_factor
 from sfm_shapefit.viewgraph import ViewGraph
 
 _LEAST_LENGTH = 1.0
+_TUNING = Tuning(relaxation=1.6, renewals=(), penalty=1.0, accelerate=False)
 _REPAIRS = 12
 # The balance is restored twice to this residual, which makes 1e-14.
 _CG_TOL = 1e-7
@@ -40,7 +41,7 @@ class LudResult:
     """A solution of LUD with the bound that its dual proves."""
 
     locations: FloatArray
-    """(n, d) centred; the least edge length is about 1."""
+    """(n, d) centered; the least edge length is about 1."""
     lengths: FloatArray
     """(m,) s_e >= 1, the best ones for the locations."""
     objective: float
@@ -58,11 +59,10 @@ class LudResult:
 def solve_lud(
     graph: ViewGraph,
     max_iterations: int = 50,
-    factor: LaplacianFactor | None = None,
     *,
     tol: float = 1e-8,
     certified: bool = True,
-    threads: int = 1,
+    resources: Resources = ONE_THREAD,
     on_iteration: OnIteration | None = None,
 ) -> LudResult:
     """Solve LUD by ADMM with constant penalties, so that its Laplacian is factored once.
@@ -70,25 +70,16 @@ def solve_lud(
     Args:
         graph: a connected view graph.
         max_iterations: 25 to 50 suffice as the start of a robust refinement.
-        factor: solver for the graph's Laplacian, overwritten; by default what `laplacian_factor` picks.
         tol: relative error of the objective, estimated, at which to stop early.
         certified: compute the dual bound, at the price of about 100 iterations.
-        threads: of the passes over edges; the result does not depend on it.
+        resources: threads of the passes over edges, and the factor, by default what `laplacian_factor` picks.
         on_iteration: called after each iteration; returning False cancels and returns the iterate.
     """
-    settings = Settings(
-        absolute_tol=0.0,
-        tol=tol,
-        max_iterations=max_iterations,
-        relaxation=1.6,
-        renewals=(),
-        penalty=1.0,
-        accelerate=False,
-    )
-    factor = laplacian_factor(graph) if factor is None else factor
-    passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), threads)
+    factor = laplacian_factor(graph, resources)
+    passes = EdgePasses(edge_data(graph, _LEAST_LENGTH), resources.threads)
     try:
-        outcome = Iteration(passes, factor, settings, None, float(graph.weights.sum())).run(on_iteration)
+        iteration = Iteration(passes, factor, _TUNING, None, float(graph.weights.sum()))
+        outcome = iteration.run(Goal(tol, 0.0, max_iterations), on_iteration)
         dual = passes.in_graph_order(passes.dual(outcome.state.x, outcome.state.rho))
     finally:
         passes.close()
@@ -116,10 +107,10 @@ def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner
     v, w, n = graph.directions, graph.weights, graph.num_nodes
     bound_active = along(dual, v) < -1e-6 * w
     for _ in range(_REPAIRS):
-        y = _balanced(graph, dual, bound_active, precondition)
+        y = _balance(graph, dual, bound_active, precondition)
         still_active = bound_active & (along(y, v) <= 0.0)
         if (still_active == bound_active).all():  # then once more, to rounding
-            y = _balanced(graph, y, bound_active, precondition)
+            y = _balance(graph, y, bound_active, precondition)
             still_active = bound_active & (along(y, v) <= 0.0)
         if (still_active == bound_active).all():
             break
@@ -132,22 +123,19 @@ def _dual_bound(graph: ViewGraph, dual: FloatArray, precondition: Preconditioner
     return float(-along(y, v)[bound_active].sum()), residual
 
 
-def _balanced(
-    graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner
-) -> FloatArray:
+def _balance(graph: ViewGraph, dual: FloatArray, free: BoolArray, precondition: Preconditioner) -> FloatArray:
     """Return the dual moved to D^T y = 0, by all directions on `free` edges and across v on the others."""
     edges, v, n = graph.edges, graph.directions, graph.num_nodes
 
     def allowed(z: FloatArray) -> FloatArray:
         return np.where(free[:, None], z, across(z, v))
 
+    def product(x: FloatArray) -> FloatArray:
+        return adjoint(allowed(differences(x, edges)), edges, n)
+
     y = allowed(dual)
+    total = adjoint(y, edges, n)
     h = conjugate_gradients(
-        lambda x: adjoint(allowed(differences(x, edges)), edges, n),
-        precondition,
-        adjoint(y, edges, n),
-        tol=_CG_TOL,
-        max_iterations=_CG_STEPS,
-        coupled=True,
+        product, precondition, total, tol=_CG_TOL, max_iterations=_CG_STEPS, coupled=True
     ).x
     return np.asarray(y - allowed(differences(h, edges)))

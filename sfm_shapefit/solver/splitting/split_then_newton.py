@@ -1,11 +1,10 @@
 """Large graphs to a proven gap: splitting, then a certificate, then Newton steps only if it must be.
 
-Splitting is cheap but proves nothing; the certificate makes its dual feasible at the price of some twenty
-iterations, and the gap it then proves is mostly below the error that the splitting estimates for itself, and
-hardly ever above three times it. So the splitting is asked for a third of the gap, and its answer certified.
-If that misses, it goes on where it was. Where it stalls, as on long chains, the sparse Newton solver takes
-over from the certified point, if its factor fits. Newton's method converges from near a solution or from its
-own beginning: if the point was of no use, it begins again there.
+Splitting is cheap but proves nothing; the certificate costs some twenty of its iterations, and the gap proven
+is hardly ever above three times the error that the splitting estimates for itself. So the splitting is asked
+for a third of the gap, and its answer certified. If that misses, it goes on where it was. Where it stalls, as
+on long chains, the sparse Newton solver takes over from the certified point, if its factor fits, and begins
+anew where that point was of no use.
 """
 
 import enum
@@ -15,13 +14,19 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor
-from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.solver.certificate import Certificate, certify, certify_within
+from sfm_shapefit.solver.certificate import Certificate, certify_in_place
 from sfm_shapefit.solver.newton import solve_newton_sparse
-from sfm_shapefit.solver.options import IterationInfo, OnIteration
+from sfm_shapefit.solver.options import OnIteration, Watch
 from sfm_shapefit.solver.program import projected_length
-from sfm_shapefit.solver.splitting import Splitting, Stop, laplacian_factor
-from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Prediction
+from sfm_shapefit.solver.splitting.engine import Goal, Stop
+from sfm_shapefit.solver.splitting.linear import (
+    ONE_THREAD,
+    LaplacianFactor,
+    Prediction,
+    Resources,
+    laplacian_factor,
+)
+from sfm_shapefit.solver.splitting.shapefit import Splitting
 from sfm_shapefit.viewgraph import ViewGraph
 
 # The splitting runs until it estimates its error below 0.3 tol; its certificate is then mostly within tol.
@@ -58,7 +63,7 @@ class HybridResult:
     """Locations and what is proven about them."""
 
     locations: FloatArray
-    """(n, d) centred, with L(T) = sum of the weights."""
+    """(n, d) centered, with L(T) = sum of the weights."""
     certificate: Certificate
     """Of these locations; its dual is feasible."""
     iterations: int
@@ -73,9 +78,7 @@ def solve_hybrid(
     graph: ViewGraph,
     tol: float,
     max_iterations: int,
-    *,
-    threads: int = 1,
-    memory_bytes: int = DEFAULT_FACTOR_BYTES,
+    resources: Resources = ONE_THREAD,
     prediction: Prediction | None = None,
     on_iteration: OnIteration | None = None,
 ) -> HybridResult:
@@ -86,8 +89,7 @@ def solve_hybrid(
         tol: the certified gap wanted, in units of the objective.
         max_iterations: limit of iterations of the splitting. Newton steps follow a stall, or a few hundred
             iterations where they are cheap, not this limit.
-        threads: of the passes over edges and of the factor; the result does not depend on it.
-        memory_bytes: what a factor may take.
+        resources: threads, of the passes over edges and of the factor, and memory of a factor.
         prediction: of the factor, if it is there already, to save a second ordering.
         on_iteration: called after each iteration and each factorization; returning False cancels. What
             has been reached is certified all the same.
@@ -95,100 +97,71 @@ def solve_hybrid(
     Raises:
         UnsolvableError: if the graph is not connected.
     """
-    factor = laplacian_factor(graph, memory_bytes, prediction=prediction, threads=threads)
-    patience = (
-        min(max_iterations, _SPLITTING_BEFORE_NEWTON)
-        if _is_cheap(factor, graph.dimension)
-        else max_iterations
-    )
-    splitting = Splitting(graph, factor, threads)
+    factor = laplacian_factor(graph, resources, prediction)
+    resources = resources._replace(factor=factor)
+    patience = max_iterations
+    if _is_cheap(factor, graph.dimension):
+        patience = min(max_iterations, _SPLITTING_BEFORE_NEWTON)
+    splitting = Splitting(graph, resources)
     try:
-        result = _split(splitting, graph, factor, tol, patience, threads, on_iteration)
+        result = _split(splitting, tol, patience, on_iteration)
     finally:
         splitting.close()
     gave_up = result.stop is HybridStop.MAX_ITERATIONS and patience < max_iterations
     if not gave_up and result.stop is not HybridStop.INACCURATE:
         return result
     del splitting  # its arrays over edges make room for the factor
-    return _newton(graph, factor, result, tol, memory_bytes, on_iteration)
+    return _newton(graph, resources, result, tol, on_iteration)
 
 
 def _split(
-    splitting: Splitting,
-    graph: ViewGraph,
-    factor: LaplacianFactor,
-    tol: float,
-    max_iterations: int,
-    threads: int,
-    on_iteration: OnIteration | None,
+    splitting: Splitting, tol: float, max_iterations: int, on_iteration: OnIteration | None
 ) -> HybridResult:
     """Alternate splitting and certificate until the gap is below the tolerance or one of them gives up."""
-    target = _FIRST_TARGET_PER_TOL * tol
+    graph, resources, target = splitting.graph, splitting.resources, _FIRST_TARGET_PER_TOL * tol
     for attempts_left in reversed(range(_CERTIFICATES)):
-        step = splitting.run(0.0, target, max_iterations, on_iteration)
-        t, y = step.locations, step.dual
-        if step.stop is Stop.ACCURATE and attempts_left:
-            certificate = certify_within(graph, t, y, tol, factor=factor, threads=threads)
-        else:
-            certificate = certify(graph, t, y, tol=tol, factor=factor, threads=threads, overwrite_dual=True)
+        step = splitting.run(Goal(0.0, target, max_iterations), on_iteration)
+        hopeless = tol if step.stop is Stop.ACCURATE and attempts_left else np.inf
+        certificate = certify_in_place(graph, step.locations, step.dual, tol, hopeless, resources)
         if certificate is not None:
             break
         target *= _TARGET_SHRINKAGE
     assert certificate is not None, "the last one is taken as it is"
+    ends = {Stop.CANCELLED: HybridStop.CANCELLED, Stop.MAX_ITERATIONS: HybridStop.MAX_ITERATIONS}
+    is_certified = certificate.gap <= tol
     return HybridResult(
-        locations=t,
+        locations=step.locations,
         certificate=certificate,
         iterations=step.iterations,
         factorizations=0,
-        stop=_verdict(certificate, step.stop, tol),
+        stop=HybridStop.CERTIFIED if is_certified else ends.get(step.stop, HybridStop.INACCURATE),
     )
-
-
-def _verdict(certificate: Certificate, stop: Stop, tol: float) -> HybridStop:
-    """Return what a certified answer of the splitting amounts to."""
-    if certificate.gap <= tol:
-        return HybridStop.CERTIFIED
-    ends = {Stop.CANCELLED: HybridStop.CANCELLED, Stop.MAX_ITERATIONS: HybridStop.MAX_ITERATIONS}
-    return ends.get(stop, HybridStop.INACCURATE)
 
 
 def _newton(
     graph: ViewGraph,
-    factor: LaplacianFactor,
+    resources: Resources,
     result: HybridResult,
     tol: float,
-    memory_bytes: int,
     on_iteration: OnIteration | None,
 ) -> HybridResult:
     """Go on from the best certified point by Newton steps, if their factor fits."""
-    d = graph.dimension
+    d, factor = graph.dimension, resources.factor
     plan = factor.symbolic if isinstance(factor, CholeskyFactor) else None
-    fits = plan is not None and plan.num_bytes(d, np.float64) <= memory_bytes
-    if plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
+    fits = plan is not None and plan.num_bytes(d, np.float64) <= resources.memory_bytes
+    if factor is None or plan is None or not fits or plan.flops * d**3 > _NEWTON_FLOPS:
         return replace(result, stop=HybridStop.TOO_LARGE)
-    cancelled = False
-
-    def report(info: IterationInfo) -> bool | None:
-        nonlocal cancelled
-        if on_iteration is None:
-            return None
-        answer = on_iteration(
-            IterationInfo(result.iterations + info.iteration, info.objective, info.dual_bound)
-        )
-        cancelled = answer is not None and not answer
-        return not cancelled
-
-    count = 0
+    watch, count = Watch(on_iteration, done=result.iterations), 0
     for start in (result.locations, result.certificate.dual), None:
         if start is None and not _is_cheap(factor, d):
             break
-        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, report, start=start, plan=plan)
-        result, count = _better(graph, result, t, y, tol, factor), count + steps
-        if cancelled or result.certificate.gap <= tol:
+        t, y, steps = solve_newton_sparse(graph, tol, _NEWTON_STEPS, watch, start=start, plan=plan)
+        result, count = _better(graph, result, t, y, tol, resources), count + steps
+        if watch.cancelled or result.certificate.gap <= tol:
             break
-    stop = HybridStop.NEWTON if result.certificate.gap <= tol else HybridStop.INACCURATE
-    if cancelled and stop is HybridStop.INACCURATE:
-        stop = HybridStop.CANCELLED
+    stop = HybridStop.CANCELLED if watch.cancelled else HybridStop.INACCURATE
+    if result.certificate.gap <= tol:
+        stop = HybridStop.NEWTON
     return replace(result, factorizations=count, stop=stop)
 
 
@@ -198,12 +171,12 @@ def _is_cheap(factor: LaplacianFactor, dimension: int) -> bool:
 
 
 def _better(
-    graph: ViewGraph, result: HybridResult, t: FloatArray, y: FloatArray, tol: float, factor: LaplacianFactor
+    graph: ViewGraph, result: HybridResult, t: FloatArray, y: FloatArray, tol: float, resources: Resources
 ) -> HybridResult:
     """Return the result with other locations and their certificate, if its gap is smaller."""
     if not (np.isfinite(t).all() and projected_length(graph, t) > 0.0):
         return result
-    certificate = certify(graph, t, y, tol=tol, factor=factor)
-    if not certificate.gap < result.certificate.gap:
+    certificate = certify_in_place(graph, t, y, tol, np.inf, resources)
+    if certificate is None or not certificate.gap < result.certificate.gap:
         return result
     return replace(result, locations=t - t.mean(axis=0), certificate=certificate)
