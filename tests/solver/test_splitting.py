@@ -391,7 +391,7 @@ def test_acceleration_begins_where_the_fitting_edges_stay(accelerate, inside, be
     sums = np.zeros(5)
     sums[INTERIOR] = inside
     passes = SimpleNamespace(data=SimpleNamespace(bounds=(0, 100)))
-    asked = SimpleNamespace(settings=SimpleNamespace(accelerate=accelerate), passes=passes)
+    asked = SimpleNamespace(tuning=SimpleNamespace(accelerate=accelerate), passes=passes)
     state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(100), sums=sums, interior=before)
     assert (Iteration._accelerator(asked, state) is not None) == accelerated
     assert state.interior == inside / 100
@@ -405,7 +405,7 @@ def test_acceleration_forgets_its_history_after_a_step_that_made_things_much_wor
     passes = SimpleNamespace(
         step=lambda *_: (None, np.array([0.0, 0.0, 0.0, change, 0.0])), pull=lambda *_: np.ones((3, 3))
     )
-    asked = SimpleNamespace(settings=SimpleNamespace(relaxation=1.7), passes=passes)
+    asked = SimpleNamespace(tuning=SimpleNamespace(relaxation=1.7), passes=passes)
     state = engine.State(x=x, t=np.zeros((3, 3)), rho=np.ones(4), steps=[10.0], anderson=history)
     Iteration._pass(asked, state)
     assert calls == ["restart"] * restarts
