@@ -36,8 +36,12 @@ def estimate_directions(
         estimate_pairs(rows, *given, *settings, directions, measures, moments)
 
     shares = np.array_split(np.arange(k, dtype=np.int64), max(1, threads))
-    with ThreadPoolExecutor(len(shares)) as pool:
-        list(pool.map(run, shares))
+    if len(shares) == 1:
+        # Where memory is short, Python waits for ever for a thread that could not begin.
+        run(shares[0])
+    else:
+        with ThreadPoolExecutor(len(shares)) as pool:
+            list(pool.map(run, shares))
     return _judge(matches, directions, measures, moments, options)
 
 
