@@ -102,8 +102,7 @@ def locate(
             kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = choose_gauge(model, placement, kept, rigid, options, priors_known)
             if priors_known is not None and options.refine_with_priors:
-                settings = options
-                placement, gauge = pull_to_priors(placement, gauge, priors_known, settings)
+                placement, gauge = pull_to_priors(placement, gauge, priors_known, options)
                 kept = select_trusted(placement, options.min_trust)
         with clock("further pieces"):
             further = place_further_pieces(source, placement, options)
