@@ -222,7 +222,7 @@ def _over_rows(run: Callable[[int, int], Part], n: int, threads: int) -> list[Pa
         return list(pool.map(run, bounds[:-1], bounds[1:]))
 
 
-@kernel(exact=True)
+@kernel
 def _least_sines(
     t: FloatArray, exceptions: int, low: int, high: int
 ) -> tuple[FloatArray, FloatArray, IntArray]:
@@ -263,7 +263,7 @@ def _least_sines(
     return least, most, collinear
 
 
-@kernel(exact=True)
+@kernel
 def _spread_in_space(t: FloatArray, adjacency: BoolArray, low: int, high: int) -> FloatArray:
     """Return the well-distributedness of the pairs (i, j > i), the least of each row low..high; d = 3.
 
@@ -297,7 +297,7 @@ def _spread_in_space(t: FloatArray, adjacency: BoolArray, low: int, high: int) -
     return worst
 
 
-@kernel(exact=True)
+@kernel
 def _orthogonal_axis(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return a unit vector orthogonal to a unit vector."""
     if abs(x) < 0.6:
@@ -307,7 +307,7 @@ def _orthogonal_axis(x: float, y: float, z: float) -> tuple[float, float, float]
     return y / size, -x / size, 0.0
 
 
-@kernel(exact=True)
+@kernel
 def _least_sum_of_sines(phi: FloatArray) -> float:
     """Return min over s of sum_k |sin(phi_k - phi_s)| for sorted angles in [0, pi)."""
     sines, cosines = np.sin(phi), np.cos(phi)

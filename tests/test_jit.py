@@ -22,7 +22,7 @@ def test_a_kernel_works_where_nothing_can_be_cached(monkeypatch):
 
     monkeypatch.setattr(numba, "njit", without_a_place_for_a_cache)
 
-    @kernel(exact=True)
+    @kernel
     def twice(x):
         return 2 * x
 
@@ -46,7 +46,7 @@ def test_a_kernel_that_closes_over_a_value_is_refused():
     factor = 2
     with pytest.raises(TypeError, match="closes over a value"):
 
-        @kernel()
+        @kernel
         def scale(x):
             return factor * x
 
@@ -87,7 +87,7 @@ COMPILE = """
 from sfm_shapefit.jit import kernel, on_compilation
 def plus_one(x):
     return x + 1
-assert kernel()(plus_one)(1) == 2
+assert kernel(plus_one)(1) == 2
 """
 
 
@@ -139,7 +139,7 @@ def test_no_kernel_hands_a_named_tuple_to_python():
         if "NamedTuple" in text or "kernel" in text or "/solver/" in str(path)
     }
     assert list(crossings(modules)) == []
-    sin = "class P(NamedTuple): pass\n@kernel()\ndef f() -> tuple[int, P]: pass\ndef g(): return f()"
+    sin = "class P(NamedTuple): pass\n@kernel\ndef f() -> tuple[int, P]: pass\ndef g(): return f()"
     assert list(crossings({"a": sin, "b": "from a import f\ndef h(): return f()"})) == ["f", "f"]
 
 

@@ -208,7 +208,7 @@ def _pairs(
     return first, seconds
 
 
-@kernel()
+@kernel
 def _meet(
     first_of_node: Any,
     by_node: Any,

@@ -148,7 +148,7 @@ def _refuse_singular(failed: bool, pivots: FloatArray) -> None:
         raise UnsolvableError(_UNDETERMINED)
 
 
-@kernel(exact=True)
+@kernel
 def _fill(rows: Any, pair_nodes: Any, diagonal: Any, pairs: Any, columns: Any) -> None:
     """Write the lower triangle of a matrix, given by its contiguous columns."""
     for i in range(len(rows)):

@@ -145,7 +145,7 @@ def _chunks(layout: Layout) -> list[tuple[int, int]]:
     return list(zip([0, *cuts], [*cuts, layout.num_points], strict=True))
 
 
-@kernel(inline=True)
+@kernel
 def _look(given: Any, camera: int, point: Any, body: Any, seen: Any) -> bool:
     """Write the point in axes of the frame and of the camera; return whether it is in front."""
     _, _, _, frame_of_camera, _, sensor_rotations, sensor_translations, rotations, centers, _, _, _ = given
@@ -162,7 +162,7 @@ def _look(given: Any, camera: int, point: Any, body: Any, seen: Any) -> bool:
     return bool(seen[2] > _LEAST_DEPTH * distance)
 
 
-@kernel(inline=True)
+@kernel
 def _project(seen: Any, lens: Any, pixel: Any) -> None:
     """Write the pixel of a point in front of the camera."""
     u, v = seen[0] / seen[2], seen[1] / seen[2]
@@ -172,7 +172,7 @@ def _project(seen: Any, lens: Any, pixel: Any) -> None:
     pixel[1] = lens[1] * (v * radial + 2.0 * lens[7] * u * v + lens[6] * (s + 2.0 * v * v)) + lens[3]
 
 
-@kernel(inline=True)
+@kernel
 def _differentiate(seen: Any, lens: Any, by_seen: Any, by_lens: Any) -> None:
     """Write the derivatives of the pixel by the point (2, 3) and by the OPENCV parameters (2, 8)."""
     inverse = 1.0 / seen[2]
@@ -196,7 +196,7 @@ def _differentiate(seen: Any, lens: Any, by_seen: Any, by_lens: Any) -> None:
     by_lens[0, 7], by_lens[1, 7] = lens[0] * (s + 2.0 * u * u), lens[1] * 2.0 * u * v
 
 
-@kernel()
+@kernel
 def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
     """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length."""
     first, cameras, pixels, _, lens_of_camera, _, _, _, _, points, lenses, scale = given
@@ -212,7 +212,7 @@ def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
             total[0] += 0.5 * square if plain else 0.5 * scale * np.log1p(square / scale)
 
 
-@kernel()
+@kernel
 def _write_residuals(given: Any, out: Any) -> None:
     """Write the residuals in the order of the points; NaN behind the camera."""
     first, cameras, pixels, _, lens_of_camera, _, _, _, _, points, lenses, _ = given
@@ -225,7 +225,7 @@ def _write_residuals(given: Any, out: Any) -> None:
                 out[k] -= pixels[k]
 
 
-@kernel()
+@kernel
 def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_point_sums: Any) -> None:
     """Add the observations of the points begin..end-1 to the normal equations."""
     first, cameras, pixels, frame_of_camera, lens_of_camera, _, _, _, _, points, lenses, scale = given
@@ -264,7 +264,7 @@ def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
                     _add_product(by_frame, weighted, links[link_of_camera[camera]])
 
 
-@kernel(inline=True)
+@kernel
 def _turn_derivatives(
     given: Any, camera: int, body: Any, by_seen: Any, turns: bool, by_point: Any, by_frame: Any
 ) -> None:
@@ -287,7 +287,7 @@ def _turn_derivatives(
             by_frame[row, 5] = body[0] * g1 - body[1] * g0
 
 
-@kernel(inline=True)
+@kernel
 def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, float, float]:
     """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature.
 
@@ -302,7 +302,7 @@ def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, flo
     return w, w * (1.0 - bend * x * x), -w * bend * x * y, w * (1.0 - bend * y * y)
 
 
-@kernel(inline=True)
+@kernel
 def _add_point(by_point: Any, weights: Any, residual: Any, block: Any, gradient: Any) -> None:
     """Add J^T M J, packed, and J^T w r to a point."""
     w, m00, m01, m11 = weights
@@ -316,7 +316,7 @@ def _add_point(by_point: Any, weights: Any, residual: Any, block: Any, gradient:
             at += 1
 
 
-@kernel(inline=True)
+@kernel
 def _add_node(by_node: Any, weights: Any, residual: Any, weighted: Any, block: Any, gradient: Any) -> None:
     """Add J^T M J and J^T w r to a node, and leave M J in `weighted`."""
     w, m00, m01, m11 = weights
@@ -328,7 +328,7 @@ def _add_node(by_node: Any, weights: Any, residual: Any, weighted: Any, block: A
     _add_product(by_node, weighted, block)
 
 
-@kernel(inline=True)
+@kernel
 def _collect_slots(by_values: Any, slots: Any, by_lens: Any) -> None:
     """Write the derivatives by a lens' unknowns: the sum over the OPENCV parameters that each of them is."""
     by_lens[:] = 0.0
@@ -338,7 +338,7 @@ def _collect_slots(by_values: Any, slots: Any, by_lens: Any) -> None:
             by_lens[1, slots[q]] += by_values[1, q]
 
 
-@kernel(inline=True)
+@kernel
 def _add_product(left: Any, right: Any, out: Any) -> None:
     """Add left^T right to out; left is (2, a), right (2, 6)."""
     for a in range(left.shape[1]):

@@ -78,7 +78,7 @@ def step_points(
     return steps
 
 
-@kernel(exact=True)
+@kernel
 def _invert(blocks: Any, damping: float, inverses: Any) -> None:
     """Invert 3 x 3 blocks L D L^T with a damped diagonal; the inverse of a pivot that is rounding is 0."""
     more = 1.0 + damping
@@ -101,7 +101,7 @@ def _invert(blocks: Any, damping: float, inverses: Any) -> None:
         inverses[p, 5] = i2
 
 
-@kernel()
+@kernel
 def _reduce(
     begin: int, end: int, first_of_node: Any, entries_by_node: Any, entry_point: Any, entry_node: Any,
     first_entry: Any, first_pair: Any, pair_nodes: Any, entries: Any, inverses: Any, point_gradients: Any,
@@ -139,7 +139,7 @@ def _reduce(
                         )
 
 
-@kernel(exact=True)
+@kernel
 def _back_substitute(
     first_entry: Any,
     entry_node: Any,

@@ -57,7 +57,7 @@ def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> Fl
     return scores / num_axes
 
 
-@kernel(exact=True)
+@kernel
 def _greedy_order(start: IntArray, other: Int32Array, weight: FloatArray) -> IntArray:
     """Return the place (n,) of each camera in an order that most weight agrees with.
 

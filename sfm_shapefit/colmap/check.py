@@ -326,7 +326,7 @@ def _check_track_elements(file: _BinaryFile, elements: IntArray, images: _Images
         )
 
 
-@kernel(exact=True)
+@kernel
 def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
     """Return the little-endian uint64 at `offset`."""
     value = np.uint64(0)
@@ -335,7 +335,7 @@ def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
     return value
 
 
-@kernel(exact=True)
+@kernel
 def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> int:
     """Fill in the offset of each point and the end of the last; return how many points are complete."""
     size = len(data)
@@ -353,7 +353,7 @@ def _walk_points(data: npt.NDArray[np.uint8], offset: int, starts: IntArray) -> 
     return count
 
 
-@kernel(exact=True)
+@kernel
 def _read_points(data: npt.NDArray[np.uint8], starts: IntArray, ids: UInt64Array, elements: IntArray) -> int:
     """Fill in ids and track elements; return the first point whose xyz is not finite, or -1.
 

@@ -35,7 +35,7 @@ _MIN_VOTE_PX = 2.0
 _VOTE_SIGMAS = 6.0
 
 
-@kernel(exact=True)
+@kernel
 def estimate_pairs(
     rows: IntArray,
     offsets: IntArray,
@@ -72,7 +72,7 @@ def estimate_pairs(
         directions[p] = sign * d
 
 
-@kernel(exact=True)
+@kernel
 def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> FloatArray:
     """Return (a x b) / pixel_angle for every match: its length is the parallax in pixels."""
     normals = np.empty_like(a)
@@ -83,31 +83,31 @@ def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> Float
     return normals
 
 
-@kernel(exact=True)
+@kernel
 def _dot(rows: FloatArray, k: int, d: FloatArray) -> float:
     """Return the inner product of row k with d."""
     return float(rows[k, 0] * d[0] + rows[k, 1] * d[1] + rows[k, 2] * d[2])
 
 
-@kernel(exact=True)
+@kernel
 def _length(rows: FloatArray, k: int) -> float:
     """Return the norm of row k."""
     return float(np.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2))
 
 
-@kernel(exact=True)
+@kernel
 def _squared_gradient(along_a: float, along_b: float) -> float:
     """Return |a x d|^2 + |b x d|^2 from <a, d> and <b, d>, floored where both rays run along the baseline."""
     return float(max(2.0 - along_a * along_a - along_b * along_b, 1e-12))
 
 
-@kernel(exact=True)
+@kernel
 def _residual(a: FloatArray, b: FloatArray, normals: FloatArray, d: FloatArray, k: int) -> float:
     """Return the signed Sampson error of match k in px."""
     return float(_dot(normals, k, d) / np.sqrt(_squared_gradient(_dot(a, k, d), _dot(b, k, d))))
 
 
-@kernel(exact=True)
+@kernel
 def _best_hypothesis(
     a: FloatArray,
     b: FloatArray,
@@ -146,7 +146,7 @@ def _best_hypothesis(
     return best
 
 
-@kernel(exact=True)
+@kernel
 def _refine(
     a: FloatArray,
     b: FloatArray,
@@ -183,13 +183,13 @@ def _refine(
     return noise_px, cap_px
 
 
-@kernel(exact=True)
+@kernel
 def _width(noise_px: float) -> float:
     """Return the width of the kernel in px."""
     return float(min(max(_WIDTH * noise_px, _MIN_WIDTH_PX), _MAX_WIDTH_PX))
 
 
-@kernel(exact=True)
+@kernel
 def _fill_residuals(
     a: FloatArray, b: FloatArray, normals: FloatArray, d: FloatArray, residuals: FloatArray
 ) -> None:
@@ -198,7 +198,7 @@ def _fill_residuals(
         residuals[k] = _residual(a, b, normals, d, k)
 
 
-@kernel(exact=True)
+@kernel
 def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tuple[float, float]:
     """Return the noise and the leverage cap in px, from the matches whose residual is below the cutoff.
 
@@ -223,14 +223,14 @@ def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tupl
     return noise_px, _LEVERAGE * np.partition(parallaxes[:seen], rank)[rank]
 
 
-@kernel(exact=True)
+@kernel
 def _leverage_weight(normals: FloatArray, k: int, cap_px: float) -> float:
     """Return the weight of match k by its parallax alone: (cap / parallax)^2 beyond the cap."""
     ratio = cap_px / max(_length(normals, k), 1e-300)
     return float(min(1.0, ratio * ratio))
 
 
-@kernel(exact=True)
+@kernel
 def _slope(
     a: FloatArray,
     b: FloatArray,
@@ -247,7 +247,7 @@ def _slope(
     return float(_dot(normals, k, axis) / np.sqrt(square) + residual * turn / square)
 
 
-@kernel(exact=True)
+@kernel
 def _fill_basis(d: FloatArray, basis: FloatArray) -> None:
     """Fill the rows of `basis` (2, 3) with an orthonormal basis of the plane orthogonal to d."""
     smallest = np.argmin(np.abs(d))
@@ -259,7 +259,7 @@ def _fill_basis(d: FloatArray, basis: FloatArray) -> None:
     basis[1, 2] = d[0] * basis[0, 1] - d[1] * basis[0, 0]
 
 
-@kernel(exact=True)
+@kernel
 def _fill_normal_matrix(
     a: FloatArray,
     b: FloatArray,
@@ -286,7 +286,7 @@ def _fill_normal_matrix(
         out[4] += weight * y * r
 
 
-@kernel(exact=True)
+@kernel
 def _fill_moments(
     a: FloatArray,
     b: FloatArray,
@@ -334,7 +334,7 @@ def _fill_moments(
     moments[1] = (few * squared / total) * steep
 
 
-@kernel(exact=True)
+@kernel
 def _depth_sign(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> int:
     """Return 1 if match k meets in front of both cameras for the baseline +d, -1 if behind both, else 0."""
     cosine = a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1] + a[k, 2] * b[k, 2]
@@ -343,7 +343,7 @@ def _depth_sign(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> int:
     return int(depth_i > 0.0 and depth_j > 0.0) - int(depth_i < 0.0 and depth_j < 0.0)
 
 
-@kernel(exact=True)
+@kernel
 def _count_sides(
     a: FloatArray,
     b: FloatArray,
@@ -365,7 +365,7 @@ def _count_sides(
     return -1.0 if behind > front else 1.0
 
 
-@kernel(exact=True)
+@kernel
 def _measure(
     a: FloatArray,
     b: FloatArray,
@@ -387,7 +387,7 @@ def _measure(
     measures[6], measures[7] = np.median(np.abs(residuals[inliers])), np.median(angles)
 
 
-@kernel(exact=True)
+@kernel
 def _count_rivals(
     a: FloatArray,
     b: FloatArray,

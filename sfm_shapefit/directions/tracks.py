@@ -176,7 +176,7 @@ def _worth(tracks: Tracks) -> FloatArray:
     return np.asarray(np.sqrt(tracks.lengths()) * np.minimum(widest, _WIDEST_RAD))
 
 
-@kernel()
+@kernel
 def _greedy_cover(
     order: IntArray, offsets: IntArray, cameras: IntArray, num_cameras: int, per_camera: int
 ) -> BoolArray:

@@ -70,7 +70,7 @@ def sample_direction_errors(
     return errors
 
 
-@kernel(exact=True)
+@kernel
 def _add_scores(
     pairs: Any,
     offsets: Any,
@@ -104,7 +104,7 @@ def _add_scores(
             _add_samples(pairs[p], keypoints[k], factors, score, scores[p])
 
 
-@kernel(exact=True)
+@kernel
 def _tangential(ray: Any, vector: Any, out: Any) -> None:
     """Write the components of a vector along two axes across a ray that depend on the ray alone."""
     axis = np.zeros(3)
@@ -115,7 +115,7 @@ def _tangential(ray: Any, vector: Any, out: Any) -> None:
     out[1] = np.sum(np.cross(ray, first) * vector)
 
 
-@kernel(exact=True)
+@kernel
 def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -> None:
     """Add the score of one match times its residual in each sample."""
     for first in range(0, len(scores), _SIGNS_PER_HASH):
@@ -132,7 +132,7 @@ def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -
                 scores[k, c] += residual * score[c]
 
 
-@kernel(exact=True)
+@kernel
 def _hash(image: int, keypoint: int, sample: int) -> Any:
     """Return 64 random bits of a keypoint."""
     x = np.uint64(image) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(keypoint)

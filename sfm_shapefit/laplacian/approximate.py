@@ -91,14 +91,14 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     return ApproximateCholesky(*(frozen(part) for part in parts))
 
 
-@kernel(exact=True)
+@kernel
 def _uniform(state: Any) -> float:
     """Return the next draw from [0, 1), by splitmix64."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     return (mix_bits(state[0]) >> np.uint64(11)) * (1.0 / 9007199254740992.0)  # type: ignore[no-any-return]
 
 
-@kernel(exact=True)
+@kernel
 def _push(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
     """Put node v first into the bucket of its degree."""
     first = bucket[degree[v]]
@@ -109,7 +109,7 @@ def _push(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
     bucket[degree[v]] = v
 
 
-@kernel(exact=True)
+@kernel
 def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
     """Take node v out of the bucket of its degree."""
     if above[v] >= 0:
@@ -120,7 +120,7 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
         above[below[v]] = above[v]
 
 
-@kernel(exact=True)
+@kernel
 def _enlarge(array: Any, size: int) -> Any:
     """Return a copy of an array with room for `size` entries."""
     larger = np.empty((size, *array.shape[1:]), array.dtype)
@@ -128,7 +128,7 @@ def _enlarge(array: Any, size: int) -> Any:
     return larger
 
 
-@kernel(exact=True)
+@kernel
 def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> Any:
     """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
@@ -152,7 +152,7 @@ def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> An
     return head, links, values, degree, np.array([-1, used])
 
 
-@kernel(exact=True)
+@kernel
 def _add_entry(
     head: Any, links: Any, values: Any, degree: Any, pool: Any, here: int, there: int, w: float
 ) -> None:
@@ -168,7 +168,7 @@ def _add_entry(
     degree[here] += 1
 
 
-@kernel(exact=True)
+@kernel
 def _merge_star(
     v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
     below: Any, step: Any, place: Any, star: Any, star_weight: Any,
@@ -198,7 +198,7 @@ def _merge_star(
     return size
 
 
-@kernel(exact=True)
+@kernel
 def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
     """Sort the neighbors by weight, ascending, equal ones by node; sum the weights from each to the last.
 
@@ -217,7 +217,7 @@ def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
         tail[i] = tail[i + 1] + star_weight[i]
 
 
-@kernel(exact=True)
+@kernel
 def _sample_clique(
     size: int, star: Any, star_weight: Any, tail: Any, head: Any, links: Any, values: Any, degree: Any,
     pool: Any, state: Any,
@@ -237,7 +237,7 @@ def _sample_clique(
         _add_entry(head, links, values, degree, pool, star[low], star[a], w)
 
 
-@kernel(exact=True)
+@kernel
 def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, state: Any) -> Any:
     """Eliminate all nodes, each time one with the fewest edges left."""
     n = len(pointers) - 1
@@ -277,7 +277,7 @@ def _eliminate_all(pointers: Any, neighbors: Any, edge_of: Any, weights: Any, st
     return permutation, columns, step[rows[: columns[n]]], fractions[: columns[n]].copy(), pivots
 
 
-@kernel(exact=True)
+@kernel
 def _substitute(pointers: Any, rows: Any, fractions: Any, pivots: Any, x: Any) -> None:
     """Apply the inverse of the factor to three columns in place."""
     n = len(pivots)

@@ -334,7 +334,7 @@ def _factor_large(factor: CholeskyFactor, panels: _Panels, parts: _Parts, s: int
     return False
 
 
-@kernel(exact=True)
+@kernel
 def _sum_at_nodes(panels: Any, parts: Any) -> None:
     """Write the diagonal blocks of the Laplacian, in elimination order: sums over incident edges."""
     first, row_pointers, rows = panels.first, panels.row_pointers, panels.rows
@@ -353,7 +353,7 @@ def _sum_at_nodes(panels: Any, parts: Any) -> None:
                 diagonal[j, a] += w
 
 
-@kernel(exact=True)
+@kernel
 def _factorize(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot: Any, blas: Any) -> bool:
     """Factor the supernodes begin..end-1; return True if a pivot was not positive.
 
@@ -384,7 +384,7 @@ def _factorize(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot:
     return False
 
 
-@kernel(exact=True)
+@kernel
 def _assemble_front(s: int, panels: Any, parts: Any, arena: int) -> None:
     """Write the panel of a supernode before it is factored: edges, diagonal, children's updates."""
     b, row_pointers = panels.b, panels.row_pointers
@@ -398,7 +398,7 @@ def _assemble_front(s: int, panels: Any, parts: Any, arena: int) -> None:
     _add_children(s, panels, parts, arena, 0, width // b, panel, height)
 
 
-@kernel(exact=True)
+@kernel
 def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
     """Add what the children leave for later fronts to the update of s, which starts at `update`."""
     width = panels.first[s + 1] - panels.first[s]
@@ -408,7 +408,7 @@ def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
     _add_children(s, panels, parts, arena, width, width + below, mine, leading)
 
 
-@kernel(exact=True)
+@kernel
 def _add_children(
     s: int, panels: Any, parts: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
@@ -421,7 +421,7 @@ def _add_children(
         _add_update(update, there, b, lowest, highest, target, leading)
 
 
-@kernel(exact=True)
+@kernel
 def _subtract_strip(blas: Any, a: Any, shape: Any, c: Any, accumulate: bool) -> None:
     """Subtract a a^T from the first columns of the lower triangle of the block c, or store -a a^T there.
 
@@ -434,7 +434,7 @@ def _subtract_strip(blas: Any, a: Any, shape: Any, c: Any, accumulate: bool) -> 
         gemm(blas, lower, a, (rows - strip, strip, columns), (c[0], c[1] + strip, c[2]), accumulate)
 
 
-@kernel(exact=True)
+@kernel
 def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None:
     """Subtract the edges' weights from the panel of a supernode at their slots."""
     index, row, column, weights = parts.edge_index, parts.edge_row, parts.edge_column, parts.weights
@@ -446,7 +446,7 @@ def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None
                 panel[at + a] -= weights[e, c * b + a]
 
 
-@kernel(exact=True)
+@kernel
 def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, diagonal: Any) -> None:
     """Add the diagonal blocks of the nodes start..stop-1 to a panel."""
     for q in range(stop - start):
@@ -456,7 +456,7 @@ def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, d
                 panel[at + a] += diagonal[start + q, c * b + a]
 
 
-@kernel(exact=True)
+@kernel
 def _check_pivots(s: int, panels: Any, parts: Any, pivot: Any) -> None:
     """Lower pivot[0] to the least ratio of a squared pivot to its diagonal entry, and note its row."""
     b, start = panels.b, panels.first[s]
@@ -471,7 +471,7 @@ def _check_pivots(s: int, panels: Any, parts: Any, pivot: Any) -> None:
             pivot[1] = start * b + k
 
 
-@kernel(exact=True)
+@kernel
 def _add_update(
     update: Any, there: Any, b: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
@@ -501,7 +501,7 @@ def _add_update(
                 skip = 0
 
 
-@kernel(exact=True)
+@kernel
 def _add(target: Any, values: Any) -> None:
     """Add one contiguous vector to another."""
     for i in range(len(target)):
@@ -534,7 +534,7 @@ def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
     factor.workers.run([job(_ascend, *task) for task in plan.tasks])
 
 
-@kernel(exact=True)
+@kernel
 def _descend(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
     x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any, outer: Any,
@@ -548,7 +548,7 @@ def _descend(
         _add_below(b, s, first, row_pointers, rows, first[end], x, outer, work)
 
 
-@kernel(exact=True)
+@kernel
 def _ascend(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
     x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any,
@@ -561,7 +561,7 @@ def _ascend(
         _store_front(b, s, first, x, work)
 
 
-@kernel(exact=True)
+@kernel
 def _load_front(
     b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
 ) -> Any:
@@ -580,7 +580,7 @@ def _load_front(
     return at
 
 
-@kernel(exact=True)
+@kernel
 def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
     """Copy a front's own unknowns back to `x`."""
     start, width = first[s] * b, (first[s + 1] - first[s]) * b
@@ -589,7 +589,7 @@ def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
             x[start + i, k] = work[k, i]
 
 
-@kernel(exact=True)
+@kernel
 def _add_below(
     b: int, s: int, first: Any, row_pointers: Any, rows: Any, limit: int, x: Any, outer: Any, work: Any
 ) -> None:
@@ -604,7 +604,7 @@ def _add_below(
         at += b
 
 
-@kernel(exact=True)
+@kernel
 def _forward(
     panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
@@ -627,7 +627,7 @@ def _forward(
         _call_leaf(leaves[0], panels, offset, height, width - 4, work, sizes, numbers)
 
 
-@kernel(exact=True)
+@kernel
 def _backward(
     panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
@@ -650,7 +650,7 @@ def _backward(
             _finish(panels[offset + q * height :][:height], q, j + 4, work)
 
 
-@kernel(exact=True)
+@kernel
 def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
     """Finish unknown q and subtract its column from the rows q+1..end-1."""
     for k in range(3):
@@ -659,7 +659,7 @@ def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
             work[k, i] -= column[i] * work[k, q]
 
 
-@kernel(exact=True)
+@kernel
 def _finish(column: Any, q: int, end: int, work: Any) -> None:
     """Subtract the rows q+1..end-1 of column q from unknown q and finish it."""
     for k in range(3):
@@ -669,7 +669,7 @@ def _finish(column: Any, q: int, end: int, work: Any) -> None:
         work[k, q] = total / column[q]
 
 
-@kernel(exact=True)
+@kernel
 def _call_leaf(
     leaf: int, panels: Any, offset: int, height: int, j: int, work: Any, sizes: Any, numbers: Any
 ) -> None:

@@ -83,7 +83,7 @@ def blas_of(dtype: npt.DTypeLike) -> Blas:
     )
 
 
-@kernel(exact=True)
+@kernel
 def potrf(blas: Any, a: Any, order: int) -> int:
     """Factor the block a = L L^T in place; return 0, or k if the leading minor of order k is not positive."""
     entries, offset, leading = a
@@ -97,7 +97,7 @@ def potrf(blas: Any, a: Any, order: int) -> int:
     return int(integers[2])
 
 
-@kernel(exact=True)
+@kernel
 def trsm(blas: Any, triangle: Any, below: Any, rows: int, columns: int) -> None:
     """Replace the (rows, columns) block `below` by below @ inv(triangle)^T."""
     integers = blas.integers
@@ -115,7 +115,7 @@ def trsm(blas: Any, triangle: Any, below: Any, rows: int, columns: int) -> None:
     call_address(blas.routines[_TRSM], pointers)
 
 
-@kernel(exact=True)
+@kernel
 def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -> None:
     """Subtract a a^T, a of so many rows and columns, from the lower triangle of c, or store -a a^T there."""
     integers = blas.integers
@@ -133,7 +133,7 @@ def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -
     call_address(blas.routines[_SYRK], pointers)
 
 
-@kernel(exact=True)
+@kernel
 def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool) -> None:
     """Subtract left right^T from a block c, or store it negated; shape: (rows, columns, depth)."""
     integers = blas.integers
@@ -152,7 +152,7 @@ def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool)
     call_address(blas.routines[_GEMM], pointers)
 
 
-@kernel(exact=True)
+@kernel
 def solve_factored(blas: Any, a: Any, order: int, b: Any) -> None:
     """Solve L L^T x = b in place for one right-hand side; the array `a` holds L as one block.
 

@@ -66,7 +66,7 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
     return Adjacency(*(frozen(part) for part in _adjacency(num_nodes, edges)))
 
 
-@kernel()
+@kernel
 def _adjacency(num_nodes: int, edges: Any) -> Any:
     """Counting sort of both ends of the edges by node."""
     m = edges.shape[0]
@@ -156,7 +156,7 @@ def assemble(
     return csr_array(indices, shape=(n, n)) if w.ndim == 1 else bsr_array(indices, shape=(n, n))
 
 
-@kernel(exact=True)
+@kernel
 def _assemble(edges: Any, diagonal: Any, upper: Any, lower: Any, weights: Any, data: Any) -> None:
     for e in range(edges.shape[0]):
         i, j = diagonal[edges[e, 0]], diagonal[edges[e, 1]]
@@ -261,13 +261,13 @@ class LaplacianOperator:
         return out
 
 
-@kernel(exact=True)
+@kernel
 def _write_entries(edge_of: Any, weights: Any, out: Any) -> None:
     for p in range(len(out)):
         out[p] = weights[edge_of[p]]
 
 
-@kernel(exact=True)
+@kernel
 def _degrees(pointers: Any, entries: Any, out: Any) -> None:
     for i in range(len(out)):
         total = 0.0
@@ -276,7 +276,7 @@ def _degrees(pointers: Any, entries: Any, out: Any) -> None:
         out[i] = total
 
 
-@kernel(exact=True)
+@kernel
 def _apply_entries_3(
     first: int, last: int, pointers: Any, neighbors: Any, entries: Any, x: Any, out: Any
 ) -> None:
@@ -291,7 +291,7 @@ def _apply_entries_3(
         out[i, 0], out[i, 1], out[i, 2] = degree * x[i, 0] - s0, degree * x[i, 1] - s1, degree * x[i, 2] - s2
 
 
-@kernel(exact=True)
+@kernel
 def _apply_entries(
     first: int, last: int, pointers: Any, neighbors: Any, entries: Any, x: Any, out: Any
 ) -> None:

@@ -92,7 +92,7 @@ def widest_level(graph: Adjacency) -> int:
     return int(np.bincount(distance[distance >= 0]).max())
 
 
-@kernel()
+@kernel
 def _distances(pointers: Any, neighbors: Any, start: int) -> Any:
     """Return the graph distance of each node from `start`, -1 if not reached, and a farthest node."""
     distance = np.full(len(pointers) - 1, -1)

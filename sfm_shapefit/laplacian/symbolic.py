@@ -219,7 +219,7 @@ def _inverse(permutation: IntArray) -> IntArray:
     return inverse
 
 
-@kernel()
+@kernel
 def _parents(pointers: Any, neighbors: Any, permutation: Any, inverse: Any) -> Any:
     """Return the elimination tree: join the earlier neighbors' trees below each step (with compression)."""
     n = len(permutation)
@@ -238,7 +238,7 @@ def _parents(pointers: Any, neighbors: Any, permutation: Any, inverse: Any) -> A
     return parent
 
 
-@kernel()
+@kernel
 def _postorder(parent: Any) -> Any:
     """Return a postorder of a forest; siblings stay in ascending order."""
     n = len(parent)
@@ -263,7 +263,7 @@ def _postorder(parent: Any) -> Any:
         node = parent[node] if parent[node] >= 0 else n
 
 
-@kernel()
+@kernel
 def _column_counts(pointers: Any, neighbors: Any, permutation: Any, inverse: Any, parent: Any) -> Any:
     """Count the entries of each column of L.
 
@@ -323,7 +323,7 @@ def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray,
     return order, first, supernode_parent, (height - width)[post]
 
 
-@kernel()
+@kernel
 def _merge(label: Any, above: Any, width: Any, height: Any, limits: Any, shares: Any, always: float) -> Any:
     """Merge children into parents while few zeros arise.
 
@@ -355,7 +355,7 @@ def _merge(label: Any, above: Any, width: Any, height: Any, limits: Any, shares:
     return rank[target[label]], tree, width[chosen], height[chosen]
 
 
-@kernel()
+@kernel
 def _panel_rows(
     pointers: Any, neighbors: Any, permutation: Any, inverse: Any, owner: Any, parent: Any, row_pointers: Any
 ) -> Any:
@@ -380,7 +380,7 @@ def _panel_rows(
     return rows
 
 
-@kernel()
+@kernel
 def _relative_positions(first: Any, parent: Any, row_pointers: Any, rows: Any) -> Any:
     """Locate the rows below each supernode in its parent's panel; both lists ascend."""
     relative = np.empty(len(rows), np.int32)
@@ -414,7 +414,7 @@ def _tasks(parent: IntArray, sizes: IntArray) -> tuple[IntArray, IntArray]:
     return tasks, edges[edges[:, 0] < edges[:, 1]]
 
 
-@kernel()
+@kernel
 def _subtrees(parent: Any, sizes: Any) -> Any:
     """Return the first supernode of each subtree and the sum of its sizes."""
     begin, weight = np.arange(len(parent)), sizes.copy()
@@ -444,7 +444,7 @@ def _stack_plan(parent: IntArray, below: IntArray, tasks: IntArray) -> tuple[Int
     return offsets, int(stack), arena
 
 
-@kernel()
+@kernel
 def _stacked(parent: Any, below: Any, root: int) -> Any:
     """Place each update matrix on one of two stacks that grow towards each other; `root`'s is elsewhere.
 
@@ -476,7 +476,7 @@ def _stacked(parent: Any, below: Any, root: int) -> Any:
     return offsets, size
 
 
-@kernel()
+@kernel
 def _edge_slots(edges: Any, inverse: Any, owner: Any, first: Any, row_pointers: Any, rows: Any) -> Any:
     """Group the edges by the supernode of their earlier end and find their row and column in its panel."""
     num, m = len(first) - 1, len(edges)

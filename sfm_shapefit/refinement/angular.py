@@ -321,7 +321,7 @@ def _residuals(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return np.asarray(units - graph.directions)
 
 
-@kernel(exact=True)
+@kernel
 def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
     """Write sum_a q_a q_a^T / (variance_a + level^2) + m v v^T."""
     m, d = v.shape
@@ -339,7 +339,7 @@ def _inform(axes: Any, variances: Any, v: Any, level: Any, out: Any) -> None:
                 out[e, a, b] += mean * v[e, a] * v[e, b]
 
 
-@kernel(exact=True)
+@kernel
 def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool) -> float:
     """Return sum_e w_e / 2 * k^2 rho(chi2 / k^2), rho(x) = atan x, or x / (1 + x) if `steep`."""
     m, d = v.shape
@@ -361,7 +361,7 @@ def _sum_of_kernels(baselines: Any, v: Any, w: Any, information: Any, floor: flo
     return total
 
 
-@kernel(exact=True)
+@kernel
 def _linearize_pairs(
     baselines: Any, v: Any, w: Any, information: Any, floor: float, steep: bool, out: Any
 ) -> None:
@@ -401,7 +401,7 @@ def _linearize_pairs(
         _congruence(weight, across, information[e], half, blocks[e])
 
 
-@kernel(exact=True)
+@kernel
 def _congruence(weight: float, a: Any, middle: Any, half: Any, out: Any) -> None:
     """Write weight * a^T middle a of symmetric a into `out`."""
     d = len(a)

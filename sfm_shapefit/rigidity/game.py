@@ -118,7 +118,7 @@ class _Board(NamedTuple):
     """Marks of the running rigid set, valid where they equal clock[1]; its nodes."""
 
 
-@kernel()
+@kernel
 def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
     """Move one free pebble to node u along a path of copies, sparing node v; False if none is left."""
     board.clock[0] += 1
@@ -145,7 +145,7 @@ def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
     return False
 
 
-@kernel()
+@kernel
 def _reverse_path(board: _Board, u: int, w: int) -> None:
     """Turn the copies on the path found from u to w, so that a pebble of w becomes free at u."""
     slot = _free_slot(board, w)
@@ -159,7 +159,7 @@ def _reverse_path(board: _Board, u: int, w: int) -> None:
     board.free[u] += 1
 
 
-@kernel()
+@kernel
 def _free_slot(board: _Board, u: int) -> int:
     """Return the first free pebble of a node that has one."""
     slot = 0
@@ -168,7 +168,7 @@ def _free_slot(board: _Board, u: int) -> int:
     return slot
 
 
-@kernel()
+@kernel
 def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
     """Bring free pebbles to u and v until they hold `wanted` in all, or no more can come; return how many."""
     dimension = board.target.shape[1]
@@ -180,7 +180,7 @@ def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
     return int(board.free[u] + board.free[v])
 
 
-@kernel()
+@kernel
 def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
     """Play the game: place as many copies of each link as are independent of those before.
 
@@ -219,7 +219,7 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
     return mark
 
 
-@kernel()
+@kernel
 def _rigid_set(board: _Board, u: int, v: int) -> int:
     """Collect the largest rigid set around u and v, which hold all the d + 1 pebbles that they can.
 
@@ -244,7 +244,7 @@ def _rigid_set(board: _Board, u: int, v: int) -> int:
     return size
 
 
-@kernel()
+@kernel
 def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
     """Follow all copies from w: if none escapes to a free pebble, all nodes met join the rigid set."""
     rigid = board.clock[1]
@@ -276,7 +276,7 @@ def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
     return size
 
 
-@kernel()
+@kernel
 def _sets_by_marks(board: _Board, owner: IntArray, num_sets: int, mark: IntArray) -> IntArray:
     """Return a root set for each set: sets with two nodes of the same mark have the same."""
     parent = np.arange(num_sets)
@@ -289,7 +289,7 @@ def _sets_by_marks(board: _Board, owner: IntArray, num_sets: int, mark: IntArray
     return parent
 
 
-@kernel()
+@kernel
 def _sets_by_search(board: _Board, owner: IntArray, num_sets: int) -> IntArray:
     """Return a root set for each set after a full game: sets in the same rigid set have the same."""
     parent = np.arange(num_sets)

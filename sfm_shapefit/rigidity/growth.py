@@ -25,7 +25,7 @@ def compact(label: IntArray) -> IntArray:
     return np.asarray((np.cumsum(used) - 1)[label], dtype=np.int64)
 
 
-@kernel()
+@kernel
 def find_root(parent: IntArray, item: int) -> int:
     """Return the root of an item, halving its path."""
     while parent[item] != item:
@@ -34,7 +34,7 @@ def find_root(parent: IntArray, item: int) -> int:
     return item
 
 
-@kernel()
+@kernel
 def unite(parent: IntArray, a: int, b: int) -> None:
     """Unite the sets of two items under the smaller root."""
     a = find_root(parent, a)
@@ -45,7 +45,7 @@ def unite(parent: IntArray, a: int, b: int) -> None:
         parent[a] = b
 
 
-@kernel()
+@kernel
 def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
     """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same.
 
@@ -92,7 +92,7 @@ def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
     return parent
 
 
-@kernel()
+@kernel
 def incidence(
     num_nodes: int, edges: IntArray, set_of: IntArray, num_sets: int
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
@@ -175,7 +175,7 @@ class _Growth(NamedTuple):
     """The seed's nodes, in the order of joining."""
 
 
-@kernel()
+@kernel
 def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
     """Let each seed absorb what step 2 allows; leave a root set for each set in `parent`."""
     for seed in seeds:
@@ -185,7 +185,7 @@ def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
         growth.parent[b] = find_root(growth.parent, b)
 
 
-@kernel()
+@kernel
 def _grow_seed(growth: _Growth, seed: int) -> int:
     """Absorb each set that meets the seed's nodes a second time; return the work done.
 
@@ -213,7 +213,7 @@ def _grow_seed(growth: _Growth, seed: int) -> int:
     return work
 
 
-@kernel()
+@kernel
 def _reach_out(growth: _Growth, seed: int, b: int, node: int, tail: int) -> int:
     """Mark the nodes of a set that meets the seed at `node`; absorb it if that closes a triangle.
 
@@ -236,7 +236,7 @@ def _reach_out(growth: _Growth, seed: int, b: int, node: int, tail: int) -> int:
     return tail
 
 
-@kernel()
+@kernel
 def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
     """Unite a set with the seed and queue the nodes that it brings; return the queue's new tail."""
     if growth.taken[eaten] == seed:

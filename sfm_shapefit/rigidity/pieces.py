@@ -112,7 +112,7 @@ def rigid_pieces(graph: ViewGraph) -> list[RigidPiece]:
     return [RigidPiece(frozen(own), frozen(pairs), frozen(own[hinge])) for own, pairs, hinge in parts]
 
 
-@kernel()
+@kernel
 def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbors: Int32Array) -> bool:
     """Return whether the first pair grows to all nodes by nodes that are joined to two of its own.
 
@@ -138,7 +138,7 @@ def _grows_from_first_pair(edges: IntArray, start: IntArray, neighbors: Int32Arr
     return bool(size == num_nodes)
 
 
-@kernel()
+@kernel
 def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray[np.bool_]:
     """Return which pairs are among the first `few` kept at one of their nodes, at least, (m,)."""
     kept = np.zeros(num_nodes, dtype=np.int64)

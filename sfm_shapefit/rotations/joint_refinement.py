@@ -64,7 +64,7 @@ class State(NamedTuple):
         return State(turned, self.centers + step[:, 3:])
 
 
-@kernel(exact=True)
+@kernel
 def _add_pair(
     a: FloatArray,
     b: FloatArray,
@@ -99,7 +99,7 @@ def _add_pair(
     return cost
 
 
-@kernel(exact=True)
+@kernel
 def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     """Fill `out` with a x b."""
     out[0] = a[1] * b[2] - a[2] * b[1]
@@ -107,7 +107,7 @@ def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
-@kernel(exact=True)
+@kernel
 def _residual_and_gradient(
     p: FloatArray,
     q: FloatArray,
@@ -139,7 +139,7 @@ def _residual_and_gradient(
     return float(value * size)
 
 
-@kernel(exact=True)
+@kernel
 def _add_pairs(
     offsets: IntArray,
     rays_i: FloatArray,

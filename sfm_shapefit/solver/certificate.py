@@ -201,7 +201,7 @@ def _multiplier(total: FloatArray, c: FloatArray, t: FloatArray) -> float:
     return float(np.vdot(total, t) / np.vdot(c, t))
 
 
-@kernel(exact=True)
+@kernel
 def _unbalanced(total: Any, c: Any, multiplier: float) -> float:
     """Return the largest norm of a row of total - multiplier c: the violation at a camera."""
     worst = 0.0
@@ -358,7 +358,7 @@ def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Re
     return factor.preconditioner if isinstance(factor, IterativeSolver) else factor
 
 
-@kernel(exact=True)
+@kernel
 def _residuals(edges: Any, v: Any, t: Any, out: Any) -> None:
     """Write ||r_e||."""
     for e in range(len(edges)):
@@ -372,7 +372,7 @@ def _residuals(edges: Any, v: Any, t: Any, out: Any) -> None:
         out[e] = np.sqrt(square)
 
 
-@kernel(exact=True)
+@kernel
 def _project(edges: Any, v: Any, w: Any, y: Any, c: Any, total: Any, degrees: Any) -> float:
     """Remove the part of y along v; add D^T (w v), D^T y and the sums of w; return max_e ||y_e|| / w_e."""
     worst = 0.0
@@ -394,7 +394,7 @@ def _project(edges: Any, v: Any, w: Any, y: Any, c: Any, total: Any, degrees: An
     return worst
 
 
-@kernel(exact=True)
+@kernel
 def _clip(metric: Any) -> None:
     """Shorten y_e to its ball, and write what makes u_e of it where it is on the surface."""
     w, y = metric.w, metric.y
@@ -410,7 +410,7 @@ def _clip(metric: Any) -> None:
             y[e, k] *= keep
 
 
-@kernel(exact=True)
+@kernel
 def _apply(metric: Any, first: int, last: int, x: Any, out: Any) -> None:
     """Write D^T S D x of the pairs from `first` to `last` into `out`."""
     edges, v, y, stiffness = metric.edges, metric.v, metric.y, metric.stiffness
@@ -429,7 +429,7 @@ def _apply(metric: Any, first: int, last: int, x: Any, out: Any) -> None:
             out[j, k] -= z
 
 
-@kernel(exact=True)
+@kernel
 def _move(metric: Any, h: Any) -> float:
     """Replace y by y - S D h, orthogonal to v to rounding; return max_e ||y_e|| / w_e."""
     edges, v, y, stiffness = metric.edges, metric.v, metric.y, metric.stiffness
@@ -485,7 +485,7 @@ def _is_regular_dense(graph: ViewGraph, blocks: FloatArray) -> bool:
     return False
 
 
-@kernel(exact=True)
+@kernel
 def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
     """Write the block of each pair in the matrix whose null space is what the dual leaves open, (m, d, d)."""
     d = v.shape[1]
@@ -503,7 +503,7 @@ def _set_conditions(v: Any, w: Any, y: Any, longest: int, blocks: Any) -> None:
             blocks[longest, k, q] += w[longest] * v[longest, k] * v[longest, q]
 
 
-@kernel(exact=True)
+@kernel
 def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any) -> float:
     """Factor the Laplacian of the blocks, its last node grounded; return the least pivot per diagonal entry.
 

@@ -88,14 +88,14 @@ def normalize_locations(graph: ViewGraph, t: FloatArray) -> FloatArray:
     return centered * (float(graph.weights.sum()) / length)
 
 
-@kernel(exact=True)
+@kernel
 def _differences(t: Any, edges: Any, out: Any) -> None:
     for e in range(len(edges)):
         for k in range(t.shape[1]):
             out[e, k] = t[edges[e, 0], k] - t[edges[e, 1], k]
 
 
-@kernel(exact=True)
+@kernel
 def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
     for e in range(len(edges)):
         for k in range(y.shape[1]):
@@ -103,7 +103,7 @@ def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
             out[edges[e, 1], k] -= y[e, k]
 
 
-@kernel(exact=True)
+@kernel
 def _add_scale(edges: Any, v: Any, w: Any, out: Any) -> None:
     for e in range(len(edges)):
         for k in range(v.shape[1]):
@@ -111,7 +111,7 @@ def _add_scale(edges: Any, v: Any, w: Any, out: Any) -> None:
             out[edges[e, 1], k] -= w[e] * v[e, k]
 
 
-@kernel(exact=True)
+@kernel
 def _across(x: Any, v: Any, out: Any) -> None:
     for e in range(len(x)):
         length = 0.0
@@ -121,7 +121,7 @@ def _across(x: Any, v: Any, out: Any) -> None:
             out[e, k] = x[e, k] - length * v[e, k]
 
 
-@kernel(exact=True)
+@kernel
 def _sums(t: Any, edges: Any, v: Any, w: Any) -> tuple[float, float]:
     """Return R(T) and L(T)."""
     residual, length = 0.0, 0.0

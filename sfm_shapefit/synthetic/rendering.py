@@ -223,7 +223,7 @@ def _bounds(corners: FloatArray, rays: FloatArray) -> IntArray:
     return bounds
 
 
-@kernel(exact=True)
+@kernel
 def _nearest_triangles(
     rays: FloatArray, inverse: FloatArray, bounds: IntArray
 ) -> tuple[npt.NDArray[np.int32], FloatArray]:
@@ -291,7 +291,7 @@ def _mipmaps(textures: tuple[ByteArray, ...]) -> tuple[ByteArray, IntArray]:
     return np.concatenate(pieces), np.array(padded, dtype=np.int64)
 
 
-@kernel(exact=True)
+@kernel
 def _paint(
     colors: npt.NDArray[np.float32],
     rays: FloatArray,
@@ -325,7 +325,7 @@ def _paint(
                 colors[r, c, a] = brightness[k] * ((1.0 - weight) * sharp + weight * blurred)
 
 
-@kernel(exact=True)
+@kernel
 def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float, float]:
     """Return where in the picture of a triangle its plane is met by a ray."""
     x, y = ray[0], ray[1]
@@ -335,7 +335,7 @@ def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float,
     return u / w, v / w
 
 
-@kernel(exact=True)
+@kernel
 def _bilinear(pyramid: ByteArray, levels: IntArray, level: int, u: float, v: float, channel: int) -> float:
     """Return one color of a picture that repeats for ever, at a position in pixels of its first level."""
     offset, height, width = levels[level, 0], levels[level, 1], levels[level, 2]

@@ -116,7 +116,7 @@ def _allocate_factor(n: int, d: int, dtype: type[np.floating[Any]]) -> DenseFact
     )
 
 
-@kernel()
+@kernel
 def _newton(
     problem: Any,
     iterate: Any,
@@ -140,7 +140,7 @@ def _newton(
     return count, stalled, scalars(progress)
 
 
-@kernel(inline=True)
+@kernel
 def _cycle(
     problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, progress: Any, tol: float
 ) -> Progress:
@@ -167,7 +167,7 @@ def _cycle(
     return close_cycle(iterate, progress, progress.mu, first)
 
 
-@kernel()
+@kernel
 def _start(problem: Any, iterate: Any, linearization: Any, factor: Any) -> bool:
     """Factor the projected Laplacian D^T W P D, which is M at rho = 1, y = r = 0, and start from it."""
     if _factorize(problem, linearization, factor) != 0:
@@ -175,7 +175,7 @@ def _start(problem: Any, iterate: Any, linearization: Any, factor: Any) -> bool:
     return start_from(problem, linearization.a, iterate)
 
 
-@kernel(inline=True)
+@kernel
 def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if it worked."""
     order = problem.c.size
@@ -195,7 +195,7 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     return info
 
 
-@kernel(inline=True)
+@kernel
 def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
     order = problem.c.size
@@ -212,7 +212,7 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
         column[0] += ridge
 
 
-@kernel(inline=True)
+@kernel
 def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
     """Add D^T S D to the lower triangle of the matrix."""
     edges, basis, s = problem.edges, problem.basis, linearization.s
@@ -245,7 +245,7 @@ def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
                 matrix[(node * d + k) * order + node * d + q] += diagonal[node, k, q]
 
 
-@kernel(inline=True)
+@kernel
 def _propose(
     problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
@@ -271,7 +271,7 @@ def _propose(
     return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
 
 
-@kernel(inline=True)
+@kernel
 def _solve(factor: Any, nodes: Any) -> None:
     """Replace `nodes` by M^-1 nodes."""
     right = factor.right

@@ -32,7 +32,7 @@ _EPS, _SHRINK = 0.5, 0.7
 _LEFT = 3e-3
 
 
-@kernel()
+@kernel
 def approach(problem: Any, iterate: Any, step: Any) -> bool:
     """Start near the optimum, with the bound 0; return whether it is: if not, the iterate is of no use."""
     t, gradient = iterate.t, np.empty_like(iterate.t)
@@ -61,7 +61,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     return True
 
 
-@kernel(inline=True)
+@kernel
 def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degrees: Any) -> float:
     """Write s_e = w_e / sqrt(||r_e||^2 + floor^2), their sums at the cameras, and D^T S r at T.
 
@@ -95,7 +95,7 @@ def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degre
     return total / len(edges)
 
 
-@kernel(inline=True)
+@kernel
 def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhill: Any, steps: int) -> float:
     """Move t by conjugate gradients of the weighted least squares, <c, T> unchanged.
 
@@ -123,7 +123,7 @@ def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhi
     return size
 
 
-@kernel(inline=True)
+@kernel
 def set_downhill(problem: Any, degrees: Any, gradient: Any, downhill: Any) -> float:
     """Write the preconditioned direction of descent that keeps <c, T>; return its slope, positive."""
     along = length = slope = 0.0
@@ -141,7 +141,7 @@ def set_downhill(problem: Any, degrees: Any, gradient: Any, downhill: Any) -> fl
     return slope
 
 
-@kernel(inline=True)
+@kernel
 def multiply(problem: Any, weights: Any, x: Any, product: Any) -> None:
     """Write D^T S P D x at the nodes."""
     edges, v = problem.edges, problem.v

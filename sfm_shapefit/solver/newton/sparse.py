@@ -170,7 +170,7 @@ def _factorize(
     return None
 
 
-@kernel()
+@kernel
 def _set_blocks(problem: Any, linearization: Any, ridge: float, blocks: Any) -> None:
     """Write S_e, plus `ridge` times its stiffness times the identity."""
     basis, s = problem.basis, linearization.s

@@ -159,7 +159,7 @@ def is_cancelled(on_iteration: OnIteration | None, iteration: int, progress: Pro
     return asks_to_stop(on_iteration, IterationInfo(iteration, progress.objective, bound))
 
 
-@kernel()
+@kernel
 def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
     """Write the bases B_e: the reflection that maps v_e to the first axis, without its first column.
 
@@ -177,7 +177,7 @@ def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
                 s[e, k - 1, q] = unit * w[e]
 
 
-@kernel(inline=True)
+@kernel
 def start_from(problem: Any, a: Any, iterate: Any) -> bool:
     """Start from the least-squares locations along `a`, whose scaled residuals are a feasible dual."""
     length = dot(problem.c, a)
@@ -208,7 +208,7 @@ def answer(
     return iterate.t, dual
 
 
-@kernel()
+@kernel
 def _set_dual(basis: Any, y: Any, dual: Any) -> None:
     """Write B_e y_e."""
     for e in range(len(dual)):
@@ -219,7 +219,7 @@ def _set_dual(basis: Any, y: Any, dual: Any) -> None:
             dual[e, k] = x
 
 
-@kernel(inline=True)
+@kernel
 def measure(problem: Any, iterate: Any) -> Progress:
     """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
@@ -235,7 +235,7 @@ def measure(problem: Any, iterate: Any) -> Progress:
     )
 
 
-@kernel(inline=True)
+@kernel
 def smoothing(progress: Any, mu: float) -> float:
     """Return mu for the next step: it shrinks with the gap, with a clipped dual a little faster."""
     share = 1.0
@@ -244,7 +244,7 @@ def smoothing(progress: Any, mu: float) -> float:
     return float(min(mu, MU_PER_GAP * share * progress.gap))
 
 
-@kernel(inline=True)
+@kernel
 def close_cycle(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
     """Return the scalars after a cycle that began with the gap `first`; clipping ends if it gained little."""
     clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
@@ -254,13 +254,13 @@ def close_cycle(iterate: Any, progress: Any, mu: float, first: float) -> Progres
     return Progress(mu, progress.multiplier, progress.objective, progress.gap, clips)
 
 
-@kernel(inline=True)
+@kernel
 def pays(first: float, previous: float, gap: float, work: float, step_work: float) -> bool:
     """Return whether the last step gained at least as much per unit of work as the cycle did on average."""
     return bool(np.log(previous / gap) * work >= np.log(first / gap) * step_work)
 
 
-@kernel(inline=True)
+@kernel
 def allowed_violation(problem: Any, gap: float) -> float:
     """Return how far D^T y+ may be from lambda+ c at a camera.
 
@@ -269,7 +269,7 @@ def allowed_violation(problem: Any, gap: float) -> float:
     return float(max(_EQUALITY * gap * gap, _LEAST_EQUALITY) * problem.kappa / len(problem.c))
 
 
-@kernel(inline=True)
+@kernel
 def linearize(problem: Any, iterate: Any, mu: float, linearization: Any) -> None:
     """Take S at the iterate."""
     y, r = iterate.y, iterate.r
@@ -287,7 +287,7 @@ def linearize(problem: Any, iterate: Any, mu: float, linearization: Any) -> None
                 linearization.s[e, k, q] = inverse * ((problem.w[e] if k == q else 0.0) - bend)
 
 
-@kernel(inline=True)
+@kernel
 def set_gradient(problem: Any, iterate: Any, linearization: Any, mu: float, step: Any) -> None:
     """Begin a step: dT = 0, y+ = g with g_e = y_e - (rho_e y_e - w_e r_e) / rho'_e, nodes = D^T g."""
     y, r = iterate.y, iterate.r
@@ -305,7 +305,7 @@ def set_gradient(problem: Any, iterate: Any, linearization: Any, mu: float, step
     sum_at_nodes(problem, step)
 
 
-@kernel(inline=True)
+@kernel
 def extend_step(problem: Any, linearization: Any, dt: Any, step: Any) -> None:
     """Add dt to the step: dT += dt, y+_e += S_e P_e (dt_i - dt_j), nodes = D^T y+.
 
@@ -325,7 +325,7 @@ def extend_step(problem: Any, linearization: Any, dt: Any, step: Any) -> None:
     sum_at_nodes(problem, step)
 
 
-@kernel(inline=True)
+@kernel
 def sum_at_nodes(problem: Any, step: Any) -> None:
     """nodes = D^T B y+, by the reflections as in `set_residuals`."""
     edges, v, tilt, y, nodes = problem.edges, problem.v, problem.tilt, step.y, step.nodes
@@ -345,7 +345,7 @@ def sum_at_nodes(problem: Any, step: Any) -> None:
             nodes[j, q + 1] -= x
 
 
-@kernel(inline=True)
+@kernel
 def set_residuals(problem: Any, t: Any, r: Any) -> None:
     """r_e = B_e^T (t_i - t_j), from v_e itself: reading B_e takes longer than to reflect."""
     edges, v, tilt = problem.edges, problem.v, problem.tilt
@@ -360,7 +360,7 @@ def set_residuals(problem: Any, t: Any, r: Any) -> None:
             r[e, q] = (t[i, q + 1] - t[j, q + 1]) - along * v[e, q + 1]
 
 
-@kernel(inline=True)
+@kernel
 def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Progress:
     """Move along the step as far as it helps; return the scalars there."""
     alpha, multiplier = 1.0, progress.multiplier
@@ -382,7 +382,7 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
     return Progress(mu, reached, objective / problem.kappa, gap, progress.clips)
 
 
-@kernel(inline=True)
+@kernel
 def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
     """Return the change of sum_e w_e rho_e from r to r + alpha dr, without cancellation."""
     r, dr = iterate.r, step.r
@@ -398,7 +398,7 @@ def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> 
     return total
 
 
-@kernel(inline=True)
+@kernel
 def largest_dual(problem: Any, step: Any) -> float:
     """Return max_e ||y+_e||^2 / w_e^2, and leave the ratios in the scratch."""
     for e in range(len(problem.w)):
@@ -409,7 +409,7 @@ def largest_dual(problem: Any, step: Any) -> float:
     return largest(step.ratios)
 
 
-@kernel(inline=True)
+@kernel
 def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
     """Return 1 / the longest step from the feasible dual to y+ in the ball, given `largest_dual`'s ratios."""
     ratios = step.ratios
@@ -427,7 +427,7 @@ def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
     return largest(ratios)
 
 
-@kernel(inline=True)
+@kernel
 def largest(x: Any) -> float:
     """Return the largest of non-negative numbers; by four maxima, for one would be a chain of waits."""
     a = b = c = d = 0.0
@@ -442,7 +442,7 @@ def largest(x: Any) -> float:
     return max(a, b, c, d)
 
 
-@kernel(inline=True)
+@kernel
 def move(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
@@ -471,7 +471,7 @@ def move(
     return residual, bound
 
 
-@kernel(inline=True)
+@kernel
 def dot(x: Any, y: Any) -> float:
     """Return the inner product of two (n, d) arrays."""
     total = 0.0
@@ -490,19 +490,19 @@ def dot(x: Any, y: Any) -> float:
 Scalars = tuple[float, float, float, float, bool]
 
 
-@kernel(inline=True)
+@kernel
 def scalars(progress: Any) -> Scalars:
     """Return the scalars as a plain tuple."""
     return progress.mu, progress.multiplier, progress.objective, progress.gap, progress.clips
 
 
-@kernel()
+@kernel
 def measure_plain(problem: Any, iterate: Any) -> Scalars:
     """Return the scalars at the iterate; see `measure`."""
     return scalars(measure(problem, iterate))
 
 
-@kernel()
+@kernel
 def take_step_plain(
     problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float
 ) -> Scalars:
@@ -510,7 +510,7 @@ def take_step_plain(
     return scalars(take_step(problem, iterate, step, mu, progress, target))
 
 
-@kernel()
+@kernel
 def close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
     """Return the scalars after a cycle; see `close_cycle`."""
     return scalars(close_cycle(iterate, progress, mu, first))

@@ -70,7 +70,7 @@ class Anderson:
         return np.asarray(np.linalg.solve(gram + ridge * np.eye(used), dots[:, 1]))
 
 
-@kernel()
+@kernel
 def _remember(
     first: int, last: int, is_first: bool, slot: int, used: int, rho: Any, x: Any, f: Any,
     f_before: Any, g_before: Any, df: Any, dg: Any, dots: Any,
@@ -101,7 +101,7 @@ def _remember(
             dots[j, 1] += with_g
 
 
-@kernel()
+@kernel
 def _combine(first: int, last: int, gamma: Any, df: Any, f: Any) -> None:
     """Subtract sum_j gamma_j df_j from f."""
     d = f.shape[1]

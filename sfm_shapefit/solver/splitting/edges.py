@@ -186,7 +186,7 @@ class EdgePasses:
         self._workers.run([partial(run, k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)])
 
 
-@kernel()
+@kernel
 def _clip_factor(axes: Any, x: Any, v: Any, e: int, least: float, radius: float) -> Any:
     """Return (a, shrink) of an edge: r = x - a v, clip(r) = shrink * r."""
     d = len(axes)
@@ -201,7 +201,7 @@ def _clip_factor(axes: Any, x: Any, v: Any, e: int, least: float, radius: float)
     return a, radius / max(np.sqrt(square), radius)  # no branch: half of the edges take either side
 
 
-@kernel()
+@kernel
 def _step(
     axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
     rho: Any, relaxation: float, t: Any, x: Any, x_next: Any, sums: Any, totals: Any,
@@ -230,7 +230,7 @@ def _step(
                 sums[j, k] -= block[k, b]
 
 
-@kernel(inline=True)
+@kernel
 def _advance(axes: Any, block: Any, count: int, least: float, relaxation: float, totals: Any) -> None:
     """Take the step for edges side by side, coordinate by coordinate, so that it is vectorized.
 
@@ -286,7 +286,7 @@ def _advance(axes: Any, block: Any, count: int, least: float, relaxation: float,
     totals[4] += interior
 
 
-@kernel()
+@kernel
 def _pull(
     axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
     rho: Any, t: Any, x: Any, sums: Any,
@@ -302,7 +302,7 @@ def _pull(
             sums[j, k] -= p
 
 
-@kernel()
+@kernel
 def _dual(axes: Any, first: int, last: int, v: Any, w: Any, least: float, rho: Any, x: Any, out: Any) -> None:
     d = len(axes)
     for e in range(first, last):
@@ -311,7 +311,7 @@ def _dual(axes: Any, first: int, last: int, v: Any, w: Any, least: float, rho: A
             out[e, k] = rho[e] * shrink * (x[e, k] - a * v[e, k])
 
 
-@kernel()
+@kernel
 def _residuals(axes: Any, first: int, last: int, ends: Any, v: Any, least: float, t: Any, out: Any) -> None:
     d = len(axes)
     for e in range(first, last):
@@ -327,7 +327,7 @@ def _residuals(axes: Any, first: int, last: int, ends: Any, v: Any, least: float
         out[e] = np.sqrt(square)
 
 
-@kernel()
+@kernel
 def _imbalance(
     axes: Any, first: int, last: int, ends: Any, v: Any, w: Any, least: float,
     rho: Any, t: Any, x_before: Any, x: Any, totals: Any,
@@ -350,7 +350,7 @@ def _imbalance(
     totals[1] += dual
 
 
-@kernel()
+@kernel
 def _change_penalties(
     axes: Any, first: int, last: int, v: Any, w: Any, least: float, rho: Any, rho_next: Any, x: Any
 ) -> None:
