@@ -19,13 +19,14 @@ from sfm_shapefit.solver.newton.steps import (
     allowed_violation,
     answer,
     close_cycle,
+    combine,
     dot,
     extend_step,
     is_cancelled,
+    is_within,
     linearize,
-    measure_plain,
+    measure,
     pays,
-    scalars,
     set_gradient,
     set_residuals,
     smoothing,
@@ -84,7 +85,7 @@ def solve_newton_dense(
     with one_blas_thread():
         if not (approach(problem, iterate, step) or _start(problem, iterate, linearization, factor)):
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
-        progress = Progress(*measure_plain(problem, iterate))
+        progress = Progress(*measure(problem, iterate))
         count, stalled = 0, 0
         chunk = 1 if on_iteration else max(1, int(_OPERATIONS_PER_CALL / (problem.c.size**3 / 3)))
         while progress.gap > tol and count < max_iterations and stalled < STALL:
@@ -130,41 +131,33 @@ def _newton(
 ) -> tuple[int, int, Scalars]:
     """Run up to `limit` cycles; return how many ran, for how many there was no progress, and the scalars."""
     count = 0
-    while count < limit and progress.gap > tol and stalled < factor.patience:
-        before = progress.gap
-        count += 1
-        progress = _cycle(problem, iterate, linearization, factor, step, progress, tol)
-        stalled = 0 if progress.gap < 0.9 * before else stalled + 1
-        if progress.gap == before and factor.right.itemsize == 4:
-            stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
-    return count, stalled, scalars(progress)
-
-
-@kernel
-def _cycle(
-    problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, progress: Any, tol: float
-) -> Progress:
-    """Factor once, then step with that factor while it pays."""
-    first = progress.gap
-    mu = smoothing(progress, progress.mu)
-    set_residuals(problem, iterate.t, iterate.r)
-    linearize(problem, iterate, mu, linearization)
-    if _factorize(problem, linearization, factor) != 0:
-        return close_cycle(iterate, progress, mu, first)
     order = float(problem.c.size)
     step_work = _EDGE_WORK * len(problem.w) + _SOLVE_WORK * order**2
-    work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
-    for _ in range(STEPS_PER_FACTOR):
-        previous = progress.gap
-        mu = smoothing(progress, mu)
-        target, exact = _propose(problem, iterate, linearization, factor, step, mu, previous)
-        if not exact:
-            break
-        progress = take_step(problem, iterate, step, mu, progress, target)
-        work += step_work
-        if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
-            break
-    return close_cycle(iterate, progress, progress.mu, first)
+    cycle_work = order**3 / 3.0 + 0.5 * _EDGE_WORK * len(problem.w)
+    while count < limit and progress.gap > tol and stalled < factor.patience:
+        first, work = progress.gap, cycle_work
+        mu = smoothing(progress, progress.mu)
+        set_residuals(problem, iterate.t, iterate.r)
+        linearize(problem, iterate, mu, linearization)
+        if _factorize(problem, linearization, factor) == 0:
+            for _ in range(STEPS_PER_FACTOR):
+                previous = progress.gap
+                mu = smoothing(progress, mu)
+                target, exact = _propose(problem, iterate, linearization, factor, step, mu, previous)
+                if not exact:
+                    break
+                progress = Progress(*take_step(problem, iterate, step, mu, progress, target))
+                work += step_work
+                if progress.gap <= tol or not pays(first, previous, progress.gap, work, step_work):
+                    break
+            mu = progress.mu
+        progress = Progress(*close_cycle(iterate, progress, mu, first))
+        count += 1
+        stalled = 0 if progress.gap < 0.9 * first else stalled + 1
+        if progress.gap == first and factor.right.itemsize == 4:
+            stalled = factor.patience  # no step could be taken, nor could one by the same matrix again
+    scalars = progress.mu, progress.multiplier, progress.objective, progress.gap, progress.clips
+    return count, stalled, scalars
 
 
 @kernel
@@ -189,9 +182,8 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
         _add_edge_blocks(problem, linearization, factor)
         info = potrf(factor.blas, (factor.matrix, 0, order), order)
         ridge *= 100.0
-    linearization.a[:] = problem.c
     if info == 0:
-        _solve(factor, linearization.a)
+        _solve(factor, problem.c, linearization.a)
     return info
 
 
@@ -254,30 +246,35 @@ def _propose(
     Returns:
         lambda+, and whether the refinement converged; the step must not be taken otherwise.
     """
-    c, a, nodes = problem.c, linearization.a, step.nodes
+    c, a, nodes, addend = problem.c, linearization.a, step.nodes, step.addend
     allowed, scale = allowed_violation(problem, gap), dot(c, a)
     set_gradient(problem, iterate, linearization, mu, step)
-    _solve(factor, nodes)
+    _solve(factor, nodes, nodes)
     multiplier = dot(c, nodes) / scale
-    extend_step(problem, linearization, multiplier * a - nodes, step)
+    combine(multiplier, a, -1.0, nodes, addend)
     for _ in range(factor.refinements):
-        nodes[:] = multiplier * c - nodes
-        if np.max(np.abs(nodes)) <= allowed:
+        extend_step(problem, linearization, step)
+        combine(multiplier, c, -1.0, nodes, nodes)
+        if is_within(nodes, allowed):
             return float(multiplier), True
-        _solve(factor, nodes)
+        _solve(factor, nodes, nodes)
         shift = dot(c, nodes) / scale
         multiplier -= shift
-        extend_step(problem, linearization, nodes - shift * a, step)
-    return float(multiplier), bool(np.max(np.abs(multiplier * c - nodes)) <= allowed)
+        combine(1.0, nodes, -shift, a, addend)
+    extend_step(problem, linearization, step)
+    combine(multiplier, c, -1.0, nodes, nodes)
+    return float(multiplier), is_within(nodes, allowed)
 
 
 @kernel
-def _solve(factor: Any, nodes: Any) -> None:
-    """Replace `nodes` by M^-1 nodes."""
+def _solve(factor: Any, nodes: Any, solution: Any) -> None:
+    """Write M^-1 nodes, which may be in place."""
     right = factor.right
-    x = nodes.reshape(right.size)
-    for k in range(len(right)):
-        right[k] = x[k]
+    n, d = nodes.shape
+    for i in range(n):
+        for k in range(d):
+            right[i * d + k] = nodes[i, k]
     solve_factored(factor.blas, factor.matrix, right.size, right)
-    for k in range(len(right)):
-        x[k] = right[k]
+    for i in range(n):
+        for k in range(d):
+            solution[i, k] = right[i * d + k]

@@ -20,7 +20,15 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.solver.newton.steps import LEAST_MU, MU_PER_GAP, dot, measure, set_residuals
+from sfm_shapefit.solver.newton.steps import (
+    LEAST_MU,
+    MU_PER_GAP,
+    Progress,
+    combine,
+    dot,
+    measure,
+    set_residuals,
+)
 
 # Conjugate gradient steps for plain least squares, and for each reweighted problem.
 _FIRST_STEPS, _STEPS = 4, 2
@@ -35,22 +43,23 @@ _LEFT = 3e-3
 @kernel
 def approach(problem: Any, iterate: Any, step: Any) -> bool:
     """Start near the optimum, with the bound 0; return whether it is: if not, the iterate is of no use."""
-    t, gradient = iterate.t, np.empty_like(iterate.t)
-    degrees, downhill = np.empty(len(t)), np.empty_like(t)
-    t[:] = (problem.kappa / dot(problem.c, problem.c)) * problem.c
+    t, gradient, degrees = iterate.t, step.addend, np.empty(len(iterate.t))
+    downhill = np.empty_like(iterate.t)
+    scale = problem.kappa / dot(problem.c, problem.c)
+    combine(scale, problem.c, 0.0, problem.c, t)
     weigh(problem, t, np.inf, step.ratios, gradient, degrees)
-    left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
+    left = descend(problem, step, t, gradient, degrees, downhill, np.int64(_FIRST_STEPS))
     if left > _LEFT * dot(t, gradient):
         return False
     mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     eps = _EPS
     for _ in range(_ROUNDS):
         mean = weigh(problem, t, eps * mean, step.ratios, gradient, degrees)
-        descend(problem, step, t, gradient, degrees, downhill, _STEPS)
+        descend(problem, step, t, gradient, degrees, downhill, np.int64(_STEPS))
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0
-    floor = max(MU_PER_GAP * measure(problem, iterate).gap, LEAST_MU)
+    floor = max(MU_PER_GAP * Progress(*measure(problem, iterate)).gap, LEAST_MU)
     for e in range(len(problem.w)):
         rr = floor * floor
         for k in range(len(problem.transverse)):
@@ -104,7 +113,7 @@ def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhi
     """
     direction, product = step.t, step.nodes
     size = set_downhill(problem, degrees, gradient, downhill)
-    direction[:] = downhill
+    combine(1.0, downhill, 0.0, downhill, direction)
     for _ in range(steps):
         multiply(problem, step.ratios, direction, product)
         curvature = dot(direction, product)
@@ -112,14 +121,10 @@ def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhi
             break
         alpha = size / curvature
         previous = size
-        for i in range(len(t)):
-            for k in range(len(problem.axes)):
-                t[i, k] += alpha * direction[i, k]
-                gradient[i, k] += alpha * product[i, k]
+        combine(1.0, t, alpha, direction, t)
+        combine(1.0, gradient, alpha, product, gradient)
         size = set_downhill(problem, degrees, gradient, downhill)
-        for i in range(len(t)):
-            for k in range(len(problem.axes)):
-                direction[i, k] = downhill[i, k] + size / previous * direction[i, k]
+        combine(1.0, downhill, size / previous, direction, direction)
     return size
 
 

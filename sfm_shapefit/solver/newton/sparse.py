@@ -83,7 +83,7 @@ def solve_newton_reduced(
             raise UnsolvableError("the directions do not determine the locations; check the graph's rigidity")
     else:
         _begin_at(problem, *start, iterate)
-    progress, count, stalled = Progress(*steps.measure_plain(problem, iterate)), 0, 0
+    progress, count, stalled = Progress(*steps.measure(problem, iterate)), 0, 0
     while progress.gap > tol and count < max_iterations and stalled < steps.STALL:
         before = progress.gap
         progress = _cycle(work, reduction, progress, tol)
@@ -113,7 +113,7 @@ def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> 
     longest = int(np.argmax(along(differences(iterate.t, ends), problem.v)))
     system = _factorize(problem, linearization, reduction, longest)
     if system is None:
-        return Progress(*steps.close_cycle_plain(iterate, progress, mu, first))
+        return Progress(*steps.close_cycle(iterate, progress, mu, first))
     factor, edge_work = reduction.factor, steps.EDGE_WORK * len(problem.w)
     step_work = edge_work + steps.SOLVE_WORK * factor.panels.size
     done = factor.symbolic.flops * factor.block**3 + 0.5 * edge_work
@@ -123,11 +123,11 @@ def _cycle(work: Work, reduction: Reduction, progress: Progress, tol: float) -> 
         target, exact = _propose(work, system, mu, previous)
         if not exact:
             break
-        progress = Progress(*steps.take_step_plain(problem, iterate, step, mu, progress, target))
+        progress = Progress(*steps.take_step(problem, iterate, step, mu, progress, target))
         done += step_work
         if progress.gap <= tol or not steps.pays(first, previous, progress.gap, done, step_work):
             break
-    return Progress(*steps.close_cycle_plain(iterate, progress, progress.mu, first))
+    return Progress(*steps.close_cycle(iterate, progress, progress.mu, first))
 
 
 def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, bool]:
@@ -143,15 +143,21 @@ def _propose(work: Work, system: System, mu: float, gap: float) -> tuple[float, 
     steps.set_gradient(problem, iterate, linearization, mu, step)
     drift = problem.kappa - steps.dot(problem.c, iterate.t)
     multiplier, dx = system.solve(-reduction.reduce(step.nodes), drift)
-    steps.extend_step(problem, linearization, reduction.expand(dx), step)
+    _extend(work, reduction, dx)
     for _ in range(steps.REFINEMENTS):
         violation = multiplier * c - reduction.reduce(step.nodes)
         if np.abs(violation).max() <= allowed:
             return multiplier, True
         shift, dx = system.solve(violation, drift - steps.dot(problem.c, step.t))
         multiplier += shift
-        steps.extend_step(problem, linearization, reduction.expand(dx), step)
+        _extend(work, reduction, dx)
     return multiplier, bool(np.abs(multiplier * c - reduction.reduce(step.nodes)).max() <= allowed)
+
+
+def _extend(work: Work, reduction: Reduction, dx: FloatArray) -> None:
+    """Add dx to the step; see `steps.extend_step`."""
+    work.step.addend[:] = reduction.expand(dx)
+    steps.extend_step(work.problem, work.linearization, work.step)
 
 
 def _factorize(

@@ -2,8 +2,11 @@
 
 The formulas stand in the docstring of `sfm_shapefit.solver.newton`. Residuals and dual are kept in d - 1
 coordinates across v_e: with an orthonormal basis B_e of these, r_e = B_e^T (t_i - t_j), and B_e y_e is the
-dual of the program. All kernels are `inline`: results must not depend on which copy runs
-(`sfm_shapefit.jit`).
+dual of the program.
+
+What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while the
+kernel ran would be raised there, and end the process by a segmentation fault: kernels return the scalars of
+`Progress` as a plain tuple, of which `Progress(*...)` makes it again.
 """
 
 from typing import Any, NamedTuple
@@ -97,6 +100,8 @@ class Step(NamedTuple):
     """(m, d - 1), g and then y+."""
     nodes: FloatArray
     """(n, d) right-hand side, then solution."""
+    addend: FloatArray
+    """(n, d), what `extend_step` adds to dT."""
     change: FloatArray
     """(m, d - 1) scratch."""
     ratios: FloatArray
@@ -115,8 +120,12 @@ class Progress(NamedTuple):
     """R(T) / kappa."""
     gap: float
     """sum_e (w_e ||r_e|| - <y_e, r_e>) / kappa, y feasible: every term is positive, so it does not cancel."""
-    clips: bool = True
+    clips: bool
     """Whether the next steps go on from the clipped dual."""
+
+
+Scalars = tuple[float, float, float, float, bool]
+"""The fields of `Progress`."""
 
 
 class Work(NamedTuple):
@@ -149,7 +158,9 @@ def allocate(graph: ViewGraph) -> Work:
     problem = Problem(edges, v, basis, tilt, w, c, kappa, tuple(axes), tuple(axes[:-1]))
     if not np.linalg.norm(problem.c) > _CANCEL * problem.kappa:
         raise UnsolvableError("the directions cancel at every camera, so no scale can be fixed")
-    step = Step(at_nodes(), at_edges(), at_edges(), at_nodes(), at_edges(), np.empty(m), np.empty(m))
+    step = Step(
+        at_nodes(), at_edges(), at_edges(), at_nodes(), at_nodes(), at_edges(), np.empty(m), np.empty(m)
+    )
     return Work(problem, Iterate(at_nodes(), at_edges(), at_edges(), at_edges()), linearization, step)
 
 
@@ -181,20 +192,23 @@ def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
 def start_from(problem: Any, a: Any, iterate: Any) -> bool:
     """Start from the least-squares locations along `a`, whose scaled residuals are a feasible dual."""
     length = dot(problem.c, a)
-    if length > 0.0:
-        iterate.t[:] = (problem.kappa / length) * a
-        set_residuals(problem, iterate.t, iterate.r)
-        worst = 0.0
-        for e in range(len(problem.w)):
-            rr = 0.0
-            for k in range(len(problem.transverse)):
-                rr += iterate.r[e, k] ** 2
-            worst = max(worst, np.sqrt(rr))
-        for e in range(len(problem.w)):
-            scale = problem.w[e] / worst if worst > 0.0 else 0.0
-            for k in range(len(problem.transverse)):
-                iterate.y[e, k] = iterate.feasible[e, k] = scale * iterate.r[e, k]
-    return bool(length > 0.0)
+    if not length > 0.0:
+        return False
+    for i in range(len(a)):
+        for k in range(len(problem.axes)):
+            iterate.t[i, k] = (problem.kappa / length) * a[i, k]
+    set_residuals(problem, iterate.t, iterate.r)
+    worst = 0.0
+    for e in range(len(problem.w)):
+        rr = 0.0
+        for k in range(len(problem.transverse)):
+            rr += iterate.r[e, k] ** 2
+        worst = max(worst, np.sqrt(rr))
+    for e in range(len(problem.w)):
+        scale = problem.w[e] / worst if worst > 0.0 else 0.0
+        for k in range(len(problem.transverse)):
+            iterate.y[e, k] = iterate.feasible[e, k] = scale * iterate.r[e, k]
+    return True
 
 
 def answer(
@@ -220,7 +234,7 @@ def _set_dual(basis: Any, y: Any, dual: Any) -> None:
 
 
 @kernel
-def measure(problem: Any, iterate: Any) -> Progress:
+def measure(problem: Any, iterate: Any) -> Scalars:
     """Return the scalars at the iterate, before any smoothing."""
     objective = bound = 0.0
     for e in range(len(problem.w)):
@@ -230,9 +244,8 @@ def measure(problem: Any, iterate: Any) -> Progress:
             yr += iterate.r[e, k] * iterate.feasible[e, k]
         objective += problem.w[e] * np.sqrt(rr)
         bound += yr
-    return Progress(
-        1.0, bound / problem.kappa, objective / problem.kappa, (objective - bound) / problem.kappa, True
-    )
+    kappa = problem.kappa
+    return 1.0, bound / kappa, objective / kappa, (objective - bound) / kappa, True
 
 
 @kernel
@@ -245,13 +258,13 @@ def smoothing(progress: Any, mu: float) -> float:
 
 
 @kernel
-def close_cycle(iterate: Any, progress: Any, mu: float, first: float) -> Progress:
+def close_cycle(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
     """Return the scalars after a cycle that began with the gap `first`; clipping ends if it gained little."""
     clips = progress.clips and progress.gap <= _CLIPS_BELOW * first
     if progress.clips and not clips:
-        iterate.y[:] = iterate.feasible
+        start_again(iterate)
         mu = MU_PER_GAP * progress.gap
-    return Progress(mu, progress.multiplier, progress.objective, progress.gap, clips)
+    return mu, progress.multiplier, progress.objective, progress.gap, clips
 
 
 @kernel
@@ -306,15 +319,15 @@ def set_gradient(problem: Any, iterate: Any, linearization: Any, mu: float, step
 
 
 @kernel
-def extend_step(problem: Any, linearization: Any, dt: Any, step: Any) -> None:
-    """Add dt to the step: dT += dt, y+_e += S_e P_e (dt_i - dt_j), nodes = D^T y+.
+def extend_step(problem: Any, linearization: Any, step: Any) -> None:
+    """Add the addend dt to the step: dT += dt, y+_e += S_e P_e (dt_i - dt_j), nodes = D^T y+.
 
     A refinement adds its small dt to the dual that is there: y+ from the whole dT would carry the
     rounding of dT, multiplied by a stiffness of the order 1 / mu.
     """
     change = step.change
-    step.t[:] += dt
-    set_residuals(problem, dt, change)
+    combine(1.0, step.t, 1.0, step.addend, step.t)
+    set_residuals(problem, step.addend, change)
     for e in range(len(problem.w)):
         for k in range(len(problem.transverse)):
             step.r[e, k] += change[e, k]
@@ -361,7 +374,7 @@ def set_residuals(problem: Any, t: Any, r: Any) -> None:
 
 
 @kernel
-def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Progress:
+def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float) -> Scalars:
     """Move along the step as far as it helps; return the scalars there."""
     alpha, multiplier = 1.0, progress.multiplier
     while alpha > 0.0 and increase(problem, iterate, step, mu, alpha) > 0.0:
@@ -377,9 +390,8 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
         keep, gain, reached = 1.0, 0.0, multiplier
     objective, bound = move(problem, iterate, step, alpha, keep, gain)
     if not progress.clips:
-        iterate.y[:] = iterate.feasible
-    gap = (objective - bound) / problem.kappa
-    return Progress(mu, reached, objective / problem.kappa, gap, progress.clips)
+        start_again(iterate)
+    return mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa, progress.clips
 
 
 @kernel
@@ -451,7 +463,7 @@ def move(
     Returns:
         sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
     """
-    iterate.t[:] += alpha * step.t
+    combine(1.0, iterate.t, alpha, step.t, iterate.t)
     residual = bound = 0.0
     for e in range(len(problem.w)):
         rr = yr = pp = 0.0
@@ -481,36 +493,27 @@ def dot(x: Any, y: Any) -> float:
     return total
 
 
-# --- the same from Python ---------------------------------------------------------------------------
-#
-# What makes a NamedTuple of a kernel's result runs Python inside native code. An interrupt that came while
-# the kernel ran would be raised there, and end the process by a segmentation fault: kernels that Python
-# calls return plain tuples, of which `Progress(*...)` makes the scalars again.
-
-Scalars = tuple[float, float, float, float, bool]
+@kernel
+def combine(a: float, x: Any, b: float, y: Any, out: Any) -> None:
+    """out = a x + b y, for (n, d) arrays."""
+    for i in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            out[i, k] = a * x[i, k] + b * y[i, k]
 
 
 @kernel
-def scalars(progress: Any) -> Scalars:
-    """Return the scalars as a plain tuple."""
-    return progress.mu, progress.multiplier, progress.objective, progress.gap, progress.clips
+def is_within(x: Any, bound: float) -> bool:
+    """Return whether no entry of an (n, d) array exceeds the bound in size; false if one is not a number."""
+    for i in range(x.shape[0]):
+        for k in range(x.shape[1]):
+            if not abs(x[i, k]) <= bound:
+                return False
+    return True
 
 
 @kernel
-def measure_plain(problem: Any, iterate: Any) -> Scalars:
-    """Return the scalars at the iterate; see `measure`."""
-    return scalars(measure(problem, iterate))
-
-
-@kernel
-def take_step_plain(
-    problem: Any, iterate: Any, step: Any, mu: float, progress: Any, target: float
-) -> Scalars:
-    """Take a step and return the scalars after it; see `take_step`."""
-    return scalars(take_step(problem, iterate, step, mu, progress, target))
-
-
-@kernel
-def close_cycle_plain(iterate: Any, progress: Any, mu: float, first: float) -> Scalars:
-    """Return the scalars after a cycle; see `close_cycle`."""
-    return scalars(close_cycle(iterate, progress, mu, first))
+def start_again(iterate: Any) -> None:
+    """y = feasible."""
+    for e in range(len(iterate.y)):
+        for k in range(iterate.y.shape[1]):
+            iterate.y[e, k] = iterate.feasible[e, k]
