@@ -30,7 +30,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import Listener, install_listener
-from numba.extending import get_cython_function_address, intrinsic
+from numba.extending import get_cython_function_address, intrinsic, register_jitable
 
 
 def _names_without_zlib(config: Any) -> str:
@@ -66,6 +66,11 @@ def kernel(function: Kernel) -> Kernel:
         return cast(Kernel, numba.njit(cache=True, **_OPTIONS)(function))
     except RuntimeError:  # neither the package's folder nor the user's can be written: compile every time
         return cast(Kernel, numba.njit(**_OPTIONS)(function))
+
+
+def inner_kernel(function: Kernel) -> Kernel:
+    """Let kernels call a function, which is compiled as a part of them; for Python it stays a plain function."""
+    return cast(Kernel, register_jitable(**_OPTIONS)(function))
 
 
 @contextmanager

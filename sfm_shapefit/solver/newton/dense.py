@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
@@ -168,7 +168,7 @@ def _start(problem: Any, iterate: Any, linearization: Any, factor: Any) -> bool:
     return start_from(problem, linearization.a, iterate)
 
 
-@kernel
+@inner_kernel
 def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     """Assemble and factor M, with more ridge if it is not positive definite; solve for a. 0 if it worked."""
     order = problem.c.size
@@ -187,7 +187,7 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     return info
 
 
-@kernel
+@inner_kernel
 def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
     """Overwrite the matrix by outer products of c and of translations, of norm `size`, plus the ridge."""
     order = problem.c.size
@@ -204,7 +204,7 @@ def _lift(problem: Any, factor: Any, size: float, ridge: float) -> None:
         column[0] += ridge
 
 
-@kernel
+@inner_kernel
 def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
     """Add D^T S D to the lower triangle of the matrix."""
     edges, basis, s = problem.edges, problem.basis, linearization.s
@@ -237,7 +237,7 @@ def _add_edge_blocks(problem: Any, linearization: Any, factor: Any) -> None:
                 matrix[(node * d + k) * order + node * d + q] += diagonal[node, k, q]
 
 
-@kernel
+@inner_kernel
 def _propose(
     problem: Any, iterate: Any, linearization: Any, factor: Any, step: Any, mu: float, gap: float
 ) -> tuple[float, bool]:
@@ -266,7 +266,7 @@ def _propose(
     return float(multiplier), is_within(nodes, allowed)
 
 
-@kernel
+@inner_kernel
 def _solve(factor: Any, nodes: Any, solution: Any) -> None:
     """Write M^-1 nodes, which may be in place."""
     right = factor.right

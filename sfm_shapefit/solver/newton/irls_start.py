@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.solver.newton.steps import (
     LEAST_MU,
     MU_PER_GAP,
@@ -70,7 +70,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     return True
 
 
-@kernel
+@inner_kernel
 def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degrees: Any) -> float:
     """Write s_e = w_e / sqrt(||r_e||^2 + floor^2), their sums at the cameras, and D^T S r at T.
 
@@ -104,7 +104,7 @@ def weigh(problem: Any, t: Any, floor: float, weights: Any, gradient: Any, degre
     return total / len(edges)
 
 
-@kernel
+@inner_kernel
 def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhill: Any, steps: int) -> float:
     """Move t by conjugate gradients of the weighted least squares, <c, T> unchanged.
 
@@ -128,7 +128,7 @@ def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhi
     return size
 
 
-@kernel
+@inner_kernel
 def set_downhill(problem: Any, degrees: Any, gradient: Any, downhill: Any) -> float:
     """Write the preconditioned direction of descent that keeps <c, T>; return its slope, positive."""
     along = length = slope = 0.0
@@ -146,7 +146,7 @@ def set_downhill(problem: Any, degrees: Any, gradient: Any, downhill: Any) -> fl
     return slope
 
 
-@kernel
+@inner_kernel
 def multiply(problem: Any, weights: Any, x: Any, product: Any) -> None:
     """Write D^T S P D x at the nodes."""
     edges, v = problem.edges, problem.v

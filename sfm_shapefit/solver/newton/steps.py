@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.solver.options import IterationInfo, OnIteration, asks_to_stop
 from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.viewgraph import ViewGraph
@@ -338,7 +338,7 @@ def extend_step(problem: Any, linearization: Any, step: Any) -> None:
     sum_at_nodes(problem, step)
 
 
-@kernel
+@inner_kernel
 def sum_at_nodes(problem: Any, step: Any) -> None:
     """nodes = D^T B y+, by the reflections as in `set_residuals`."""
     edges, v, tilt, y, nodes = problem.edges, problem.v, problem.tilt, step.y, step.nodes
@@ -394,7 +394,7 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
     return mu, reached, objective / problem.kappa, (objective - bound) / problem.kappa, progress.clips
 
 
-@kernel
+@inner_kernel
 def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
     """Return the change of sum_e w_e rho_e from r to r + alpha dr, without cancellation."""
     r, dr = iterate.r, step.r
@@ -410,7 +410,7 @@ def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> 
     return total
 
 
-@kernel
+@inner_kernel
 def largest_dual(problem: Any, step: Any) -> float:
     """Return max_e ||y+_e||^2 / w_e^2, and leave the ratios in the scratch."""
     for e in range(len(problem.w)):
@@ -421,7 +421,7 @@ def largest_dual(problem: Any, step: Any) -> float:
     return largest(step.ratios)
 
 
-@kernel
+@inner_kernel
 def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
     """Return 1 / the longest step from the feasible dual to y+ in the ball, given `largest_dual`'s ratios."""
     ratios = step.ratios
@@ -439,7 +439,7 @@ def speed_of_exit(problem: Any, iterate: Any, step: Any) -> float:
     return largest(ratios)
 
 
-@kernel
+@inner_kernel
 def largest(x: Any) -> float:
     """Return the largest of non-negative numbers; by four maxima, for one would be a chain of waits."""
     a = b = c = d = 0.0
@@ -454,7 +454,7 @@ def largest(x: Any) -> float:
     return max(a, b, c, d)
 
 
-@kernel
+@inner_kernel
 def move(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
@@ -493,7 +493,7 @@ def dot(x: Any, y: Any) -> float:
     return total
 
 
-@kernel
+@inner_kernel
 def combine(a: float, x: Any, b: float, y: Any, out: Any) -> None:
     """out = a x + b y, for (n, d) arrays."""
     for i in range(x.shape[0]):
@@ -501,7 +501,7 @@ def combine(a: float, x: Any, b: float, y: Any, out: Any) -> None:
             out[i, k] = a * x[i, k] + b * y[i, k]
 
 
-@kernel
+@inner_kernel
 def is_within(x: Any, bound: float) -> bool:
     """Return whether no entry of an (n, d) array exceeds the bound in size; false if one is not a number."""
     for i in range(x.shape[0]):
@@ -511,7 +511,7 @@ def is_within(x: Any, bound: float) -> bool:
     return True
 
 
-@kernel
+@inner_kernel
 def start_again(iterate: Any) -> None:
     """y = feasible."""
     for e in range(len(iterate.y)):
