@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from abuse.layouts import Field, binary_fields
+from abuse.layouts import binary_fields, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
 
 HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
@@ -149,11 +149,7 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
 
 
 def _ids(data: bytes, name: str) -> list[int]:
-    return [_value(data, field) for field in binary_fields(name, data) if field.meaning == "id"]
-
-
-def _value(data: bytes, field: Field) -> int:
-    return int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0])
+    return [read_field(data, field) for field in binary_fields(name, data) if field.meaning == "id"]
 
 
 def _reorder_file(
@@ -170,7 +166,7 @@ def _reorder_file(
     fields, changed = binary_fields(name, data), bytearray(data)
     for field in fields:
         if (name, field.meaning) in maps:
-            value = _value(data, field)
+            value = read_field(data, field)
             renamed = maps[name, field.meaning].get(value, value)  # no point: stays
             struct.pack_into(f"<{field.kind}", changed, field.offset, renamed)
     starts = [field.offset for field in fields if field.meaning == "id"]

@@ -17,16 +17,15 @@ pairs alone: their peak memory is that of the imports, the pairs and the search.
 import argparse
 import math
 import statistics
-import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from pathlib import Path
+from itertools import product
 from typing import TYPE_CHECKING, Any
 
 from harness import ours
-from harness.driver import ROOT, Benchmark, Case
+from harness.driver import Benchmark, Case
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
 from harness.metrics import Check, Quantity, check_all, number, verdict
 from harness.process import call, peak_memory_mb, reset_peak, resident_memory_mb
@@ -34,6 +33,7 @@ from harness.record import table, table_of
 
 if TYPE_CHECKING:
     from sfm_shapefit import SolverResult, ViewGraph
+    from sfm_shapefit.arrays import FloatArray, IntArray
 
 CLOSE = 1e-4
 """Relative excess of the objective that counts as close."""
@@ -159,7 +159,6 @@ def find_settled(values: Sequence[float], limit: float) -> int | None:
 
 def flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--million", action="store_true", help="also a geometric graph of 1e6 cameras")
-    parser.add_argument("--plot", type=Path, help="the plot's file (docs/scale.png)")
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
@@ -176,27 +175,26 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     return found
 
 
-def save_problem(spec: GraphSpec, file: Path) -> None:
-    """Draw a problem and store it."""
-    import numpy as np
-
+def draw_graph(spec: GraphSpec) -> "tuple[ViewGraph, FloatArray]":
+    """Return the measurements of a problem, and its truth."""
     problem = draw(spec)
-    np.savez(file, edges=problem.edges, directions=problem.directions, locations=problem.locations)
+    return view_graph(problem), problem.locations
+
+
+def draw_edges(spec: GraphSpec) -> "IntArray":
+    """Return the pairs of a problem alone."""
+    return draw(spec).edges
 
 
 def measure(problem: Problem, asked: str, threads: int) -> Measured:
-    """Solve a problem that another process draws; to be called once per process."""
-    import numpy as np
+    """Solve a problem that another process draws; to be called once per process.
 
-    from sfm_shapefit import ViewGraph
-
-    _warm_up(problem.spec, threads)
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder) / "problem.npz"
-        call(save_problem, problem.spec, file)
-        with np.load(file) as stored:
-            truth = stored["locations"]
-            graph = ViewGraph(len(truth), stored["edges"], stored["directions"])
+    A small graph of the family is solved before by every method that the problem may call for.
+    """
+    small = GraphSpec(family=problem.spec.family, n=1000, degree=min(problem.spec.degree, 40.0), sigma=0.01)
+    for method in ("auto", "newton", "admm"):
+        _trace(view_graph(draw(small)), method, 1e-4, threads)
+    graph, truth = call(draw_graph, problem.spec)
     before_mb = resident_memory_mb()
     reset_peak()
     run = ours.time_call(lambda: _trace(graph, asked, problem.tol, threads))
@@ -220,14 +218,6 @@ def measure(problem: Problem, asked: str, threads: int) -> Measured:
         before_mb=before_mb,
         peak_mb=peak_mb,
     )
-
-
-def _warm_up(spec: GraphSpec, threads: int) -> None:
-    """Solve a small graph of the family by every method that the problem may call for."""
-    small = GraphSpec(family=spec.family, n=1000, degree=min(spec.degree, 40.0), sigma=0.01)
-    graph = view_graph(draw(small))
-    for method in ("auto", "newton", "admm"):
-        _trace(graph, method, 1e-4, threads)
 
 
 def _trace(
@@ -260,11 +250,6 @@ def search(spec: GraphSpec) -> Search:
         cpu_s=statistics.median(run.cpu_s for run in runs),
         peak_mb=peak_memory_mb(),
     )
-
-
-def draw_edges(spec: GraphSpec) -> object:
-    """Return the pairs of a problem."""
-    return draw(spec).edges
 
 
 def checks(one: Measured | Search) -> list[Check]:
@@ -306,12 +291,10 @@ def noisy(measured: Sequence[Measured], family: str, by_admm: bool = False) -> l
     return sorted(chosen, key=lambda one: one.problem.spec.n)
 
 
-def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) -> Iterator[str]:
+def tables(measured: Mapping[str, Measured | Search], _args: argparse.Namespace) -> Iterator[str]:
     solves = [one for one in measured.values() if isinstance(one, Measured)]
     searches = [one for one in measured.values() if isinstance(one, Search)]
     if solves:
-        if args.plot is not None or not args.quick:
-            plot(solves, args.plot or ROOT / "docs" / "scale.png")
         yield (
             "q = 0.2 of the directions are random; each solve once, after a warm-up on 1000 cameras of the"
             " family, so that nothing is compiled while the clock runs."
@@ -320,12 +303,7 @@ def tables(measured: Mapping[str, Measured | Search], args: argparse.Namespace) 
         yield _show_times(solves)
         yield "## Certificate, error and memory"
         yield _show_proofs(solves)
-        yield f"## Iterations of ADMM until the objective is within {CLOSE:.0e}, as n grows"
-        yield _show_iterations(solves)
-        yield (
-            "## Exponents: value ~ size^exponent, least squares of logarithms over the sizes above\n\n"
-            "![time and memory against cameras](../../docs/scale.png)"
-        )
+        yield "## Exponents: value ~ size^exponent, least squares of logarithms over the sizes above"
         yield _show_exponents(solves)
         yield "## Why this solver"
         yield "\n".join(
@@ -421,71 +399,24 @@ def _show_searches(searches: Sequence[Search]) -> str:
     )
 
 
-def _show_iterations(measured: Sequence[Measured]) -> str:
-    by_admm = {family: noisy(measured, family, by_admm=True) for family in FAMILIES}
-    sizes = sorted({one.problem.spec.n for found in by_admm.values() for one in found})
+def _show_exponents(solves: Sequence[Measured]) -> str:
+    values: dict[str, Callable[[Measured], float]] = {
+        "to 1e-4": lambda one: one.close_s,
+        "total": lambda one: one.total_s,
+        "memory of the solve": lambda one: one.peak_mb - one.before_mb,
+    }
     rows = []
-    for family, name in FAMILIES.items():
-        close_at = {one.problem.spec.n: one.close_at for one in by_admm[family]}
-        if close_at:
-            cells = [close_at.get(n) for n in sizes]
-            rows.append([name, *("-" if cell is None else f"{cell}" for cell in cells)])
-    return table(["family", *(f"{n} cameras" for n in sizes)], rows)
-
-
-def _show_exponents(measured: Sequence[Measured]) -> str:
-    rows = []
-    for family, name in FAMILIES.items():
-        for by_admm in (False, True):
-            found = noisy(measured, family, by_admm)
-            if len(found) > 1:
-                rows.append([name, "admm" if by_admm else "auto", *_exponent_cells(found)])
-    values = ("to 1e-4", "total", "memory of the solve")
-    return table(
-        ["family", "solver", "cameras", *(f"{value}: per cameras / pairs" for value in values)], rows
-    )
-
-
-def _exponent_cells(found: Sequence[Measured]) -> list[str]:
-    """Return the sizes, and the exponents of times and memory."""
-    cameras = [float(one.problem.spec.n) for one in found]
-    pairs = [float(one.num_edges) for one in found]
-    values = (
-        [one.close_s for one in found],
-        [one.total_s for one in found],
-        [one.peak_mb - one.before_mb for one in found],
-    )
-    sizes = " ".join(map(_show_size, cameras))
-    exponents = [f"{exponent(cameras, v):.2f} / {exponent(pairs, v):.2f}".replace("nan", "-") for v in values]
-    return [sizes, *exponents]
-
-
-def plot(measured: Sequence[Measured], file: Path) -> None:
-    """Draw time and memory against the number of cameras, log-log, into a PNG file."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10.0, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    panels = figure.subplots(1, 2)
-    for color, (family, name) in enumerate(FAMILIES.items()):
-        found = noisy(measured, family)
-        if not found:
-            continue
-        cameras = [one.problem.spec.n for one in found]
-        style = {"color": f"C{color}", "marker": "o", "markersize": 4.0}
-        slope = exponent(cameras, [one.total_s for one in found])
-        fitted = "" if math.isnan(slope) else f", n^{slope:.2f}"
-        panels[0].loglog(cameras, [one.total_s for one in found], label=f"{name}{fitted}", **style)
-        panels[0].loglog(cameras, [one.close_s for one in found], linestyle="--", **style)
-        panels[1].loglog(cameras, [one.peak_mb for one in found], label=name, **style)
-    panels[0].set_ylabel("seconds: certified (solid), objective to 1e-4 (dashed)")
-    panels[1].set_ylabel("peak resident memory, MB, libraries included")
-    for panel in panels:
-        panel.set_xlabel("cameras")
-        panel.grid(True, which="both", alpha=0.25)
-        panel.legend(frameon=False)
-    figure.savefig(file, dpi=110)
+    for (family, name), by_admm in product(FAMILIES.items(), (False, True)):
+        found = noisy(solves, family, by_admm)
+        cameras, pairs = [one.problem.spec.n for one in found], [one.num_edges for one in found]
+        cells = [
+            f"{exponent(cameras, grown):.2f} / {exponent(pairs, grown):.2f}".replace("nan", "-")
+            for grown in ([show(one) for one in found] for show in values.values())
+        ]
+        if len(found) > 1:
+            rows.append([name, "admm" if by_admm else "auto", " ".join(map(_show_size, cameras)), *cells])
+    header = ["family", "solver", "cameras", *(f"{value}: per cameras / pairs" for value in values)]
+    return table(header, rows)
 
 
 BENCHMARK = Benchmark(

@@ -9,20 +9,17 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, get_args
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from figures.trials import Cell, Results, problems, run_trials
 from harness import ours
 from harness.graphs import view_graph
 from sfm_shapefit.rigidity import is_parallel_rigid
 from sfm_shapefit.synthetic.graphs import Corruption
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 
 SEED = 0
 EXACT = 1e-9
@@ -92,25 +89,13 @@ FIGURES: dict[str, list[Panel]] = {
 }
 
 
-def quick(panel: Panel) -> Panel:
-    """Return the panel with few cells: what the tests run."""
-    return replace(panel, n=(10, 30), q=(0.0, 0.2))
-
-
-def compute(shown: Sequence[Panel], trials: int, cache: Path | None, processes: int) -> Results:
-    """Run all cells of the panels; every method runs on every cell."""
-    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
-    methods = list(dict.fromkeys(panel.method for panel in shown))
-    return run_trials(cells, methods, trials, cache=cache, processes=processes, seed=SEED)
-
-
 def image(panel: Panel, results: Results) -> np.ndarray:
     """Return the mean errors of a panel, rows by n, columns by q."""
     means = dict(zip(results.cells, results.mean_errors(panel.method), strict=True))
     return np.array([means[cell] for cell in panel.cells()]).reshape(len(panel.n), len(panel.q))
 
 
-def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
+def draw(shown: Sequence[Panel], results: Results) -> Figure:
     """Draw the panels as the paper does."""
     columns = min(len(shown), 3 if len(shown) % 3 == 0 else 4)
     rows = -(-len(shown) // columns)
@@ -129,17 +114,14 @@ def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
     for axis in axes.ravel()[len(shown) :]:
         axis.set_axis_off()
     figure.colorbar(picture, ax=axes, label="mean relative error", shrink=0.7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
+    return figure
 
 
 def report(shown: Sequence[Panel], results: Results) -> str:
     """Say what the paper's text says of its figure, and which camera fails where a large problem does."""
-    lines = [f"{len(results.cells)} cells in {results.seconds:.0f} s"]
+    lines = [f"{len(results.cells)} cells"]
     for panel in shown:
-        rows = {cell: k for k, cell in enumerate(results.cells)}
-        values = results.values[[rows[cell] for cell in panel.cells()], results.methods.index(panel.method)]
+        values = results.of(panel.method)[[results.cells.index(cell) for cell in panel.cells()]]
         exact = values[..., 0] < EXACT
         lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
         if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
@@ -190,17 +172,15 @@ def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
         if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
             mean = np.minimum(trials[:, 0], 1.0).mean()
             lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
-            lines += [_failure(t) for t in trials.tolist() if t[0] >= EXACT]
+            lines += [
+                "    a problem that is not parallel rigid"
+                if camera < 0
+                else f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong;"
+                f" {others:.2g} without it"
+                for error, camera, share, others in trials.tolist()
+                if error >= EXACT
+            ]
     return lines
-
-
-def _failure(trial: Sequence[float]) -> str:
-    error, camera, share, others = trial
-    if camera < 0:
-        return "    a problem that is not parallel rigid"
-    return (
-        f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong; {others:.2g} without it"
-    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -208,11 +188,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figure", choices=FIGURES, default="paper")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Compute and draw a figure, and say what the paper's text says of its own."""
+def run(args: argparse.Namespace) -> Figure:
+    """Compute and draw a figure, and say what the paper's text says of its own.
+
+    Every method runs on every cell.
+    """
     shown, trials = FIGURES[args.figure], args.trials
     if args.quick:
-        shown, trials = [quick(panel) for panel in shown], 2
-    results = compute(shown, trials, args.cache, args.processes)
-    draw(shown, results, args.out)
+        shown, trials = [replace(panel, n=(10, 30), q=(0.0, 0.2)) for panel in shown], 2
+    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
+    methods = list(dict.fromkeys(panel.method for panel in shown))
+    results = run_trials(cells, methods, trials, cache=args.cache, processes=args.processes, seed=SEED)
     print(report(shown, results))
+    return draw(shown, results)

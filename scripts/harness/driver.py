@@ -168,6 +168,9 @@ class Kept:
         if kept_settings != settings:
             raise ValueError(f"{file} holds answers of other settings; delete it or give another --cache")
 
+    def __contains__(self, name: str) -> bool:
+        return name in self._answers
+
     def get(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return the answer kept under a name, or ask for it and keep it."""
         if name not in self._answers:
