@@ -13,7 +13,7 @@ has a process of its own, in which the changed source is loaded in place of the 
 the shortest first, until one fails. A mutant that takes far more processor time than the tests counts as
 found.
 
-Outcomes are kept in FOLDER, and what is there is not run again; give another folder after a change of the code.
+Outcomes are kept in FOLDER and not asked again; give another folder after a change of the code.
 """
 
 import argparse

@@ -10,14 +10,14 @@ answer stands beside it.
 import argparse
 import statistics
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 from harness import ours
 from harness.driver import Benchmark, Case
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
 from harness.metrics import Check, Quantity, number, verdict
-from harness.record import table, table_of
+from harness.record import table_of
 
 PROBLEMS = {
     "er2-50": GraphSpec(family="er2", n=50, sigma=0.01),
@@ -30,8 +30,7 @@ BROKEN = 0.2
 """Relative error from which a method counts as broken; two independent configurations are 1.4 apart."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
+class Trial(NamedTuple):
     """One graph, solved by all methods."""
 
     shapefit: float
@@ -43,8 +42,7 @@ class Trial:
     warned: bool
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trials:
+class Trials(NamedTuple):
     """All seeds of one problem at one share of wrong pairs."""
 
     name: str
@@ -141,15 +139,21 @@ def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterato
         },
     )
     yield f"## Where the methods break\n\nThe least q from which on the median error stays above {BROKEN:g}."
-    rows = []
-    for name in dict.fromkeys(one.name for one in measured.values()):
-        cells = []
-        for column in ("shapefit", "lud", "placed"):
-            errors = {one.q: one.median(column) for one in measured.values() if one.name == name}
-            share = breaking_share(errors)
-            cells.append("never" if share is None else f"{share:g}")
-        rows.append([name, *cells])
-    yield table(["problem", "ShapeFit", "LUD", "placed"], rows)
+
+    def show_share(name: str, column: str) -> str:
+        errors = {one.q: one.median(column) for one in measured.values() if one.name == name}
+        share = breaking_share(errors)
+        return "never" if share is None else f"{share:g}"
+
+    yield table_of(
+        dict.fromkeys(one.name for one in measured.values()),
+        {
+            "problem": str,
+            "ShapeFit": lambda name: show_share(name, "shapefit"),
+            "LUD": lambda name: show_share(name, "lud"),
+            "placed": lambda name: show_share(name, "placed"),
+        },
+    )
 
 
 BENCHMARK = Benchmark(

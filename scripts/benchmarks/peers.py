@@ -29,7 +29,7 @@ class OnScene:
     """All contenders on a real scene."""
 
     scene: Scene
-    rows: tuple[on_scenes.Row, ...]
+    rows: tuple[on_graphs.Answer, ...]
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
@@ -95,19 +95,14 @@ def tables(measured: Mapping[str, on_graphs.Compared | OnScene], args: argparse.
 
 
 def _rows(one: on_graphs.Compared | OnScene) -> Iterator[list[str]]:
-    if isinstance(one, OnScene):
-        for row in one.rows:
-            yield [one.scene.label, row.name, show_errors(row.errors), *_costs(row), row.note]
-    else:
-        for answer in one.answers:
-            label = f"{one.name} ({one.num_edges} pairs)"
-            yield [label, answer.name, number(answer.error), *_costs(answer), answer.note]
-
-
-def _costs(answer: on_graphs.Answer | on_scenes.Row) -> list[str]:
-    """Return the cells of time and memory."""
-    cpu = f" ({number(answer.cpu_s)})" if math.isfinite(answer.cpu_s) else ""
-    return [number(answer.seconds) + cpu, f"{answer.peak_mb:.0f}".replace("nan", "-")]
+    for answer in one.rows if isinstance(one, OnScene) else one.answers:
+        if isinstance(one, OnScene):
+            problem, error = one.scene.label, show_errors(answer.error)
+        else:
+            problem, error = f"{one.name} ({one.num_edges} pairs)", number(answer.error)
+        cpu = f" ({number(answer.cpu_s)})" if math.isfinite(answer.cpu_s) else ""
+        peak = f"{answer.peak_mb:.0f}".replace("nan", "-")
+        yield [problem, answer.name, error, number(answer.seconds) + cpu, peak, answer.note]
 
 
 BENCHMARK = Benchmark(
