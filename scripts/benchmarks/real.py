@@ -14,9 +14,9 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case, if_there
@@ -25,14 +25,13 @@ from harness.process import peak_memory_mb
 from harness.record import table_of
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class Scene(NamedTuple):
     """A data set and what is to be reached on it; limits of the median and mean position error."""
 
     name: str
     unit: str
-    truth: str = "gt"
-    limits: tuple[float, float] | None = None
+    truth: str
+    limits: tuple[float, float]
     """Median and mean before bundle adjustment."""
     adjusted_reference: float | None = None
     """Mean error of the better of COLMAP incremental and GLOMAP, both after bundle adjustment."""
@@ -50,37 +49,23 @@ class Scene:
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene(
-            name="fountain-P11",
-            unit="m",
-            limits=(0.0024, 0.0025),
-            adjusted_reference=0.0023,
-            averaged_limits=(0.007, 0.010),
-        ),
-        Scene(name="Herz-Jesus-P8", unit="m", limits=(0.0036, 0.0042)),
-        Scene(name="Herz-Jesus-P25", unit="m", limits=(0.0060, 0.0058), adjusted_reference=0.0053),
-        Scene(name="castle-P19", unit="m", limits=(0.022, 0.050), adjusted_reference=0.0263),
-        Scene(
-            name="castle-P30",
-            unit="m",
-            limits=(0.027, 0.032),
-            adjusted_reference=0.0232,
-            limit_s=8.0,
-            averaged_limits=(0.08, 0.11),
-        ),
-        Scene(name="lego100", unit="scene units", limits=(0.0052, 0.012)),
-        Scene(name="liberty", unit="reference units", truth="sparse/0", limits=(0.004, 0.008), limit_s=15.0),
-        Scene(name="liberty-calibrated", unit="reference units", truth="sparse/0", limits=(0.004, 0.008)),
+        Scene("fountain-P11", "m", "gt", (0.0024, 0.0025), 0.0023, (0.007, 0.010)),
+        Scene("Herz-Jesus-P8", "m", "gt", (0.0036, 0.0042)),
+        Scene("Herz-Jesus-P25", "m", "gt", (0.0060, 0.0058), 0.0053),
+        Scene("castle-P19", "m", "gt", (0.022, 0.050), 0.0263),
+        Scene("castle-P30", "m", "gt", (0.027, 0.032), 0.0232, (0.08, 0.11), limit_s=8.0),
+        Scene("lego100", "scene units", "gt", (0.0052, 0.012)),
+        Scene("liberty", "reference units", "sparse/0", (0.004, 0.008), limit_s=15.0),
+        Scene("liberty-calibrated", "reference units", "sparse/0", (0.004, 0.008)),
     )
 }
-QUICK = Scene(name="courtyard", unit="m", truth="truth", limits=(0.02, 0.02))
+QUICK = Scene("courtyard", "m", "truth", (0.02, 0.02))
 """A bundled scene."""
 ADJUSTED_SLACK = 1.15
 """How far the mean error may be above the reference's."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Errors:
+class Errors(NamedTuple):
     """Position errors in the truth's units, over the cameras that model and truth have in common."""
 
     median: float
@@ -90,22 +75,19 @@ class Errors:
     """Cameras of the truth that the model does not have; they are in no average."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Averaged:
+class Averaged(NamedTuple):
     """One run on rotations from averaging."""
 
-    refined: bool
-    """Whether `locate` refined the rotations."""
     scene: Scene
+    rotations: str
+    """Whether `locate` refined them."""
     errors: Errors
     rotation_deg: tuple[float, float, float]
     """Median, mean and maximum of the rotation errors."""
-    num_turned: int
     cpu_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
+class Measured(NamedTuple):
     """What one set gave; seconds are wall-clock unless they say CPU."""
 
     scene: Scene
@@ -192,21 +174,22 @@ def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
     from peers.colmap import average_rotations
     from sfm_shapefit import evaluate
 
-    model = average_rotations(folder / "database.db", folder / "sparse" / "0")
+    model, truth = average_rotations(folder / "database.db", folder / "sparse" / "0"), folder / scene.truth
     measured = []
     for refine in (False, True):
         run = ours.time_call(
             lambda refine=refine: ours.locate(model, folder / "database.db", refine_rotations=refine)
         )
-        rotation = evaluate(run.found.reconstruction, folder / scene.truth).rotation_deg
+        rotation = evaluate(run.found.reconstruction, truth).rotation_deg
         turned = run.found.turned_deg
         measured.append(
             Averaged(
                 scene=scene,
-                refined=refine,
-                errors=compare(run.found.reconstruction, folder / scene.truth),
+                rotations=f"refined, {0 if turned is None else (turned > 0.0).sum()} cameras"
+                if refine
+                else "kept",
+                errors=compare(run.found.reconstruction, truth),
                 rotation_deg=(rotation.median, rotation.mean, rotation.max),
-                num_turned=0 if turned is None else int((turned > 0.0).sum()),
                 cpu_s=run.cpu_s,
             )
         )
@@ -218,10 +201,7 @@ def compare(reconstruction: object, truth: Path) -> Errors:
     from sfm_shapefit import evaluate
 
     found = evaluate(reconstruction, truth)  # type: ignore[arg-type]
-    position = found.position
-    return Errors(
-        median=position.median, mean=position.mean, max=position.max, num_missing=len(found.missing)
-    )
+    return Errors(found.position.median, found.position.mean, found.position.max, len(found.missing))
 
 
 def _error_checks(errors: Errors, limits: tuple[float, float] | None) -> list[Check]:
@@ -294,8 +274,7 @@ def show_errors(errors: Errors | None) -> str:
 
 def _judge(limits: Sequence[Check], errors: Errors) -> str:
     """Return a verdict that says how many cameras of the truth it leaves out."""
-    without = f", without {errors.num_missing} cameras" if errors.num_missing else ""
-    return verdict(limits) + without
+    return verdict(limits) + (f", without {errors.num_missing} cameras" if errors.num_missing else "")
 
 
 def _show_accuracy(found: Sequence[Measured]) -> str:
@@ -306,7 +285,7 @@ def _show_accuracy(found: Sequence[Measured]) -> str:
             "placed": lambda one: f"{one.num_placed} of {one.num_posed}",
             "pairs used": lambda one: f"{one.num_pairs_used} of {one.num_pairs}",
             "median / mean / max": lambda one: show_errors(one.errors),
-            "to reach, median / mean": lambda one: numbers(one.scene.limits or ()) or "-",
+            "to reach, median / mean": lambda one: numbers(one.scene.limits),
             "verdict": lambda one: _judge(_error_checks(one.errors, one.scene.limits), one.errors),
             "gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
         },
@@ -332,9 +311,8 @@ def _show_times(found: Sequence[Measured]) -> str:
 
 
 def _show_adjusted(found: Sequence[Measured]) -> str:
-    def compare_mean(one: Measured) -> str:
-        over = ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
-        return "-" if math.isnan(over) else f"{over:.2f}"
+    def over(one: Measured) -> float:
+        return ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
 
     return table_of(
         found,
@@ -342,7 +320,7 @@ def _show_adjusted(found: Sequence[Measured]) -> str:
             "set": lambda one: one.scene.label,
             "median / mean / max": lambda one: show_errors(one.adjusted),
             "reference mean": lambda one: number(one.scene.adjusted_reference or math.nan),
-            "mean / reference": compare_mean,
+            "mean / reference": lambda one: f"{over(one):.2f}".replace("nan", "-"),
             "verdict": lambda one: _judge(adjusted_checks(one), one.adjusted),
             "adjustment, s": lambda one: number(one.adjustment_s),
         },
@@ -354,7 +332,7 @@ def _show_averaged(runs: Sequence[Averaged]) -> str:
         runs,
         {
             "set": lambda run: run.scene.label,
-            "rotations": lambda run: f"refined, {run.num_turned} cameras" if run.refined else "kept",
+            "rotations": lambda run: run.rotations,
             "median / mean / max": lambda run: show_errors(run.errors),
             "rotation error, deg": lambda run: numbers(run.rotation_deg),
             "to reach, median / mean": lambda run: numbers(run.scene.averaged_limits or ()) or "-",
