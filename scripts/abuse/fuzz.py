@@ -119,8 +119,7 @@ def make_base(folder: Path) -> Path:
         (folder / name).mkdir()
     model.write_text(folder / "text")
     model.write_binary(folder / "truth")
-    strangers.write_models(model, folder)
-    strangers.write_tables(model, folder)
+    shutil.copytree(strangers.SAMPLES, folder, dirs_exist_ok=True)
     shutil.copytree(folder / "sparse" / "0", folder / "old")
     for name in ("rigs", "frames"):
         (folder / "old" / f"{name}.bin").unlink()

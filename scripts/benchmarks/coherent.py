@@ -168,15 +168,14 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity("q", "1", "neither", 0.0, "odds that a direction is a wrong one"),
         Quantity(
-            *("ShapeFit, LUD, placed", "1", "lower", 0.05),
-            "error against the truth, both centred and of unit norm, median of the seeds; "
-            "placed is what `place` and `locate` give",
+            "ShapeFit, LUD, placed",
+            "1",
+            "lower",
+            0.05,
+            "against the truth, of unit norm, median of the seeds",
         ),
         Quantity("placed, false", "1", "neither", 0.05, "the same against the second configuration"),
         Quantity("contradicting", "1", "neither", 0.05, "share of pairs that contradict the answer, median"),
-        Quantity(
-            *("warned", "seeds", "neither", 0.0),
-            f"seeds with a warning in the report, and of those, seeds with an error above {BROKEN:g}",
-        ),
+        Quantity("warned", "seeds", "neither", 0.0, f"and of those with an error above {BROKEN:g}"),
     ),
 )

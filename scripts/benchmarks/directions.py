@@ -277,14 +277,8 @@ BENCHMARK = Benchmark(
     quick={"pairs": BATCH, "draws": 200},
     quantities=(
         Quantity("pairs/s", "1/s", "higher", 0.25, "wall-clock, without start-up"),
-        Quantity(
-            *("growth", "MB", "lower", 1.0),
-            "resident memory at the end minus that after the first batch, of the worst process",
-        ),
-        Quantity(
-            *("normalized error", "1", "neither", 0.05),
-            "mean of r^T Sigma^-1 r over the usable pairs; 2 where the covariance is right",
-        ),
+        Quantity("growth", "MB", "lower", 1.0, "of resident memory after the first batch, worst process"),
+        Quantity("normalized error", "1", "neither", 0.05, "mean of r^T Sigma^-1 r; 2 where Sigma is right"),
         Quantity("error, median / 95 %", "deg", "lower", 0.05, "of the usable directions"),
     ),
 )

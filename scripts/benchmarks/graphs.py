@@ -320,18 +320,12 @@ BENCHMARK = Benchmark(
     quick={"repeats": 1},
     repeats=5,
     quantities=(
-        Quantity(
-            *("ShapeFit, LUD, placed, oracle", "1", "lower", 0.05),
-            "error of the cameras, both sets centred and of unit norm, median of the seeds; "
-            "LUD is the second start, 50 iterations; placed is what `place` and `locate` give",
-        ),
+        Quantity("ShapeFit, LUD, placed, oracle", "1", "lower", 0.05, "of the cameras, of unit norm, median"),
         Quantity("/ oracle", "1", "lower", 0.05, "placed over the oracle, median of the seeds' ratios"),
+        Quantity("mean / median", "1", "lower", 0.1, "distances of the cameras kept; worst seed"),
         Quantity(
-            *("mean / median", "1", "lower", 0.1),
-            "of the distances of cameras after least squares alignment, those whose trust is "
-            f"{_MIN_TRUST:g} or more; largest of the seeds",
+            "kept", "cameras", "higher", 0.0, f"cameras of trust {_MIN_TRUST:g} or more, fewest of the seeds"
         ),
-        Quantity("kept", "cameras", "higher", 0.0, "these, fewest of the seeds"),
         Quantity("seconds", "s", "lower", 0.5, "`place`, wall-clock, median"),
     ),
 )

@@ -149,10 +149,7 @@ BENCHMARK = Benchmark(
     checks=checks,
     tables=tables,
     quantities=(
-        Quantity(
-            *("mean error", "truth's", "lower", 0.05),
-            "mean position error of the placed cameras; in brackets on those that `map` placed",
-        ),
+        Quantity("mean error", "truth's", "lower", 0.05, "of the placed cameras; (of those `map` placed)"),
         Quantity("placed", "1", "higher", 0.0, "cameras of the largest model"),
         Quantity("CPU, wall", "s", "lower", 0.3, "time of the whole run"),
     ),

@@ -356,27 +356,12 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity("placed", "cameras", "higher", 0.0, "of those with a rotation"),
         Quantity("pairs used", "pairs", "neither", 0.0, "of all pairs with verified matches"),
-        Quantity(
-            *("median / mean / max", "the set's", "lower", 0.01),
-            "position error after robust (L1) alignment, over the placed cameras of the truth",
-        ),
+        Quantity("median / mean / max", "the set's", "lower", 0.01, "position error after L1 alignment"),
         Quantity("gap", "1", "lower", 1.0, "certified: objective minus a rigorous dual bound"),
-        Quantity(
-            *("warm", "s", "lower", 0.5),
-            "`locate` and writing its output, wall-clock, median of the repeats after the cold run",
-        ),
+        Quantity("warm", "s", "lower", 0.5, "`locate` and writing, wall-clock, median of the repeats"),
         Quantity("CPU", "s", "lower", 0.25, "the same in processor time of all threads"),
-        Quantity(
-            *("cold", "s", "lower", 0.5),
-            "first run of a fresh process, imports included; a first run ever also compiles and caches",
-        ),
-        Quantity(
-            *("solve", "s", "lower", 0.5),
-            "the solver alone, by its own clock, median of the warm runs",
-        ),
-        Quantity(
-            *("memory", "MB", "lower", 0.15),
-            "peak resident memory of the fresh process after the cold run, libraries included",
-        ),
+        Quantity("cold", "s", "lower", 0.5, "first run of a fresh process, imports included"),
+        Quantity("solve", "s", "lower", 0.5, "the solver alone, by its own clock, median of the warm runs"),
+        Quantity("memory", "MB", "lower", 0.15, "peak of the fresh process after the cold run"),
     ),
 )

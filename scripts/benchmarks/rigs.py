@@ -146,8 +146,7 @@ BENCHMARK = Benchmark(
         Quantity("images", "images", "higher", 0.0, "placed ones of each drive"),
         Quantity("scale error", "1", "lower", 0.1, "scale of the similarity onto the truth, minus 1; median"),
         Quantity(
-            *("median, worst camera", "m", "lower", 0.1),
-            "distance from the truth after shift and rotation: median camera, median of the drives; worst",
+            "median, worst camera", "m", "lower", 0.1, "after shift and rotation, median of drives; worst"
         ),
         Quantity("seconds", "s", "lower", 0.5, "wall-clock of the call, median of the drives"),
     ),
