@@ -172,7 +172,7 @@ BENCHMARK = Benchmark(
             "1",
             "lower",
             0.05,
-            "against the truth, of unit norm, median of the seeds",
+            "against the truth, median of the seeds",
         ),
         Quantity("placed, false", "1", "neither", 0.05, "the same against the second configuration"),
         Quantity("contradicting", "1", "neither", 0.05, "share of pairs that contradict the answer, median"),

@@ -10,8 +10,9 @@ import statistics
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from harness import ours
 from harness.driver import DATA, ROOT, Benchmark, Case, if_there
@@ -35,7 +36,7 @@ _ORACLE_STEPS = 8
 _ORACLE_NODES = 20_000
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class Problem:
     """What is drawn, once per seed, and what it has to reach."""
 
@@ -49,36 +50,28 @@ class Problem:
     seconds: float | None = None
 
 
-def _usual(family: str, n: int, degree: float = 0.0) -> dict[str, Problem]:
-    specs = [GraphSpec(family=family, n=n, degree=degree, sigma=sigma) for sigma in (0.01, 0.05)]
-    return {f"{family}-{n} {spec.sigma:g}": Problem(spec=spec, over_oracle=1.08) for spec in specs}
-
-
-def _chain(family: str, n: int, degree: float) -> dict[str, Problem]:
-    spec = GraphSpec(family=family, n=n, degree=degree, sigma=0.01)
-    return {f"{family}-{n}": Problem(spec=spec, over_oracle=1.3, below_lud=True)}
-
-
 def _street(n: int, jitter: float, error: float, seconds: float | None = None) -> dict[str, Problem]:
     spec = GraphSpec(family="street", n=n, sigma=0.01, q=0.15)
     name = f"street-{n} {f'jitter {jitter:.0%}' if jitter else 'straight'}"
     return {name: Problem(spec=spec, jitter=jitter, error=error, seconds=seconds)}
 
 
+USUAL = (("er2", 100, 0.0), ("geo", 500, 40.0), ("comm", 500, 67.0))
+CHAINS = (
+    *(("seq", 300, 36.0), ("seqv", 300, 36.0), ("ring", 500, 20.0), ("corr", 500, 20.0)),
+    *(("lawn", 1000, 20.0), ("seq", 1000, 36.0), ("seqv", 1000, 36.0), ("seqv", 10_000, 36.0)),
+)
 PROBLEMS: dict[str, Problem] = {
-    **_usual("er2", 100),
-    **_usual("geo", 500, 40.0),
-    **_usual("comm", 500, 67.0),
+    **{
+        f"{family}-{n} {sigma:g}": Problem(GraphSpec(family, n, degree, sigma), over_oracle=1.08)
+        for (family, n, degree), sigma in product(USUAL, (0.01, 0.05))
+    },
     "er2-100 0.05, q 0.4": Problem(spec=GraphSpec(family="er2", n=100, sigma=0.05, q=0.4), over_oracle=1.15),
     "seq-300 exact, q 0.1": Problem(spec=GraphSpec(family="seq", n=300, degree=36.0, q=0.1), error=EXACT),
-    **_chain("seq", 300, 36.0),
-    **_chain("seqv", 300, 36.0),
-    **_chain("ring", 500, 20.0),
-    **_chain("corr", 500, 20.0),
-    **_chain("lawn", 1000, 20.0),
-    **_chain("seq", 1000, 36.0),
-    **_chain("seqv", 1000, 36.0),
-    **_chain("seqv", 10_000, 36.0),
+    **{
+        f"{family}-{n}": Problem(GraphSpec(family, n, degree, 0.01), over_oracle=1.3, below_lud=True)
+        for family, n, degree in CHAINS
+    },
     **_street(500, 0.0, 3e-3),
     **_street(500, 0.01, 3e-3),
     **_street(500, 0.05, 3e-3),
@@ -105,8 +98,7 @@ class Drawn:
     covariance: "FloatArray | None" = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
+class Trial(NamedTuple):
     """One graph, solved."""
 
     shapefit: float
@@ -120,8 +112,7 @@ class Trial:
     seconds: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trials:
+class Trials(NamedTuple):
     """All seeds of one problem."""
 
     name: str
@@ -275,17 +266,15 @@ def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
 
 def checks(found: Trials) -> list[Check]:
     """Return the limits of one problem: of medians, and of the worst mean over median."""
-    problem, limits = found.problem, []
-    if problem.over_oracle is not None:
-        limits.append(Check(name="/ oracle", value=found.median("over_oracle"), limit=problem.over_oracle))
-    if problem.error is not None:
-        limits.append(Check(name="error", value=found.median("placed"), limit=problem.error))
-    if problem.below_lud:
-        lud = found.median("lud")
-        limits.append(Check(name="placed against LUD", value=found.median("placed"), limit=lud))
-    if problem.seconds is not None:
-        limits.append(Check(name="seconds", value=found.median("seconds"), limit=problem.seconds))
-    return [*limits, Check(name="mean / median", value=found.mean_over_median, limit=MEAN_OVER_MEDIAN)]
+    problem = found.problem
+    limits = (
+        ("/ oracle", found.median("over_oracle"), problem.over_oracle),
+        ("error", found.median("placed"), problem.error),
+        ("placed against LUD", found.median("placed"), found.median("lud") if problem.below_lud else None),
+        ("seconds", found.median("seconds"), problem.seconds),
+        ("mean / median", found.mean_over_median, MEAN_OVER_MEDIAN),
+    )
+    return [Check(name=name, value=v, limit=limit) for name, v, limit in limits if limit is not None]
 
 
 def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterator[str]:

@@ -145,9 +145,7 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity("images", "images", "higher", 0.0, "placed ones of each drive"),
         Quantity("scale error", "1", "lower", 0.1, "scale of the similarity onto the truth, minus 1; median"),
-        Quantity(
-            "median, worst camera", "m", "lower", 0.1, "after shift and rotation, median of drives; worst"
-        ),
+        Quantity("median, worst camera", "m", "lower", 0.1, "after shift and rotation"),
         Quantity("seconds", "s", "lower", 0.5, "wall-clock of the call, median of the drives"),
     ),
 )

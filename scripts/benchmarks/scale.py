@@ -439,9 +439,7 @@ BENCHMARK = Benchmark(
         Quantity("error", "1", "lower", 0.01, "the paper's, against the truth"),
         Quantity("memory", "MB", "lower", 0.15, "peak during `solve`, all included / resident before it"),
         Quantity("pieces", "1", "neither", 0.0, "of three cameras or more; single pairs"),
-        Quantity(
-            "seconds (CPU)", "s", "lower", 0.3, f"of finding pieces, median of {RIGID_REPEATS}, one thread"
-        ),
+        Quantity("seconds (CPU)", "s", "lower", 0.3, f"of the search, median of {RIGID_REPEATS}"),
         Quantity("peak", "MB", "lower", 0.05, "of imports, the pairs, and the search for pieces"),
     ),
 )

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 SEED = 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class GraphSpec:
     """A random graph problem that can be drawn again anywhere."""
 
