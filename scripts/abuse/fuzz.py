@@ -18,9 +18,9 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
@@ -42,8 +42,7 @@ HELP = "damaged models, databases and graphs through the commands"
 _OLD_FILES = ("cameras", "images", "points3D")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
+class Case(NamedTuple):
     """A damaged input and how it is used."""
 
     label: str
@@ -52,18 +51,6 @@ class Case:
     """Of the command line, relative to the case's folder."""
     same_answer: bool = False
     """Whether the positions must be those of the sound input, since the damage does not concern them."""
-    encoding: str = "utf-8"
-    """Of the child's standard streams."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Report:
-    """How one case went."""
-
-    number: int
-    case: Case
-    outcome: Outcome
-    faults: tuple[str, ...]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -86,17 +73,17 @@ def run(args: argparse.Namespace) -> int:
         slowest = largest = failed = 0.0
         done = 0
         with contextlib.suppress(KeyboardInterrupt):  # which ends it early, with the figures so far
-            for report in reports(base, work / "case", numbers, args.seed, expected):
+            for number in numbers:
+                case, outcome, found = try_case(base, work / "case", [args.seed, number], expected)
                 done += 1
-                outcome = report.outcome
-                codes[report.case.label.partition(":")[0], outcome.code] += 1
+                codes[case.label.partition(":")[0], outcome.code] += 1
                 slowest, largest = max(slowest, outcome.cpu_s), max(largest, outcome.peak_bytes / 1e9)
-                if report.faults:
+                if found:
                     failed += 1
-                    print(f"case {report.number} ({report.case.label}): {'; '.join(report.faults)}")
-                    print(f"    {' '.join(report.case.arguments)}: {outcome.stderr[-1200:]}", flush=True)
+                    print(f"case {number} ({case.label}): {'; '.join(found)}")
+                    print(f"    {' '.join(case.arguments)}: {outcome.stderr[-1200:]}", flush=True)
                 if args.only is not None:
-                    print(report)
+                    print(case, outcome)
         print(f"{done} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
         print(f"slowest {slowest:.1f} s of processor time, largest {largest:.2f} GB")
         for (kind, code), count in sorted(codes.items()):
@@ -175,25 +162,19 @@ def _command(*arguments: str) -> None:
         raise RuntimeError(f"{' '.join(arguments)} failed: {result.output} {result.exception!r}")
 
 
-def reports(
-    base: Path,
-    folder: Path,
-    numbers: "range | list[int]",
-    seed: int,
-    expected: dict[str, list[tuple[float, ...]]],
-) -> Iterator[Report]:
-    """Make, run and judge the cases of these numbers one after the other; the last one's folder stays."""
-    for number in numbers:
-        shutil.rmtree(folder, ignore_errors=True)
-        (folder / "tmp").mkdir(parents=True)
-        rng = np.random.default_rng([seed, number])
-        make = mutations.pick(rng, _KINDS)
-        case = make(base, folder, rng)
-        before = snapshot(folder)
-        main = partial(command_line, case.arguments, folder / "tmp")
-        outcome = run_forked(main, folder, [folder, *caches()], encoding=case.encoding)
-        found = tuple(_judge(case, outcome, folder, before, expected))
-        yield Report(number=number, case=case, outcome=outcome, faults=found)
+def try_case(
+    base: Path, folder: Path, seed: list[int], expected: dict[str, list[tuple[float, ...]]]
+) -> tuple[Case, Outcome, list[str]]:
+    """Make, run and judge a case, whose folder stays until the next one."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "tmp").mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    case = mutations.pick(rng, _KINDS)(base, folder, rng)
+    before = snapshot(folder)
+    main = partial(command_line, case.arguments, folder / "tmp")
+    encoding = "ascii" if rng.random() < 0.1 else "utf-8"
+    outcome = run_forked(main, folder, [folder, *caches()], encoding=encoding)
+    return case, outcome, list(_judge(case, outcome, folder, before, expected))
 
 
 def command_line(arguments: tuple[str, ...], temporary: Path) -> None:
@@ -230,25 +211,18 @@ def _judge(
     strays = [name for name in after if name.startswith("tmp/")]
     if strays:
         yield f"left {strays[0]} behind"
-    for out in _outputs(case, folder) if writes else ():
-        if case.arguments[0] != "convert":
-            yield from faults_of_tables(out)
-        if case.arguments[0] != "solve":
-            yield from faults_of_model(out)
+    out = folder / case.arguments[2] if writes else folder
+    for written in sorted(out.glob("[0-9]*")) if case.arguments[0] == "map" else [out]:
+        if writes and written.is_dir() and case.arguments[0] != "convert":
+            yield from faults_of_tables(written)
+        if writes and written.is_dir() and case.arguments[0] != "solve":
+            yield from faults_of_model(written)
     if case.same_answer:
         if outcome.code:
             yield f"refused what is sound: {outcome.stderr[:300]!r}"
         form = "database" if "--database" in case.arguments else case.arguments[1]
         if not outcome.code and differs(positions(folder / "out"), expected[form]):
             yield "another answer"
-
-
-def _outputs(case: Case, folder: Path) -> list[Path]:
-    """Return the folders with a model or tables that a command wrote."""
-    out = folder / case.arguments[2]
-    if not out.is_dir():
-        return []
-    return [path for path in sorted(out.iterdir()) if path.is_dir()] if case.arguments[0] == "map" else [out]
 
 
 def _choose_command(
@@ -275,10 +249,6 @@ def _copy(base: Path, folder: Path, *names: str) -> None:
             shutil.copyfile(base / name, folder / name)
 
 
-def _encoding(rng: Generator) -> str:
-    return "ascii" if rng.random() < 0.1 else "utf-8"
-
-
 def _binary(base: Path, folder: Path, rng: Generator) -> Case:
     """One damaged binary file; if it holds points, which a database makes superfluous, the answer stays."""
     source = str(mutations.pick(rng, ("sparse/0", "sparse/0", "old")))
@@ -297,7 +267,7 @@ def _binary(base: Path, folder: Path, rng: Generator) -> Case:
         path.write_bytes(way(data, fields, rng))
         label = way.__name__
     arguments = _choose_command(source, rng, database=database)
-    return Case(label=f"binary: {name} {label}", arguments=arguments, encoding=_encoding(rng))
+    return Case(f"binary: {name} {label}", arguments)
 
 
 def _text(base: Path, folder: Path, rng: Generator) -> Case:
@@ -309,7 +279,7 @@ def _text(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(rng, (*ways, mutations.cut_at_word, mutations.change_bytes))
     path.write_bytes(way(path.read_bytes(), rng))
     arguments = _choose_command("text", rng, database=database)
-    return Case(label=f"text: {name} {way.__name__}", arguments=arguments, encoding=_encoding(rng))
+    return Case(f"text: {name} {way.__name__}", arguments)
 
 
 def _database(base: Path, folder: Path, rng: Generator) -> Case:
@@ -319,9 +289,7 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
     if not same and rng.random() < 0.15 and arguments[0] == "locate":
         arguments = (*arguments, "--directions", "relative-poses")
-    return Case(
-        label=f"database: {way.__name__}", arguments=arguments, same_answer=same, encoding=_encoding(rng)
-    )
+    return Case(f"database: {way.__name__}", arguments=arguments, same_answer=same)
 
 
 def _graph(base: Path, folder: Path, rng: Generator) -> Case:
@@ -331,7 +299,7 @@ def _graph(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(rng, (*ways, mutations.change_bytes))
     path.write_bytes(way(path.read_bytes(), rng))
     command = ("inspect", "graph.txt") if rng.random() < 0.15 else ("solve", "graph.txt", "out")
-    return Case(label=f"graph: {way.__name__}", arguments=command, encoding=_encoding(rng))
+    return Case(f"graph: {way.__name__}", command)
 
 
 def _names(base: Path, folder: Path, rng: Generator) -> Case:
@@ -349,7 +317,7 @@ def _names(base: Path, folder: Path, rng: Generator) -> Case:
         connection.commit()
     path.write_bytes(data)
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=True)
-    return Case(label="names: hostile", arguments=arguments, same_answer=True, encoding=_encoding(rng))
+    return Case("names: hostile", arguments, same_answer=True)
 
 
 def _place(base: Path, folder: Path, rng: Generator) -> Case:
@@ -362,10 +330,10 @@ def _place(base: Path, folder: Path, rng: Generator) -> Case:
     target = str(mutations.pick(rng, (*models, "database.db", "graph.txt")))
     kind = mutations.misplace(folder / target, rng)
     if target == "graph.txt":
-        return Case(label=f"place: {kind}", arguments=("solve", "graph.txt", "out"))
+        return Case(f"place: {kind}", ("solve", "graph.txt", "out"))
     source = "text" if target.startswith("text") else "sparse/0"
     return Case(
-        label=f"place: {kind} as {target}",
+        f"place: {kind} as {target}",
         arguments=_choose_command(source, rng, database=target == "database.db"),
     )
 
@@ -383,14 +351,14 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     if rng.random() < 0.5:
         order = rng.permutation(len(records))[: int(rng.integers(0, len(records) + 1))]
     path.write_bytes(struct.pack("<Q", len(order)) + b"".join(records[int(k)] for k in order))
-    return Case(label=f"records: {name}", arguments=_choose_command("sparse/0", rng, database=False))
+    return Case(f"records: {name}", _choose_command("sparse/0", rng, database=False))
 
 
 def _of_others(base: Path, folder: Path, rng: Generator) -> Case:
     """What other programs and people write."""
     ways = (strangers.damage_stranger, strangers.damage_database, strangers.damage_table)
     label, arguments = mutations.pick(rng, ways)(base, folder, rng)
-    return Case(label=label, arguments=arguments, encoding=_encoding(rng))
+    return Case(label=label, arguments=arguments)
 
 
 _KINDS: tuple[Callable[[Path, Path, Generator], Case], ...] = (
