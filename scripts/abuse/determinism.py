@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.random import Generator
 
-from abuse.layouts import binary_fields, read_field
+from abuse.layouts import binary_fields, cut_records, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
 
 HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
@@ -163,14 +163,13 @@ def _reorder_file(
         ("points3D", "image reference"): image_ids,
         ("frames", "image reference"): image_ids,
     }
-    fields, changed = binary_fields(name, data), bytearray(data)
-    for field in fields:
+    changed = bytearray(data)
+    for field in binary_fields(name, data):
         if (name, field.meaning) in maps:
             value = read_field(data, field)
             renamed = maps[name, field.meaning].get(value, value)  # no point: stays
             struct.pack_into(f"<{field.kind}", changed, field.offset, renamed)
-    starts = [field.offset for field in fields if field.meaning == "id"]
-    records = [bytes(changed[a:b]) for a, b in zip(starts, [*starts[1:], len(changed)], strict=False)]
+    records = cut_records(name, bytes(changed))
     if name not in ("cameras", "rigs"):
         records = [records[int(k)] for k in rng.permutation(len(records))]
     return bytes(changed[:8]) + b"".join(records)

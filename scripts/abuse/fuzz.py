@@ -26,7 +26,7 @@ import numpy as np
 from numpy.random import Generator
 
 from abuse import databases, mutations, strangers
-from abuse.layouts import binary_fields
+from abuse.layouts import binary_fields, cut_records
 from abuse.sandbox import Outcome, run_forked
 from abuse.verdicts import (
     MODEL_FILES,
@@ -211,12 +211,11 @@ def _judge(
     strays = [name for name in after if name.startswith("tmp/")]
     if strays:
         yield f"left {strays[0]} behind"
-    out = folder / case.arguments[2] if writes else folder
-    for written in sorted(out.glob("[0-9]*")) if case.arguments[0] == "map" else [out]:
-        if writes and written.is_dir() and case.arguments[0] != "convert":
-            yield from faults_of_tables(written)
-        if writes and written.is_dir() and case.arguments[0] != "solve":
-            yield from faults_of_model(written)
+    if writes and (folder / case.arguments[2]).is_dir():
+        out = folder / case.arguments[2]
+        for written in sorted(out.glob("*/")) if case.arguments[0] == "map" else [out]:
+            yield from faults_of_tables(written) if case.arguments[0] != "convert" else ()
+            yield from faults_of_model(written) if case.arguments[0] != "solve" else ()
     if case.same_answer:
         if outcome.code:
             yield f"refused what is sound: {outcome.stderr[:300]!r}"
@@ -259,27 +258,17 @@ def _binary(base: Path, folder: Path, rng: Generator) -> Case:
     data = path.read_bytes()
     fields = binary_fields(name, data)
     ways = (*[mutations.change_fields] * 3, mutations.cut_at_field, mutations.shuffle_fields)
-    way = mutations.pick(rng, ways)
-    if rng.random() < 0.3:
-        path.write_bytes(mutations.change_bytes(data, rng))
-        label = "bytes"
-    else:
-        path.write_bytes(way(data, fields, rng))
-        label = way.__name__
-    arguments = _choose_command(source, rng, database=database)
-    return Case(f"binary: {name} {label}", arguments)
+    way = mutations.pick(rng, (*ways, mutations.change_bytes, mutations.change_bytes))
+    path.write_bytes(way(data, rng) if way is mutations.change_bytes else way(data, fields, rng))
+    return Case(f"binary: {name} {way.__name__}", _choose_command(source, rng, database=database))
 
 
 def _text(base: Path, folder: Path, rng: Generator) -> Case:
     database = rng.random() < 0.3
     _copy(base, folder, "text", "truth", *(["database.db"] if database else []))
     name = str(mutations.pick(rng, MODEL_FILES))
-    path = folder / "text" / f"{name}.txt"
-    ways = (*[mutations.change_words] * 4, *[mutations.change_lines] * 2)
-    way = mutations.pick(rng, (*ways, mutations.cut_at_word, mutations.change_bytes))
-    path.write_bytes(way(path.read_bytes(), rng))
-    arguments = _choose_command("text", rng, database=database)
-    return Case(f"text: {name} {way.__name__}", arguments)
+    way = mutations.damage_text(folder / "text" / f"{name}.txt", rng)
+    return Case(f"text: {name} {way}", _choose_command("text", rng, database=database))
 
 
 def _database(base: Path, folder: Path, rng: Generator) -> Case:
@@ -294,12 +283,9 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
 
 def _graph(base: Path, folder: Path, rng: Generator) -> Case:
     _copy(base, folder, "graph.txt")
-    path = folder / "graph.txt"
-    ways = (*[mutations.change_words] * 3, mutations.change_lines, mutations.cut_at_word)
-    way = mutations.pick(rng, (*ways, mutations.change_bytes))
-    path.write_bytes(way(path.read_bytes(), rng))
+    way = mutations.damage_text(folder / "graph.txt", rng)
     command = ("inspect", "graph.txt") if rng.random() < 0.15 else ("solve", "graph.txt", "out")
-    return Case(f"graph: {way.__name__}", command)
+    return Case(f"graph: {way}", command)
 
 
 def _names(base: Path, folder: Path, rng: Generator) -> Case:
@@ -332,10 +318,8 @@ def _place(base: Path, folder: Path, rng: Generator) -> Case:
     if target == "graph.txt":
         return Case(f"place: {kind}", ("solve", "graph.txt", "out"))
     source = "text" if target.startswith("text") else "sparse/0"
-    return Case(
-        f"place: {kind} as {target}",
-        arguments=_choose_command(source, rng, database=target == "database.db"),
-    )
+    arguments = _choose_command(source, rng, database=target == "database.db")
+    return Case(f"place: {kind} as {target}", arguments)
 
 
 def _several(base: Path, folder: Path, rng: Generator) -> Case:
@@ -343,10 +327,7 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     _copy(base, folder, "sparse/0", "truth")
     name = str(mutations.pick(rng, MODEL_FILES))
     path = folder / "sparse" / "0" / f"{name}.bin"
-    data = path.read_bytes()
-    # Records start at their ids, all of one kind.
-    starts = [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
-    records = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data)], strict=True)]
+    records = cut_records(name, path.read_bytes())
     order = rng.integers(len(records), size=int(rng.integers(0, 2 * len(records) + 1)))
     if rng.random() < 0.5:
         order = rng.permutation(len(records))[: int(rng.integers(0, len(records) + 1))]

@@ -7,6 +7,7 @@ under attack. Layouts: see `sfm_shapefit/colmap/check.py`.
 
 import re
 import struct
+from itertools import pairwise
 from typing import NamedTuple
 
 # Parameters of the camera models that the base scenes may have.
@@ -51,6 +52,12 @@ def binary_fields(name: str, data: bytes) -> list[Field]:
     if end != len(data):
         raise ValueError(f"{name}: {len(data) - end} bytes follow the last record")
     return fields
+
+
+def cut_records(name: str, data: bytes) -> list[bytes]:
+    """Return the records of a sound file; each starts at its id."""
+    starts = [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
+    return [data[a:b] for a, b in pairwise([*starts, len(data)])]
 
 
 def read_field(data: bytes, field: Field) -> int:

@@ -154,21 +154,19 @@ def cut_at_word(data: bytes, rng: Generator) -> bytes:
     return data[: int(pick(rng, (start, end, (start + end) // 2)))]
 
 
+def damage_text(path: Path, rng: Generator) -> str:
+    """Damage a text file in one of the ways; return which."""
+    way = pick(rng, (*[change_words] * 3, change_lines, cut_at_word, change_bytes))
+    path.write_bytes(way(path.read_bytes(), rng))
+    return str(way.__name__)
+
+
 def misplace(path: Path, rng: Generator) -> str:
     """Put something that is no ordinary file in the place of one; return what."""
     data = path.read_bytes()
     path.unlink()
-    kinds = (
-        "nothing",
-        "empty file",
-        "folder",
-        "fifo",
-        "dangling link",
-        "link loop",
-        "endless device",
-        "link",
-    )
-    kind = str(pick(rng, kinds))
+    links = ("dangling link", "link loop", "endless device", "link")
+    kind = str(pick(rng, ("nothing", "empty file", "folder", "fifo", *links)))
     match kind:
         case "empty file":
             path.write_bytes(b"")

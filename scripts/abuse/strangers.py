@@ -9,7 +9,6 @@ import json
 import shutil
 import sqlite3
 import struct
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -27,10 +26,6 @@ _MODELS = {
 """Files of other programs, and what stands beside them."""
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
-_TEXT_WAYS: tuple[Callable[[bytes, Generator], bytes], ...] = (
-    *(mutations.change_words, mutations.change_words, mutations.change_lines),
-    *(mutations.cut_at_word, mutations.change_bytes),
-)
 
 Damage = tuple[str, tuple[str, ...]]
 
@@ -42,11 +37,10 @@ def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
     target = str(mutations.pick(rng, (source, source, *_MODELS[source])))
     path = folder / target
     if path.suffix == ".json" and rng.random() < 0.8:
-        label, data = "json", _change_json(path.read_bytes(), rng)
+        label = "json"
+        path.write_bytes(_change_json(path.read_bytes(), rng))
     else:
-        way = mutations.pick(rng, _TEXT_WAYS)
-        label, data = way.__name__, way(path.read_bytes(), rng)
-    path.write_bytes(data)
+        label = mutations.damage_text(path, rng)
     commands = (
         *[("locate", source, "out", "--threads", "1")] * 3,
         *(("convert", source, out) for out in ("out", "out.json", "out.csv")),
@@ -97,12 +91,11 @@ def damage_table(base: Path, folder: Path, rng: Generator) -> Damage:
     shutil.copytree(base / "sparse", folder / "sparse")
     for sound in ("database.db", name):
         shutil.copyfile(base / sound, folder / sound)
-    way = mutations.pick(rng, _TEXT_WAYS)
-    (folder / name).write_bytes(way((folder / name).read_bytes(), rng))
+    way = mutations.damage_text(folder / name, rng)
     refine = ("--refine-with-priors",) if name == "priors.txt" and rng.random() < 0.5 else ()
     arguments = ("locate", "sparse/0", "out", "--database", "database.db", _TABLES[name], name, *refine)
     threads = () if name == "options.toml" else ("--threads", "1")
-    return f"table: {name} {way.__name__}", (*arguments, *threads)
+    return f"table: {name} {way}", (*arguments, *threads)
 
 
 def _change_json(data: bytes, rng: Generator) -> bytes:

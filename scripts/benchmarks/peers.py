@@ -117,19 +117,13 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity(
             *("error", "1 on graphs, the set's on scenes", "lower", 0.05),
-            "graphs: against the truth, both centered and of unit norm; scenes: median / mean / max of"
-            " position after robust (L1) alignment, over the cameras that are placed",
+            "graphs: both centered and of unit norm; scenes: median / mean / max after L1 alignment",
         ),
         Quantity(
             *("seconds (CPU)", "s", "lower", 0.5),
-            "wall-clock, and CPU time of all threads, of the call that turns directions, tracks or"
-            " (mapping) a database into positions, one run; for `locate`, wall-clock of placing and judging,"
-            " for positioning without its tracks",
+            "of the call that turns directions, tracks or (mapping) a database into positions; for"
+            " `locate`, wall-clock of placing and judging, for positioning without its tracks",
         ),
-        Quantity(
-            *("peak MB", "10^6 bytes", "lower", 0.1),
-            "peak resident memory of the whole process while the clock ran; for `locate` and pycolmap with"
-            " reading the database",
-        ),
+        Quantity("peak MB", "10^6 bytes", "lower", 0.1, "resident, of the whole process while the clock ran"),
     ),
 )
