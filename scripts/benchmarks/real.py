@@ -218,6 +218,11 @@ def adjusted_checks(one: Measured) -> list[Check]:
     return [Check(name="mean", value=one.adjusted.mean, limit=ADJUSTED_SLACK * reference)]
 
 
+def over_reference(one: Measured) -> float:
+    """Return the mean error after bundle adjustment over the reference's; NaN without one."""
+    return ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
+
+
 def time_checks(one: Measured) -> list[Check]:
     """Return the check of the warm time end to end."""
     limit = one.scene.limit_s
@@ -232,15 +237,61 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
     found = list(measured.values())
     yield "Errors are in the set's unit; a limit is compared with the unrounded value."
     yield "## Before bundle adjustment"
-    yield _show_accuracy(found)
+    yield table_of(
+        found,
+        {
+            "set": lambda one: one.scene.label,
+            "placed": lambda one: f"{one.num_placed} of {one.num_posed}",
+            "pairs used": lambda one: f"{one.num_pairs_used} of {one.num_pairs}",
+            "median / mean / max": lambda one: show_errors(one.errors),
+            "to reach, median / mean": lambda one: numbers(one.scene.limits),
+            "verdict": lambda one: _judge(_error_checks(one.errors, one.scene.limits), one.errors),
+            "gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
+        },
+    )
     yield "## Time and memory of `locate`, without bundle adjustment"
-    yield _show_times(found)
+    yield table_of(
+        found,
+        {
+            "set": lambda one: one.scene.name,
+            "solver": lambda one: one.method,
+            "warm": lambda one: number(median(one.warm_s)),
+            "min / max": lambda one: numbers([min(one.warm_s), max(one.warm_s)]),
+            "CPU": lambda one: number(median(one.cpu_s)),
+            "cold": lambda one: number(one.cold_s),
+            "solve": lambda one: number(one.solve_s),
+            "memory": lambda one: number(one.peak_memory_mb),
+            "to reach, warm": lambda one: "-" if one.scene.limit_s is None else f"{one.scene.limit_s:g} s",
+            "verdict": lambda one: verdict(time_checks(one)),
+        },
+    )
     if any(one.adjusted for one in found):
         yield f"## After bundle adjustment (intrinsics fixed)\n\n{_ADJUSTED_NOTE}"
-        yield _show_adjusted([one for one in found if one.adjusted])
+        yield table_of(
+            [one for one in found if one.adjusted],
+            {
+                "set": lambda one: one.scene.label,
+                "median / mean / max": lambda one: show_errors(one.adjusted),
+                "reference mean": lambda one: number(one.scene.adjusted_reference or math.nan),
+                "mean / reference": lambda one: f"{over_reference(one):.2f}".replace("nan", "-"),
+                "verdict": lambda one: _judge(adjusted_checks(one), one.adjusted),
+                "adjustment, s": lambda one: number(one.adjustment_s),
+            },
+        )
     if any(one.averaged for one in found):
         yield f"## Rotations from averaging\n\n{_AVERAGED_NOTE}"
-        yield _show_averaged([run for one in found for run in one.averaged])
+        yield table_of(
+            [run for one in found for run in one.averaged],
+            {
+                "set": lambda run: run.scene.label,
+                "rotations": lambda run: run.rotations,
+                "median / mean / max": lambda run: show_errors(run.errors),
+                "rotation error, deg": lambda run: numbers(run.rotation_deg),
+                "to reach, median / mean": lambda run: numbers(run.scene.averaged_limits or ()) or "-",
+                "verdict": lambda run: verdict(_error_checks(run.errors, run.scene.averaged_limits)),
+                "CPU, s": lambda run: number(run.cpu_s),
+            },
+        )
     yield _CAVEATS
 
 
@@ -275,71 +326,6 @@ def show_errors(errors: Errors | None) -> str:
 def _judge(limits: Sequence[Check], errors: Errors) -> str:
     """Return a verdict that says how many cameras of the truth it leaves out."""
     return verdict(limits) + (f", without {errors.num_missing} cameras" if errors.num_missing else "")
-
-
-def _show_accuracy(found: Sequence[Measured]) -> str:
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.label,
-            "placed": lambda one: f"{one.num_placed} of {one.num_posed}",
-            "pairs used": lambda one: f"{one.num_pairs_used} of {one.num_pairs}",
-            "median / mean / max": lambda one: show_errors(one.errors),
-            "to reach, median / mean": lambda one: numbers(one.scene.limits),
-            "verdict": lambda one: _judge(_error_checks(one.errors, one.scene.limits), one.errors),
-            "gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
-        },
-    )
-
-
-def _show_times(found: Sequence[Measured]) -> str:
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.name,
-            "solver": lambda one: one.method,
-            "warm": lambda one: number(median(one.warm_s)),
-            "min / max": lambda one: numbers([min(one.warm_s), max(one.warm_s)]),
-            "CPU": lambda one: number(median(one.cpu_s)),
-            "cold": lambda one: number(one.cold_s),
-            "solve": lambda one: number(one.solve_s),
-            "memory": lambda one: number(one.peak_memory_mb),
-            "to reach, warm": lambda one: "-" if one.scene.limit_s is None else f"{one.scene.limit_s:g} s",
-            "verdict": lambda one: verdict(time_checks(one)),
-        },
-    )
-
-
-def _show_adjusted(found: Sequence[Measured]) -> str:
-    def over(one: Measured) -> float:
-        return ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
-
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.label,
-            "median / mean / max": lambda one: show_errors(one.adjusted),
-            "reference mean": lambda one: number(one.scene.adjusted_reference or math.nan),
-            "mean / reference": lambda one: f"{over(one):.2f}".replace("nan", "-"),
-            "verdict": lambda one: _judge(adjusted_checks(one), one.adjusted),
-            "adjustment, s": lambda one: number(one.adjustment_s),
-        },
-    )
-
-
-def _show_averaged(runs: Sequence[Averaged]) -> str:
-    return table_of(
-        runs,
-        {
-            "set": lambda run: run.scene.label,
-            "rotations": lambda run: run.rotations,
-            "median / mean / max": lambda run: show_errors(run.errors),
-            "rotation error, deg": lambda run: numbers(run.rotation_deg),
-            "to reach, median / mean": lambda run: numbers(run.scene.averaged_limits or ()) or "-",
-            "verdict": lambda run: verdict(_error_checks(run.errors, run.scene.averaged_limits)),
-            "CPU, s": lambda run: number(run.cpu_s),
-        },
-    )
 
 
 BENCHMARK = Benchmark(

@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any
 from harness import ours
 from harness.driver import Benchmark, Case
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, check_all, number, verdict
+from harness.metrics import Check, Quantity, check_all, number, ratio, verdict
 from harness.process import call, peak_memory_mb, reset_peak, resident_memory_mb
 from harness.record import table, table_of
 
@@ -120,6 +120,11 @@ class Measured:
     before_mb: float
     """Resident before the solve: interpreter, libraries, the warm-up's leftovers and the problem."""
     peak_mb: float
+
+    @property
+    def limits(self) -> Mapping[str, float]:
+        """Of `auto` only."""
+        return self.problem.limits if self.asked == "auto" else {}
 
     @property
     def certificate_s(self) -> float:
@@ -260,7 +265,7 @@ def checks(one: Measured | Search) -> list[Check]:
             {"seconds": one.wall_s, "peak": one.peak_mb},
             RIGID_LIMITS.get(one.spec.n, {}) if has_limit else {},
         )
-    limits, gap = one.problem.limits if one.asked == "auto" else {}, one.solved["gap"]
+    limits, gap = one.limits, one.solved["gap"]
     values = {
         CLOSE_S: one.close_s,
         CERTIFIED_S: one.total_s if gap <= limits.get("gap", -math.inf) else math.nan,
@@ -300,9 +305,38 @@ def tables(measured: Mapping[str, Measured | Search], _args: argparse.Namespace)
             " family, so that nothing is compiled while the clock runs."
         )
         yield "## Time"
-        yield _show_times(solves)
+        yield table_of(
+            solves,
+            {
+                "problem": _label,
+                "cameras": lambda one: str(one.problem.spec.n),
+                "pairs": lambda one: str(one.num_edges),
+                "method": lambda one: one.solved["method"],
+                "to 1e-4, s": lambda one: number(one.close_s),
+                "iterations": lambda one: f"{one.close_at or '-'} / {len(one.trace)}",
+                "total, s": lambda one: number(one.total_s),
+                "CPU, s": lambda one: number(one.cpu_s),
+                "certificate, s": lambda one: number(one.certificate_s),
+                "to reach: to 1e-4 / certified": lambda one: show_limits(one, "s", CLOSE_S, CERTIFIED_S),
+                "verdict": lambda one: verdict(checks(one)),
+            },
+        )
         yield "## Certificate, error and memory"
-        yield _show_proofs(solves)
+        yield table_of(
+            solves,
+            {
+                "problem": _label,
+                "status": lambda one: one.solved["status"],
+                "gap asked": lambda one: f"{one.problem.tol:.0e}",
+                "objective": lambda one: number(one.solved["objective"]),
+                "gap": lambda one: number(one.solved["gap"]),
+                "equality residual": lambda one: number(one.solved["equality_residual"]),
+                "excess known": lambda one: number(ratio(one.best_objective, one.bound) - 1.0),
+                "error": lambda one: number(one.error),
+                "memory, MB": lambda one: f"{number(one.peak_mb)} / {number(one.before_mb)}",
+                "to reach": lambda one: show_limits(one, "MB", MEMORY_MB),
+            },
+        )
         yield "## Exponents: value ~ size^exponent, least squares of logarithms over the sizes above"
         yield _show_exponents(solves)
         yield "## Why this solver"
@@ -315,7 +349,18 @@ def tables(measured: Mapping[str, Measured | Search], _args: argparse.Namespace)
         yield _CAVEATS
     if searches:
         yield "## Rigid pieces"
-        yield _show_searches(searches)
+        yield table_of(
+            searches,
+            {
+                "graph": lambda one: f"{one.spec.family}-{one.spec.n}",
+                "cameras": lambda one: str(one.spec.n),
+                "pairs": lambda one: str(one.num_pairs),
+                "pieces; single pairs": lambda one: f"{one.num_pieces}; {one.num_single_pairs}",
+                "seconds (CPU)": lambda one: f"{number(one.wall_s)} ({number(one.cpu_s)})",
+                "peak, MB": lambda one: number(one.peak_mb),
+                "verdict": lambda one: verdict(checks(one)),
+            },
+        )
 
 
 _CAVEATS = (
@@ -334,69 +379,9 @@ def _label(one: Measured) -> str:
     return one.problem.name + ("" if one.asked == "auto" else f" ({one.asked})")
 
 
-def _show_times(solves: Sequence[Measured]) -> str:
-    def show_limits(one: Measured) -> str:
-        if one.asked != "auto":
-            return "-"
-        limits = [one.problem.limits.get(name) for name in (CLOSE_S, CERTIFIED_S)]
-        return " / ".join("-" if limit is None else f"{limit:g} s" for limit in limits)
-
-    return table_of(
-        solves,
-        {
-            "problem": _label,
-            "cameras": lambda one: str(one.problem.spec.n),
-            "pairs": lambda one: str(one.num_edges),
-            "method": lambda one: one.solved["method"],
-            "to 1e-4, s": lambda one: number(one.close_s),
-            "iterations": lambda one: f"{one.close_at or '-'} / {len(one.trace)}",
-            "total, s": lambda one: number(one.total_s),
-            "CPU, s": lambda one: number(one.cpu_s),
-            "certificate, s": lambda one: number(one.certificate_s),
-            "to reach: to 1e-4 / certified": show_limits,
-            "verdict": lambda one: verdict(checks(one)),
-        },
-    )
-
-
-def _show_proofs(solves: Sequence[Measured]) -> str:
-    def show_excess(one: Measured) -> str:
-        return number(one.best_objective / one.bound - 1.0) if one.bound > 0.0 else "-"
-
-    def show_limit(one: Measured) -> str:
-        limit = one.problem.limits.get(MEMORY_MB) if one.asked == "auto" else None
-        return "-" if limit is None else f"{limit:g} MB"
-
-    return table_of(
-        solves,
-        {
-            "problem": _label,
-            "status": lambda one: one.solved["status"],
-            "gap asked": lambda one: f"{one.problem.tol:.0e}",
-            "objective": lambda one: number(one.solved["objective"]),
-            "gap": lambda one: number(one.solved["gap"]),
-            "equality residual": lambda one: number(one.solved["equality_residual"]),
-            "excess known": show_excess,
-            "error": lambda one: number(one.error),
-            "memory, MB": lambda one: f"{number(one.peak_mb)} / {number(one.before_mb)}",
-            "to reach": show_limit,
-        },
-    )
-
-
-def _show_searches(searches: Sequence[Search]) -> str:
-    return table_of(
-        searches,
-        {
-            "graph": lambda one: f"{one.spec.family}-{one.spec.n}",
-            "cameras": lambda one: str(one.spec.n),
-            "pairs": lambda one: str(one.num_pairs),
-            "pieces; single pairs": lambda one: f"{one.num_pieces}; {one.num_single_pairs}",
-            "seconds (CPU)": lambda one: f"{number(one.wall_s)} ({number(one.cpu_s)})",
-            "peak, MB": lambda one: number(one.peak_mb),
-            "verdict": lambda one: verdict(checks(one)),
-        },
-    )
+def show_limits(one: Measured, unit: str, *names: str) -> str:
+    """Return the limits of these names; "-" where there is none."""
+    return " / ".join(f"{one.limits[name]:g} {unit}" if name in one.limits else "-" for name in names)
 
 
 def _show_exponents(solves: Sequence[Measured]) -> str:

@@ -19,7 +19,7 @@ several times as many nodes: no limit of time was measured on those.
 
 import argparse
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -279,13 +279,67 @@ def tables(measured: Mapping[str, Compared | RealGraph], _args: argparse.Namespa
     yield "All contenders have one thread and are warmed up before the clock runs."
     if compared:
         yield f"## G(n, 1/2), q = {CORRUPTED:g}, to a certified gap of {TOL:.0e}"
-        yield _compare_ratios(compared)
+        yield table_of(
+            compared,
+            {
+                "n": lambda one: str(one.spec.n),
+                "pairs": lambda one: str(one.num_edges),
+                "sigma": lambda one: f"{one.spec.sigma:g}",
+                "ours, ms": lambda one: number(1e3 * median(one.contenders[0].wall_s)),
+                "cvxpy, ms": lambda one: number(1e3 * median(one.contenders[1].wall_s)),
+                "Clarabel, ms": lambda one: number(1e3 * median(one.contenders[2].wall_s)),
+                "ratio to cvxpy": lambda one: times(one.ratios()[0]),
+                "cvxpy, to reach": lambda one: show_limit(one, 1),
+                "ratio to Clarabel": lambda one: times(one.ratios()[1]),
+                "Clarabel, to reach": lambda one: show_limit(one, 2),
+                "CPU ratios": lambda one: " / ".join(map(times, one.ratios("cpu_s"))),
+                "verdict": lambda one: verdict(ratio_checks(one)),
+            },
+        )
         yield "## The same in detail"
-        yield _show_details(compared)
+        yield table_of(
+            [(one.spec, contender) for one in compared for contender in one.contenders],
+            {
+                "problem": lambda row: f"{row[0].n}, sigma {row[0].sigma:g}",
+                "contender": lambda row: row[1].name + (f": {row[1].failure}" if row[1].failure else ""),
+                "tolerance": lambda row: f"{row[1].tolerance:.0e}",
+                "iterations": lambda row: str(row[1].iterations),
+                "repeats": lambda row: str(len(row[1].wall_s)),
+                "min / max, ms": lambda row: numbers(
+                    [1e3 * pick(row[1].wall_s, default=math.nan) for pick in (min, max)]
+                ),
+                "CPU, ms": lambda row: number(1e3 * median(row[1].cpu_s)),
+                "excess": lambda row: number(row[1].excess),
+                "certified gap": lambda row: number(row[1].gap),
+                "error": lambda row: number(row[1].error),
+            },
+        )
     if real:
         yield f"## Real graphs, directions from known rotations, `auto`\n\n{_REAL_NOTE}"
-        yield _show_real(real)
+        yield table_of(
+            real,
+            {
+                "set": lambda one: one.name,
+                "cameras": lambda one: str(one.num_cameras),
+                "points": lambda one: str(one.num_points),
+                "pairs": lambda one: str(one.num_edges),
+                "method": lambda one: one.method,
+                "objective": lambda one: number(one.objective),
+                "certified gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
+                "factorizations": lambda one: str(one.factorizations),
+                "ms": lambda one: number(1e3 * median(one.wall_s)),
+                "ms, newton": lambda one: number(1e3 * median(one.newton_s)),
+                "distance": lambda one: number(one.distance),
+                "verdict": lambda one: verdict(real_checks(one)),
+            },
+        )
     yield _CAVEATS
+
+
+def show_limit(one: Compared, rival: int) -> str:
+    """Return the ratio that is to be reached."""
+    limits = ratio_checks(one)
+    return f"{limits[rival].limit:g}x" if limits else "-"
 
 
 _REAL_NOTE = (
@@ -301,70 +355,6 @@ _CAVEATS = (
     " the load average is above the number of cores, times are upper bounds; the ratios hold better, since"
     " the contenders take turns."
 )
-
-
-def _compare_ratios(compared: Sequence[Compared]) -> str:
-    def show_limit(one: Compared, rival: int) -> str:
-        limits = ratio_checks(one)
-        return f"{limits[rival].limit:g}x" if limits else "-"
-
-    return table_of(
-        compared,
-        {
-            "n": lambda one: str(one.spec.n),
-            "pairs": lambda one: str(one.num_edges),
-            "sigma": lambda one: f"{one.spec.sigma:g}",
-            "ours, ms": lambda one: number(1e3 * median(one.contenders[0].wall_s)),
-            "cvxpy, ms": lambda one: number(1e3 * median(one.contenders[1].wall_s)),
-            "Clarabel, ms": lambda one: number(1e3 * median(one.contenders[2].wall_s)),
-            "ratio to cvxpy": lambda one: times(one.ratios()[0]),
-            "cvxpy, to reach": lambda one: show_limit(one, 1),
-            "ratio to Clarabel": lambda one: times(one.ratios()[1]),
-            "Clarabel, to reach": lambda one: show_limit(one, 2),
-            "CPU ratios": lambda one: " / ".join(map(times, one.ratios("cpu_s"))),
-            "verdict": lambda one: verdict(ratio_checks(one)),
-        },
-    )
-
-
-def _show_details(compared: Sequence[Compared]) -> str:
-    return table_of(
-        [(one.spec, contender) for one in compared for contender in one.contenders],
-        {
-            "problem": lambda row: f"{row[0].n}, sigma {row[0].sigma:g}",
-            "contender": lambda row: row[1].name + (f": {row[1].failure}" if row[1].failure else ""),
-            "tolerance": lambda row: f"{row[1].tolerance:.0e}",
-            "iterations": lambda row: str(row[1].iterations),
-            "repeats": lambda row: str(len(row[1].wall_s)),
-            "min / max, ms": lambda row: numbers(
-                [1e3 * pick(row[1].wall_s, default=math.nan) for pick in (min, max)]
-            ),
-            "CPU, ms": lambda row: number(1e3 * median(row[1].cpu_s)),
-            "excess": lambda row: number(row[1].excess),
-            "certified gap": lambda row: number(row[1].gap),
-            "error": lambda row: number(row[1].error),
-        },
-    )
-
-
-def _show_real(real: Sequence[RealGraph]) -> str:
-    return table_of(
-        real,
-        {
-            "set": lambda one: one.name,
-            "cameras": lambda one: str(one.num_cameras),
-            "points": lambda one: str(one.num_points),
-            "pairs": lambda one: str(one.num_edges),
-            "method": lambda one: one.method,
-            "objective": lambda one: number(one.objective),
-            "certified gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
-            "factorizations": lambda one: str(one.factorizations),
-            "ms": lambda one: number(1e3 * median(one.wall_s)),
-            "ms, newton": lambda one: number(1e3 * median(one.newton_s)),
-            "distance": lambda one: number(one.distance),
-            "verdict": lambda one: verdict(real_checks(one)),
-        },
-    )
 
 
 BENCHMARK = Benchmark(
