@@ -114,7 +114,7 @@ def _place(graph: "ViewGraph") -> Solver:
     def run_it() -> tuple["FloatArray", str]:
         found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
         points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-        return _gather(points, graph.num_nodes), f"from {ours.start_of(found)}, verdicts included"
+        return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
 
     return run_it
 
