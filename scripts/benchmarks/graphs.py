@@ -6,8 +6,7 @@ a little damping would hide most of the drift of a long chain, which is in the d
 """
 
 import argparse
-import statistics
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 from harness import ours
 from harness.driver import DATA, ROOT, Benchmark, Case, if_there
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, number, verdict
+from harness.metrics import Check, Quantity, Trials, number, verdict
 from harness.record import table_of
 
 if TYPE_CHECKING:
@@ -112,23 +111,6 @@ class Trial(NamedTuple):
     seconds: float
 
 
-class Trials(NamedTuple):
-    """All seeds of one problem."""
-
-    name: str
-    problem: Problem
-    trials: Sequence[Trial]
-
-    def median(self, column: str) -> float:
-        """Return the median of a field of the trials."""
-        return float(statistics.median(getattr(trial, column) for trial in self.trials))
-
-    @property
-    def mean_over_median(self) -> float:
-        """The worst of the trials."""
-        return max(trial.mean_over_median for trial in self.trials)
-
-
 def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return the problems; large ones are drawn once."""
     found: dict[str, Case] = {}
@@ -182,7 +164,7 @@ def _madrid(spec: GraphSpec, seed: int, data: Path) -> "GraphProblem":
 def measure_seeds(name: str, problem: Problem, seeds: int, data: Path) -> Trials:
     """Measure a problem, after a small one that loads the compiled code."""
     measure(replace(problem, spec=replace(problem.spec, n=min(problem.spec.n, 100))), 0, data)
-    return Trials(name=name, problem=problem, trials=[measure(problem, seed, data) for seed in range(seeds)])
+    return Trials(name, problem, [measure(problem, seed, data) for seed in range(seeds)])
 
 
 def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
@@ -264,15 +246,20 @@ def _holding(right: "BoolArray", edges: "IntArray") -> "BoolArray":
         right = left
 
 
+def worst_ratio(found: Trials) -> float:
+    """Return the largest mean over median of the trials."""
+    return max(trial.mean_over_median for trial in found.trials)
+
+
 def checks(found: Trials) -> list[Check]:
     """Return the limits of one problem: of medians, and of the worst mean over median."""
-    problem = found.problem
+    problem, worst = found.problem, worst_ratio(found)
     limits = (
         ("/ oracle", found.median("over_oracle"), problem.over_oracle),
         ("error", found.median("placed"), problem.error),
         ("placed against LUD", found.median("placed"), found.median("lud") if problem.below_lud else None),
         ("seconds", found.median("seconds"), problem.seconds),
-        ("mean / median", found.mean_over_median, MEAN_OVER_MEDIAN),
+        ("mean / median", worst, MEAN_OVER_MEDIAN),
     )
     return [Check(name=name, value=v, limit=limit) for name, v, limit in limits if limit is not None]
 
@@ -291,7 +278,7 @@ def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterato
             "placed": lambda one: number(one.median("placed")),
             "oracle": lambda one: number(one.median("oracle")),
             "/ oracle": lambda one: number(one.median("over_oracle")),
-            "mean / median": lambda one: number(one.mean_over_median),
+            "mean / median": lambda one: number(worst_ratio(one)),
             "kept": lambda one: str(min(trial.kept for trial in one.trials)),
             "seconds": lambda one: number(one.median("seconds")),
             "verdict": lambda one: verdict(checks(one)),

@@ -237,7 +237,7 @@ def test_medians_are_checked_and_the_worst_mean_over_median():
     problem = dataclasses.replace(CHAIN, below_lud=True, seconds=2.0, error=0.05)
 
     def missed(*trials):
-        found = graphs.Trials(name="made", problem=problem, trials=trials)
+        found = graphs.Trials("made", problem, trials)
         return [check.name for check in graphs.checks(found) if not check.met]
 
     assert missed(trial(), trial(over_oracle=9.0, placed=9.0, seconds=9.0), trial()) == []
@@ -258,8 +258,8 @@ def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_mis
     values = {"shapefit": 0.01, "lud": 0.01, "placed_false": 1.4, "contradicting": 0.0}
     right = coherent.Trial(placed=0.01, warned=True, **values)
     wrong = coherent.Trial(placed=1.0, warned=False, **values)
-    clean = coherent.Trials(name="small", q=0.0, trials=[right])
-    corrupted = coherent.Trials(name="small", q=0.4, trials=[wrong, right])
+    clean = coherent.Trials("small", 0.0, [right])
+    corrupted = coherent.Trials("small", 0.4, [wrong, right])
     assert verdict(coherent.checks(clean)) == "**missed**: false alarms 1.00 > 0"
     assert verdict(coherent.checks(corrupted)) == "**missed**: warned 0 < 1.00"
     assert "| small | never | never | 0.4 |" in show(coherent.BENCHMARK, clean, corrupted)
