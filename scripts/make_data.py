@@ -7,8 +7,9 @@ import argparse
 import contextlib
 import shutil
 import sqlite3
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
+from typing import NamedTuple
 
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.synthetic import (
@@ -24,8 +25,7 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BundledScene:
+class BundledScene(NamedTuple):
     """How a bundled scene is made, and what it is for."""
 
     purpose: str

@@ -138,7 +138,10 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     source, model = scene / "sparse" / "0", target / "sparse" / "0"
     model.mkdir(parents=True)
     data = {name: (source / f"{name}.bin").read_bytes() for name in MODEL_FILES}
-    images, points = (_ids(data[name], name) for name in ("images", "points3D"))
+    images, points = (
+        [read_field(data[name], field) for field in binary_fields(name, data[name]) if field.meaning == "id"]
+        for name in ("images", "points3D")
+    )
     image_ids = dict(zip(images, (1 + rng.permutation(2 * len(images)))[: len(images)].tolist(), strict=True))
     point_ids = dict(zip(points, (1 + rng.permutation(len(points))).tolist(), strict=True))
     for name in MODEL_FILES:
@@ -146,10 +149,6 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     if (scene / "database.db").exists():
         _reorder_database(scene / "database.db", target / "database.db", image_ids, rng)
     return target
-
-
-def _ids(data: bytes, name: str) -> list[int]:
-    return [read_field(data, field) for field in binary_fields(name, data) if field.meaning == "id"]
 
 
 def _reorder_file(
@@ -188,7 +187,12 @@ def _reorder_database(source: Path, target: Path, image_ids: dict[int, int], rng
         for row in (*tables["images"], *tables["keypoints"]):
             row["image_id"] = image_ids[row["image_id"]]
         for row in tables["two_view_geometries"]:
-            _rename_pair(row, image_ids, rng)
+            first, second = (image_ids[i] for i in divmod(row["pair_id"], _MAX_NUM_IMAGES))
+            row["pair_id"] = min(first, second) * _MAX_NUM_IMAGES + max(first, second)
+            matches = np.frombuffer(row["data"] or b"", dtype="<u4").reshape(-1, 2)
+            row["data"] = rng.permutation(matches if first < second else matches[:, ::-1], axis=0).tobytes()
+            # Of the pair in its old order, and not read for directions.
+            row.update(dict.fromkeys(("F", "E", "H", "qvec", "tvec")))
         for table, rows in tables.items():
             for k in rng.permutation(len(rows)):
                 row = rows[int(k)]
@@ -197,12 +201,3 @@ def _reorder_database(source: Path, target: Path, image_ids: dict[int, int], rng
                     f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", [*row.values()]
                 )
         connection.commit()
-
-
-def _rename_pair(row: dict[str, Any], image_ids: dict[int, int], rng: Generator) -> None:
-    first, second = (image_ids[i] for i in divmod(row["pair_id"], _MAX_NUM_IMAGES))
-    row["pair_id"] = min(first, second) * _MAX_NUM_IMAGES + max(first, second)
-    matches = np.frombuffer(row["data"] or b"", dtype="<u4").reshape(-1, 2)
-    row["data"] = rng.permutation(matches if first < second else matches[:, ::-1], axis=0).tobytes()
-    for name in ("F", "E", "H", "qvec", "tvec"):  # of the pair in its old order; not read for directions
-        row[name] = None

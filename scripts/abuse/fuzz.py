@@ -69,24 +69,23 @@ def run(args: argparse.Namespace) -> int:
         expected = warm(base)
         numbers = range(args.first, args.first + args.cases) if args.only is None else [args.only]
         start = time.perf_counter()
-        codes: collections.Counter[tuple[str, int]] = collections.Counter()
-        slowest = largest = failed = 0.0
-        done = 0
+        done: list[tuple[str, Outcome]] = []
+        failed = 0
         with contextlib.suppress(KeyboardInterrupt):  # which ends it early, with the figures so far
             for number in numbers:
                 case, outcome, found = try_case(base, work / "case", [args.seed, number], expected)
-                done += 1
-                codes[case.label.partition(":")[0], outcome.code] += 1
-                slowest, largest = max(slowest, outcome.cpu_s), max(largest, outcome.peak_bytes / 1e9)
+                done.append((case.label.partition(":")[0], outcome))
                 if found:
                     failed += 1
                     print(f"case {number} ({case.label}): {'; '.join(found)}")
                     print(f"    {' '.join(case.arguments)}: {outcome.stderr[-1200:]}", flush=True)
                 if args.only is not None:
                     print(case, outcome)
-        print(f"{done} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
-        print(f"slowest {slowest:.1f} s of processor time, largest {largest:.2f} GB")
-        for (kind, code), count in sorted(codes.items()):
+        print(f"{len(done)} cases, {failed} failed, in {time.perf_counter() - start:.0f} s")
+        slowest_s = max((outcome.cpu_s for _, outcome in done), default=0.0)
+        largest_gb = max((outcome.peak_bytes for _, outcome in done), default=0) / 1e9
+        print(f"slowest {slowest_s:.1f} s of processor time, largest {largest_gb:.2f} GB")
+        for (kind, code), count in sorted(collections.Counter((k, o.code) for k, o in done).items()):
             print(f"{kind:10} exit {code:3}: {count}")
     return int(failed > 0)
 

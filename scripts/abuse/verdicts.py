@@ -43,16 +43,13 @@ def faults(outcome: Outcome) -> Iterator[str]:
         yield f"did {outcome.deeds[0]}"
     if "Traceback" in outcome.stderr:
         yield "a traceback"
-    if outcome.code in (3, 4):
-        yield from _faults_of_refusal(outcome)
-    if outcome.code == 0 and outcome.stderr:
-        yield f"stderr in spite of success: {outcome.stderr[:200]!r}"
-
-
-def _faults_of_refusal(outcome: Outcome) -> Iterator[str]:
     text = outcome.stderr
+    if outcome.code == 0 and text:
+        yield f"stderr in spite of success: {text[:200]!r}"
     if outcome.stdout and outcome.code == 3:
         yield "stdout in spite of a refusal"
+    if outcome.code not in (3, 4):
+        return
     if not text.startswith("sfm-shapefit: ") or text.count("\n") != 1 or not text.endswith("\n"):
         yield f"not one sentence: {text[:300]!r}"
     if not text[:-1].isprintable():

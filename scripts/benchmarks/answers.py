@@ -26,9 +26,8 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -50,8 +49,7 @@ _MODEL_FILES = {f"{stem}.txt" for stem in ("cameras", "images", "points3D", "rig
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Runner:
+class Runner(NamedTuple):
     """Runs commands of one checkout in the folder of the inputs."""
 
     package: Path

@@ -49,12 +49,6 @@ class Problem:
     seconds: float | None = None
 
 
-def _street(n: int, jitter: float, error: float, seconds: float | None = None) -> dict[str, Problem]:
-    spec = GraphSpec(family="street", n=n, sigma=0.01, q=0.15)
-    name = f"street-{n} {f'jitter {jitter:.0%}' if jitter else 'straight'}"
-    return {name: Problem(spec=spec, jitter=jitter, error=error, seconds=seconds)}
-
-
 USUAL = (("er2", 100, 0.0), ("geo", 500, 40.0), ("comm", 500, 67.0))
 CHAINS = (
     *(("seq", 300, 36.0), ("seqv", 300, 36.0), ("ring", 500, 20.0), ("corr", 500, 20.0)),
@@ -71,10 +65,11 @@ PROBLEMS: dict[str, Problem] = {
         f"{family}-{n}": Problem(GraphSpec(family, n, degree, 0.01), over_oracle=1.3, below_lud=True)
         for family, n, degree in CHAINS
     },
-    **_street(500, 0.0, 3e-3),
-    **_street(500, 0.01, 3e-3),
-    **_street(500, 0.05, 3e-3),
-    **_street(5000, 0.0, 9e-3, 30.0),
+    **{
+        f"street-500 {words}": Problem(GraphSpec("street", 500, sigma=0.01, q=0.15), jitter, error=3e-3)
+        for words, jitter in (("straight", 0.0), ("jitter 1%", 0.01), ("jitter 5%", 0.05))
+    },
+    "street-5000 straight": Problem(GraphSpec("street", 5000, sigma=0.01, q=0.15), error=9e-3, seconds=30.0),
     "Madrid, q 0.3 on few": Problem(spec=GraphSpec(family="madrid", n=394, sigma=0.01, q=0.3)),
 }
 

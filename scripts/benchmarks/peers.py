@@ -8,9 +8,9 @@ any other.
 import argparse
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.real import SCENES, Scene, show_errors
 from harness.driver import Benchmark, Case, if_there, positive
@@ -24,8 +24,7 @@ CPU_LIMIT_S = 150
 QUICK = GraphSpec(family="er2", n=20, sigma=0.01)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnScene:
+class OnScene(NamedTuple):
     """All contenders on a real scene."""
 
     scene: Scene

@@ -88,9 +88,10 @@ def _best_mapping(scene: "RigScene", workspace: Path) -> Outcome:
 
 def _map(scene: "RigScene", workspace: Path, min_num_matches: int, refine_sensors: bool) -> Outcome:
     """Run global mapping on a copy of the database, whatever it may do to it."""
-    from peers.colmap import map_database, quiet
+    from peers.colmap import map_database
+    from sfm_shapefit.colmap.quiet import quiet_log
 
-    with quiet():
+    with quiet_log():
         try:
             model, wall_s = map_database(
                 workspace / "database.db", min_num_matches, refine_sensors=refine_sensors

@@ -46,11 +46,6 @@ class Point(NamedTuple):
     """Wrong pairs of the worst camera, over n: least of a problem that was lost, the largest if none was."""
 
 
-def shares(num: int) -> np.ndarray:
-    """Return the probabilities of corruption that are tried."""
-    return np.linspace(0.0, 0.5, num)[1:]
-
-
 def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
     """Compute the constants of some graphs, and solve their problems at growing corruption."""
     threads = os.cpu_count() or 1
@@ -59,7 +54,7 @@ def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
         clean = random_graph_problem(n, p, seed=trial)
         found = recovery_conditions(clean.locations, clean.edges, threads=threads)
         granted.append((found.granted, found.granted_in_space, found.feasible))
-        for k, q in enumerate(shares(num_shares)):
+        for k, q in enumerate(np.linspace(0.0, 0.5, num_shares)[1:]):
             problem = random_graph_problem(n, p, q=float(q), seed=1000 * (k + 1) + trial)
             outcomes.append((worst_share(problem), is_recovered(problem)))
     lost = [share for share, good in outcomes if not good]

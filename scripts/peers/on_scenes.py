@@ -93,11 +93,12 @@ def _locate(name: str, folder: Path, scene: Scene) -> Answer:
     """Run what starts from the database; to be called once per process."""
     if name in (SAME_DIRECTIONS, BY_DEFAULT):
         return _ours(name, folder, scene)
-    from peers.colmap import SETTINGS, map_database, position, quiet
+    from peers.colmap import SETTINGS, map_database, position
+    from sfm_shapefit.colmap.quiet import quiet_log
 
     database = folder / "database.db"
     reset_peak()
-    with quiet():
+    with quiet_log():
         if name.startswith(MAPPING):
             cpu = time.process_time()
             model, seconds = map_database(database, int(name.rsplit(" ", 1)[1]))

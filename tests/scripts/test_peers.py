@@ -14,6 +14,7 @@ from peers import colmap, on_graphs, on_scenes
 from peers.clarabel_direct import solve_direct
 from peers.on_scenes import BY_DEFAULT, MAPPING, POSITIONING, SAME_DIRECTIONS, Answer, checks
 from sfm_shapefit import certify
+from sfm_shapefit.colmap.quiet import quiet_log
 from tests.scenes import RING, fingerprint, real_scene
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
@@ -45,7 +46,7 @@ def test_a_database_is_copied_with_its_log_and_stays_as_it_is(tmp_path):
 
 def test_glomap_fails_with_a_reason_where_the_database_stores_no_relative_poses():
     before = fingerprint(RING)
-    with colmap.quiet(), pytest.raises(RuntimeError, match="no pair of the database stores a relative pose"):
+    with quiet_log(), pytest.raises(RuntimeError, match="no pair of the database stores a relative pose"):
         colmap.position(RING / "database.db", RING / "sparse" / "0", colmap.SETTINGS[0])
     assert fingerprint(RING) == before
 
