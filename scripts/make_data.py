@@ -121,15 +121,11 @@ def write_scene(name: str, folder: Path) -> None:
             make_rendered_scene(bundled.scene, bundled.render), folder, bundled.workspace
         )
         shutil.rmtree(folder / "images")
-        _drop_descriptors(folder / "database.db")
+        # Only matching needs the descriptors, most of the database's size.
+        with contextlib.closing(sqlite3.connect(folder / "database.db", isolation_level=None)) as connection:
+            connection.execute("DELETE FROM descriptors")
+            connection.execute("VACUUM")
     (folder / "SOURCE.md").write_text(source_text(name), encoding="utf-8")
-
-
-def _drop_descriptors(database: Path) -> None:
-    """Remove what only matching needs from a database: most of its size."""
-    with contextlib.closing(sqlite3.connect(database, isolation_level=None)) as connection:
-        connection.execute("DELETE FROM descriptors")
-        connection.execute("VACUUM")
 
 
 def source_text(name: str) -> str:

@@ -16,13 +16,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 
 from abuse.layouts import binary_fields, cut_records, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
+from harness.record import leave_out
 
 HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
 _PROJECT = Path(__file__).resolve().parents[2]
@@ -81,20 +81,15 @@ def differing_files(scene: Path, work: Path, command: str = "locate") -> Iterato
 
 def contents(out: Path) -> dict[str, object]:
     """Return the bytes of every file of an output, and of JSON files all but times and threads."""
-    found: dict[str, object] = {
-        str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()
+    return {
+        str(path.relative_to(out)): leave_out(
+            ("timings_s", "seconds", "threads"), json.loads(path.read_bytes())
+        )
+        if path.suffix == ".json"
+        else path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
     }
-    for path in out.rglob("*.json"):
-        facts = json.loads(path.read_text(encoding="utf-8"))
-        found[str(path.relative_to(out))] = _without_times(facts)
-    return found
-
-
-def _without_times(value: Any) -> Any:
-    if isinstance(value, dict):
-        left_out = ("timings_s", "seconds", "threads")
-        return {key: _without_times(item) for key, item in value.items() if key not in left_out}
-    return [_without_times(item) for item in value] if isinstance(value, list) else value
 
 
 def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environment: dict[str, str]) -> Path:

@@ -87,13 +87,14 @@ class Bench:
         self.base = make_base(work / "base")
         self.expected = warm(self.base)["database"]
         self.folder = work / "case"
+        self.writable = [self.folder, *caches()]
         self.endings: Counter[str] = Counter()
         self.before: dict[str, str] = {}
         self.duration_s = float("inf")
         for _ in range(3):
             self.prepare()
             start = time.perf_counter()
-            outcome = run_forked(self.locate(), self.folder, self.writable())
+            outcome = run_forked(self.locate(), self.folder, self.writable)
             self.duration_s = min(self.duration_s, time.perf_counter() - start)
             if outcome.code:
                 raise RuntimeError(f"the sound run failed: {outcome.stderr}")
@@ -117,15 +118,11 @@ class Bench:
 
     def start(self, *extra: str, logs: str = "log") -> Child:
         """Start the command in a child."""
-        return start_forked(self.locate(*extra), self.folder, self.writable(), logs=logs)
-
-    def writable(self) -> list[Path]:
-        """Return where a child may write."""
-        return [self.folder, *caches()]
+        return start_forked(self.locate(*extra), self.folder, self.writable, logs=logs)
 
     def judge(self, main: Callable[[], None], label: str, cut: int | None = None) -> Problems:
         """Run a disturbed command: it must succeed or say one sentence, of which `cut` bytes may be kept."""
-        outcome = self.note(run_forked(main, self.folder, self.writable()))
+        outcome = self.note(run_forked(main, self.folder, self.writable))
         is_cut = cut is not None and len(outcome.stderr) >= cut
         if outcome.code not in (0, 3) or (outcome.stderr.count("\n") != outcome.code // 3 and not is_cut):
             yield f"{label}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
@@ -212,7 +209,7 @@ def _after_signal(
         yield "the earlier output is gone"
     yield from bench.problems(strays=killed or code < 0)
     if killed:
-        run_forked(bench.locate("-q", out="place/later"), bench.folder, bench.writable())
+        run_forked(bench.locate("-q", out="place/later"), bench.folder, bench.writable)
         shutil.rmtree(bench.folder / "place" / "later")
         yield from (f"after the next run: {problem}" for problem in bench.problems())
 
@@ -281,7 +278,7 @@ def read_only_input(bench: Bench) -> Problems:
             bench.endings[f"left out: others may not enter {parent}"] += 1
             return
     main = partial(_as_nobody, bench.locate("-q"))
-    outcome = bench.note(run_forked(main, bench.folder, bench.writable()))
+    outcome = bench.note(run_forked(main, bench.folder, bench.writable))
     if outcome.code:
         yield f"exit {outcome.code}: {outcome.stderr[-300:]}"
     yield from bench.problems()

@@ -20,13 +20,13 @@ from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.random import Generator
 
 from abuse import databases, mutations, strangers
 from abuse.layouts import binary_fields, cut_records
+from abuse.mutations import Case
 from abuse.sandbox import Outcome, run_forked
 from abuse.verdicts import (
     MODEL_FILES,
@@ -40,17 +40,6 @@ from abuse.verdicts import (
 
 HELP = "damaged models, databases and graphs through the commands"
 _OLD_FILES = ("cameras", "images", "points3D")
-
-
-class Case(NamedTuple):
-    """A damaged input and how it is used."""
-
-    label: str
-    """What was damaged and how."""
-    arguments: tuple[str, ...]
-    """Of the command line, relative to the case's folder."""
-    same_answer: bool = False
-    """Whether the positions must be those of the sound input, since the damage does not concern them."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -109,12 +98,6 @@ def make_base(folder: Path) -> Path:
     shutil.copytree(folder / "sparse" / "0", folder / "old")
     for name in ("rigs", "frames"):
         (folder / "old" / f"{name}.bin").unlink()
-    rng = np.random.default_rng(0)
-    centers = rng.normal(size=(8, 3))
-    pairs = [(i, j) for i in range(8) for j in range(i) if rng.random() < 0.7]
-    units = [(centers[i] - centers[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
-    lines = [f"{i} {j} {' '.join(map(repr, v.tolist()))} 1.5" for (i, j), v in zip(pairs, units, strict=True)]
-    (folder / "graph.txt").write_text("# i j vx vy vz weight\n" + "\n".join(lines) + "\n")
     return folder
 
 
@@ -334,14 +317,13 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     return Case(f"records: {name}", _choose_command("sparse/0", rng, database=False))
 
 
-def _of_others(base: Path, folder: Path, rng: Generator) -> Case:
-    """What other programs and people write."""
-    ways = (strangers.damage_stranger, strangers.damage_database, strangers.damage_table)
-    label, arguments = mutations.pick(rng, ways)(base, folder, rng)
-    return Case(label=label, arguments=arguments)
-
-
 _KINDS: tuple[Callable[[Path, Path, Generator], Case], ...] = (
     *(_binary, _binary, _binary, _text, _text, _database, _database, _database, _graph, _graph),
-    *(_names, _place, _several, _of_others, _of_others, _of_others, _of_others),
+    *(_names, _place, _several),
+    *(
+        strangers.damage_stranger,
+        strangers.damage_database,
+        strangers.damage_database,
+        strangers.damage_table,
+    ),
 )

@@ -7,11 +7,23 @@ import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.random import Generator
 
 from abuse.layouts import Field, words
+
+
+class Case(NamedTuple):
+    """A damaged input and how it is used."""
+
+    label: str
+    """What was damaged and how."""
+    arguments: tuple[str, ...]
+    """Of the command line, relative to the case's folder."""
+    same_answer: bool = False
+    """Whether the positions must be those of the sound input, since the damage does not concern them."""
+
 
 INTEGERS = (
     *(0, 1, 2, 7, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**32),

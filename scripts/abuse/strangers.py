@@ -1,8 +1,8 @@
 """Damage to what other programs and people write: their models, databases without a model, tables beside.
 
-Each function takes the folder of sound files, that of a case, and a generator, and returns a label and the
-arguments of the command line. The sound files in `samples` are the fuzzer's own scene as openMVG, OpenSfM
-and Bundler would write it, position priors, names of images that stay, and options.
+Each function takes the folder of sound files, that of a case, and a generator. The sound files in `samples`
+are the fuzzer's own scene as openMVG, OpenSfM and Bundler would write it, a bare graph, position priors,
+names of images that stay, and options.
 """
 
 import json
@@ -16,6 +16,7 @@ from typing import Any
 from numpy.random import Generator
 
 from abuse import databases, mutations
+from abuse.mutations import Case
 
 SAMPLES = Path(__file__).with_name("samples")
 _MODELS = {
@@ -27,10 +28,8 @@ _MODELS = {
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
 
-Damage = tuple[str, tuple[str, ...]]
 
-
-def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_stranger(base: Path, folder: Path, rng: Generator) -> Case:
     """A damaged model of another program, or a damaged list beside it."""
     source = str(mutations.pick(rng, sorted(_MODELS)))
     shutil.copytree((base / source).parent, (folder / source).parent)
@@ -49,16 +48,16 @@ def damage_stranger(base: Path, folder: Path, rng: Generator) -> Damage:
     command = mutations.pick(rng, commands)
     if command[0] == "evaluate":
         shutil.copytree(base / "truth", folder / "truth")
-    return f"stranger: {target} {label}", command
+    return Case(f"stranger: {target} {label}", command)
 
 
-def damage_database(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_database(base: Path, folder: Path, rng: Generator) -> Case:
     """A damaged database alone, from which `map` takes cameras and rotations too."""
     shutil.copyfile(base / "database.db", folder / "database.db")
     way = mutations.pick(rng, (*databases.WAYS, odd_cameras, odd_cameras, odd_cameras))
     way(folder / "database.db", rng)
     relative = ("--relative", "stored") if rng.random() < 0.3 else ()
-    return f"map: {way.__name__}", ("map", "database.db", "out", *relative, "--threads", "1")
+    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *relative, "--threads", "1"))
 
 
 def odd_cameras(path: Path, rng: Generator) -> bool:
@@ -85,7 +84,7 @@ def odd_cameras(path: Path, rng: Generator) -> bool:
     return False
 
 
-def damage_table(base: Path, folder: Path, rng: Generator) -> Damage:
+def damage_table(base: Path, folder: Path, rng: Generator) -> Case:
     """A damaged table of priors, of names or of options beside a sound model."""
     name = str(mutations.pick(rng, sorted(_TABLES)))
     shutil.copytree(base / "sparse", folder / "sparse")
@@ -95,7 +94,7 @@ def damage_table(base: Path, folder: Path, rng: Generator) -> Damage:
     refine = ("--refine-with-priors",) if name == "priors.txt" and rng.random() < 0.5 else ()
     arguments = ("locate", "sparse/0", "out", "--database", "database.db", _TABLES[name], name, *refine)
     threads = () if name == "options.toml" else ("--threads", "1")
-    return f"table: {name} {way}", (*arguments, *threads)
+    return Case(f"table: {name} {way}", (*arguments, *threads))
 
 
 def _change_json(data: bytes, rng: Generator) -> bytes:

@@ -36,6 +36,7 @@ from benchmarks.answer_cases import BUNDLED, Case, all_cases
 from benchmarks.answer_differences import compare, report
 from benchmarks.answer_inputs import MADE, MADRID, make_inputs
 from harness.driver import DATA, ROOT
+from harness.record import leave_out
 
 LIMIT_S = 300
 """Seconds after which a case is ended; its exit code is then recorded as "timeout"."""
@@ -71,7 +72,7 @@ class Runner(NamedTuple):
         answer = {"exit": code, "said": said[-1] if said else "", "files": [], "printed": ""}
         answer |= {"models": {}, "tables": {}, "json": {}, "texts": {}}
         if stdout.startswith("{"):
-            answer["json"]["stdout"] = _keep(json.loads(stdout))
+            answer["json"]["stdout"] = leave_out(_VARIABLE, json.loads(stdout))
         else:
             printed = stdout.replace(f"{self.work}/", "")
             answer["printed"] = _NUMBER.sub("#", _BORDERS.sub(" ", printed)).strip()
@@ -110,13 +111,6 @@ class Runner(NamedTuple):
             )
 
 
-def _keep(value: Any) -> Any:
-    """Return a JSON value without what differs from run to run."""
-    if isinstance(value, dict):
-        return {key: _keep(inner) for key, inner in value.items() if key not in _VARIABLE}
-    return [_keep(inner) for inner in value] if isinstance(value, list) else value
-
-
 def _collect(out: Path, answer: Answer) -> None:
     """Add what was written to an answer, file by file."""
     files = sorted(path for path in (out.rglob("*") if out.is_dir() else [out]) if path.is_file())
@@ -128,7 +122,7 @@ def _collect(out: Path, answer: Answer) -> None:
         elif path.suffix == ".csv":
             answer["tables"][key] = _table(path)
         elif path.suffix == ".json":
-            answer["json"][key] = _keep(json.loads(path.read_text(encoding="utf-8")))
+            answer["json"][key] = leave_out(_VARIABLE, json.loads(path.read_text(encoding="utf-8")))
         elif path.suffix == ".db":
             answer["texts"][key] = _digest(path)
         elif path.suffix in (".txt", ".tum", ".g2o") and path.name not in _MODEL_FILES:

@@ -154,13 +154,7 @@ BENCHMARK = Benchmark(
     repeats=5,
     quantities=(
         Quantity("q", "1", "neither", 0.0, "odds that a direction is a wrong one"),
-        Quantity(
-            "ShapeFit, LUD, placed",
-            "1",
-            "lower",
-            0.05,
-            "against the truth, median of the seeds",
-        ),
+        Quantity("ShapeFit, LUD, placed", "1", "lower", 0.05, "against the truth, median of the seeds"),
         Quantity("placed, false", "1", "neither", 0.05, "the same against the second configuration"),
         Quantity("contradicting", "1", "neither", 0.05, "share of pairs that contradict the answer, median"),
         Quantity("warned", "seeds", "neither", 0.0, f"and of those with an error above {BROKEN:g}"),

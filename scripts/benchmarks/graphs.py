@@ -294,9 +294,7 @@ BENCHMARK = Benchmark(
         Quantity("ShapeFit, LUD, placed, oracle", "1", "lower", 0.05, "of the cameras, of unit norm, median"),
         Quantity("/ oracle", "1", "lower", 0.05, "placed over the oracle, median of the seeds' ratios"),
         Quantity("mean / median", "1", "lower", 0.1, "distances of the cameras kept; worst seed"),
-        Quantity(
-            "kept", "cameras", "higher", 0.0, f"cameras of trust {_MIN_TRUST:g} or more, fewest of the seeds"
-        ),
+        Quantity("kept", "cameras", "higher", 0.0, f"cameras of trust {_MIN_TRUST:g} or more, fewest"),
         Quantity("seconds", "s", "lower", 0.5, "`place`, wall-clock, median"),
     ),
 )

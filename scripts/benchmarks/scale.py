@@ -19,7 +19,6 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -94,8 +93,7 @@ RIGID_LIMITS = {10_000: {"seconds": 0.5}, 100_000: {"seconds": 20.0, "peak": 100
 RIGID_REPEATS = 3
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
+class Measured(NamedTuple):
     """What one solve gave."""
 
     problem: Problem
@@ -137,8 +135,7 @@ class Measured:
         return math.nan if self.close_at is None else self.trace[self.close_at - 1][1]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Search:
+class Search(NamedTuple):
     """What finding the rigid pieces of one graph gave and took."""
 
     spec: GraphSpec

@@ -120,11 +120,7 @@ def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray")
 def graph_ratios(name: str, wrong: float, seed: int) -> "FloatArray":
     """Return errors over standard deviations of a graph's placement."""
     graph = draw_graph(name, seed, wrong)
-    return _placement_ratios(_place(graph), graph.locations)
-
-
-def _place(graph: Graph) -> "Placement":
-    return ours.place(view_graph(graph), covariance=graph.covariances)
+    return _placement_ratios(ours.place(view_graph(graph), covariance=graph.covariances), graph.locations)
 
 
 def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArray":
@@ -165,7 +161,7 @@ def rank_graph(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
     from sfm_shapefit.geometry import fit_similarity_l1
 
-    placement = _place(graph)
+    placement = ours.place(view_graph(graph), covariance=graph.covariances)
     truth = graph.locations[placement.cameras]
     found = placement.locations
     errors = np.linalg.norm(fit_similarity_l1(found, truth, rotate=False).apply(found) - truth, axis=1)

@@ -50,16 +50,12 @@ class Panel:
         return all(later == 2 * n for n, later in pairwise(self.n))
 
 
-def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
-    return tuple(range(low, high + 1, step))
-
-
 def _shares(num: int) -> tuple[float, ...]:
     return tuple(np.round(np.linspace(0.0, 0.5, num), 4).tolist())
 
 
 NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
-FINE, COARSE = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
+FINE, COARSE = (tuple(range(10, 81, 2)), _shares(21)), (tuple(range(10, 81, 5)), _shares(11))
 
 
 def _paper(method: str = "ShapeFit") -> list[Panel]:
@@ -83,7 +79,7 @@ FIGURES: dict[str, list[Panel]] = {
     "density": [_coarse(f"ShapeFit, p = {p}", "ShapeFit", p=p) for p in (0.25, 0.5, 0.75)],
     "dimension": [
         *(_coarse(f"ShapeFit, d = {d}", "ShapeFit", d=d) for d in (2, 3, 10)),
-        Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50),
+        Panel("ShapeFit, d = 50", "ShapeFit", tuple(range(10, 61, 10)), _shares(6), d=50),
     ],
     "large": [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])],
 }

@@ -102,21 +102,15 @@ def ask(name: str, package: str | None, run: Callable[[], Answer], cpu_limit_s: 
     return found
 
 
-def _solve_shapefit(graph: "ViewGraph") -> Solver:
-    def run_it() -> tuple["FloatArray", str]:
-        found = ours.solve(graph, tol=_SHAPEFIT_TOL)
-        return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
-
-    return run_it
+def _solve_shapefit(graph: "ViewGraph") -> tuple["FloatArray", str]:
+    found = ours.solve(graph, tol=_SHAPEFIT_TOL)
+    return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
 
 
-def _place(graph: "ViewGraph") -> Solver:
-    def run_it() -> tuple["FloatArray", str]:
-        found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
-        points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-        return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
-
-    return run_it
+def _place(graph: "ViewGraph") -> tuple["FloatArray", str]:
+    found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
+    points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
+    return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
 
 
 def _by_pytheia(nonlinear: bool, graph: "ViewGraph") -> Solver:
@@ -179,8 +173,8 @@ class Contender(NamedTuple):
 
 
 CONTENDERS = (
-    Contender("ours, placed", _place),
-    Contender("ours, ShapeFit", _solve_shapefit),
+    Contender("ours, placed", lambda graph: partial(_place, graph)),
+    Contender("ours, ShapeFit", lambda graph: partial(_solve_shapefit, graph)),
     Contender("pytheia LUD", partial(_by_pytheia, False), "pytheia"),
     Contender("pytheia Nonlinear", partial(_by_pytheia, True), "pytheia", runs=3),
     Contender("gtsam TranslationRecovery", partial(_by_gtsam, False, False), "gtsam"),

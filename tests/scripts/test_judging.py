@@ -191,7 +191,7 @@ def test_rigid_pieces_and_single_pairs_are_told_apart_and_limits_are_judged(monk
     found = scale.search(GraphSpec(family="geo", n=6))
     assert (found.num_pairs, found.num_pieces, found.num_single_pairs) == (7, 2, 1)
     assert [check.met for check in scale.checks(found)] == [True, False]
-    free = dataclasses.replace(found, spec=GraphSpec(family="er", n=6))
+    free = found._replace(spec=GraphSpec(family="er", n=6))
     assert verdict(scale.checks(free)) == "no target"
 
 
