@@ -174,7 +174,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     )
     placement = run.found
     rows, count = placement.cameras, len(placement.cameras)
-    truth, lud = one.truth[rows], ours.lud_of(placement)
+    truth, lud = one.truth[rows], placement.refined.lud
     kept = placement.assessment.trust[:count] >= _MIN_TRUST
     aligned = fit_similarity(placement.locations[kept], truth[kept], rotate=False)
     distances = np.linalg.norm(aligned.apply(placement.locations[kept]) - truth[kept], axis=1)
@@ -184,7 +184,7 @@ def measure(problem: Problem, seed: int, data: Path = DATA) -> Trial:
     placed = relative_error(placement.locations, truth)
     return Trial(
         shapefit=relative_error(placement.certified.locations[:count], truth),
-        lud=np.nan if lud is None else relative_error(lud[:count], truth),
+        lud=np.nan if lud is None else relative_error(lud.locations[:count], truth),
         placed=placed,
         oracle=best,
         over_oracle=placed / max(best, EXACT) if np.isfinite(best) else np.nan,

@@ -68,12 +68,6 @@ def place_file(source: Path, **options: Any) -> Any:
     return place_graph_file(source, PlacementOptions(**options))
 
 
-def lud_of(placement: "Placement") -> "FloatArray | None":
-    """Return the locations of the LUD start that a placement was compared with, if there was one."""
-    lud = placement.refined.lud
-    return None if lud is None else lud.locations
-
-
 def warns(placement: "Placement") -> bool:
     """Return whether the report of a placement carries a warning."""
     from sfm_shapefit.results import quality_warnings
