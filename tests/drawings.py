@@ -30,9 +30,8 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
     ]
     pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
     history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
-    drawing = build_drawing(
-        cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape)
-    )
+    drawing = build_drawing(cameras, pairs, certified=centers + rng.normal(0, 0.01, centers.shape))
+    drawing = replace(drawing, history=tuple(history))
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
     poses = Poses(rotations=rotations, centers=centers + rng.normal(0, 0.3, centers.shape), half_sizes=halves)
     points = Points(

@@ -33,7 +33,7 @@ class Run(Generic[Options]):
 
     @property
     def writing(self) -> dict[str, Any]:
-        """How the result is written; keywords of `write_result` and its like."""
+        """How the result is written; keywords of `write_result`."""
         flags = self.flags
         how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
         return how | {"protect": self.protect}

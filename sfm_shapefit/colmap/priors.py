@@ -18,7 +18,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import is_number, refuse_irregular_file
+from sfm_shapefit.formats.lines import is_number, text_of
 from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -63,15 +63,10 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
             is one of the model's.
     """
-    refuse_irregular_file(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the priors {path} cannot be read as text: {error}") from None
     index_of_name = {name: index for index, name in enumerate(model.names)}
     found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
     system, seen, first = _CARTESIAN, set(), True
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = next(csv.reader([line])) if "," in line else line.split()

@@ -8,7 +8,7 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -133,7 +133,7 @@ class Drawing:
     """Of the graph; others than 3 are bare graphs."""
     input_is_aligned: bool = False
     """Whether the input's centres are in the output's units, so that both can be drawn together."""
-    history: tuple[tuple[int, float, float | None], ...] = field(default=())
+    history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
 
     @property
@@ -147,53 +147,35 @@ def build_drawing(
     cameras: Sequence[CameraRow],
     pairs: Sequence[PairRow],
     *,
-    model: "PosedModel | None" = None,
-    original: "PosedModel | None" = None,
-    turn: FloatArray | None = None,
+    poses: Poses | None = None,
     points: "pycolmap.Reconstruction | None" = None,
     certified: FloatArray | None = None,
-    input_is_aligned: bool = False,
-    dimension: int = 3,
-    history: Sequence[tuple[int, float, float | None]] = (),
 ) -> Drawing:
-    """Return the drawing of a result's rows.
+    """Return the drawing of a result's rows; what does not follow from these has its default.
 
     Args:
         cameras, pairs: rows of the tables.
-        model: where rotations and pictures come from; unknown if None.
-        original: the input, for its centres; unknown if None.
-        turn: (3, 3) from the axes of `model` to the output's; None if they are the same.
+        poses: rotations in the output's axes, and the input's centers; unknown if None.
         points: the reconstruction whose 3D points are drawn; none if None.
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
-        input_is_aligned: the input's centres are in the output's units.
-        dimension: of the graph.
-        history: iteration, objective and bound of the solve.
     """
-    names = tuple(row.name for row in cameras)
-    known, before = (
-        _unknown_poses(len(names)) if source is None else poses_of(source, names)
-        for source in (model, original)
-    )
-    rotations = known.rotations if turn is None else known.rotations @ turn.T
-    poses = replace(known, rotations=rotations, centers=before.centers)
-    own = _cameras(cameras, names, poses)
+    poses = _unknown_poses(len(cameras)) if poses is None else poses
+    own = _cameras(cameras, poses)
     positions = own.centers[own.placed]
-    drawn = _points(points, positions)
     return Drawing(
         cameras=own,
         pairs=_pairs(pairs, own, certified),
-        points=drawn,
+        points=_points(points, positions),
         axes=view_axes(poses.rotations[own.placed]),
         frustum_depth=_frustum_depth(positions),
-        dimension=dimension,
-        input_is_aligned=input_is_aligned,
-        history=tuple(history),
     )
 
 
-def poses_of(model: "PosedModel", names: Sequence[str]) -> Poses:
-    """Return rotations, centres and pictures of a model's images, by name; NaN for those it has not."""
+def poses_of(model: "PosedModel | None", names: Sequence[str]) -> Poses:
+    """Return rotations, centers and pictures of a model's images, by name; NaN for those it does not have."""
     found = _unknown_poses(len(names))
+    if model is None:
+        return found
     row_of = {name: row for row, name in enumerate(names)}
     sizes: dict[int, tuple[float, float]] = {}
     for k, (image_id, name) in enumerate(zip(model.image_ids.tolist(), model.names, strict=True)):
@@ -259,13 +241,13 @@ def _unknown_poses(n: int) -> Poses:
     )
 
 
-def _cameras(rows: Sequence[CameraRow], names: tuple[str, ...], poses: Poses) -> Cameras:
+def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
     centers = np.full((len(rows), 3), np.nan)
     for k, row in enumerate(rows):
         if row.center:
             centers[k] = _in_three_dimensions(np.array(row.center))
     return Cameras(
-        names=names,
+        names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
         reasons=tuple(row.reason for row in rows),
         pieces=np.array([-1 if row.piece is None else row.piece for row in rows], dtype=np.int64),

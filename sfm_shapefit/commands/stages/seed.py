@@ -59,16 +59,15 @@ def build_seeded_model(
 
     An executor shares out the model's own tracks.
     """
-    adjusted, fixed, axes = None, located.fixed, located.gauge.axes
+    adjusted, axes = None, located.gauge.axes
     with clock("structure"):
         seed, tracks = _seed_and_tracks(source, located, clock.advance)
-    if not options.bundle_adjust:  # which triangulates at the seed's poses itself
+    if not options.bundle_adjust:
         with clock("triangulation"):
-            settings = options
-            seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
-    if options.bundle_adjust:
+            seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
+    else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            frames = () if fixed is None else source.model.frame_ids[fixed].tolist()
+            frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
             adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
