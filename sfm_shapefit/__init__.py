@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.options import LocateOptions, MapOptions
     from sfm_shapefit.placement.place import Placement, place
     from sfm_shapefit.refinement.options import PlacementOptions
-    from sfm_shapefit.results import LocateResult
     from sfm_shapefit.results.map_result import MapResult
+    from sfm_shapefit.results.result import LocateResult
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
@@ -51,8 +51,8 @@ _HOMES = {
     "options": ("LocateOptions", "MapOptions"),
     "placement.place": ("Placement", "place"),
     "refinement.options": ("PlacementOptions",),
-    "results": ("LocateResult",),
     "results.map_result": ("MapResult",),
+    "results.result": ("LocateResult",),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),

@@ -70,7 +70,7 @@ def place_file(source: Path, **options: Any) -> Any:
 
 def warns(placement: "Placement") -> bool:
     """Return whether the report of a placement carries a warning."""
-    from sfm_shapefit.results import quality_warnings
+    from sfm_shapefit.results.warnings import quality_warnings
 
     return any(True for _ in quality_warnings(placement))
 

@@ -90,11 +90,7 @@ def find_database(model_folder: Path) -> Path | None:
 
 @contextmanager
 def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabase"]:
-    """Open a COLMAP database for reading; neither it nor its folder is changed.
-
-    Args:
-        path: the database.
-        model: the posed images whose matches are wanted.
+    """Open a COLMAP database, for the matches of a model's images; neither it nor its folder is changed.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer

@@ -8,7 +8,7 @@ import pycolmap
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, model_of_images
 
 
 def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reconstruction:
@@ -51,13 +51,9 @@ def posed_model_of(model: pycolmap.Reconstruction) -> PosedModelFile:
     """Return the posed images of a reconstruction, by id, without points."""
     images = [model.image(i) for i in sorted(i for i, image in model.images.items() if image.has_pose)]
     camera_ids = sorted({image.camera_id for image in images})
-    return PosedModelFile(
-        cameras=tuple(intrinsics_of(model.camera(camera_id)) for camera_id in camera_ids),
-        names=tuple(image.name for image in images),
-        camera_of=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
-        rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3),
-        centers=np.array([image.projection_center() for image in images]).reshape(-1, 3),
-    )
+    poses = [(image.cam_from_world().rotation.matrix(), image.projection_center()) for image in images]
+    posed = [(i.name, camera_ids.index(i.camera_id), *pose) for i, pose in zip(images, poses, strict=True)]
+    return model_of_images((intrinsics_of(model.camera(camera_id)) for camera_id in camera_ids), posed)
 
 
 def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:

@@ -27,11 +27,7 @@ _heard = ContextVar("pycolmap_is_heard", default=False)
 
 @contextmanager
 def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
-    """Let pycolmap's messages through while the block runs, or silence them as by default.
-
-    Args:
-        enabled: let them through.
-    """
+    """Let pycolmap's messages through while the block runs, or silence them as by default."""
     token = _heard.set(enabled)
     try:
         yield

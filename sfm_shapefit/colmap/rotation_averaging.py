@@ -25,7 +25,6 @@ _LOSSES = {
 }
 # Pairs that are farther off after the first averaging are left out of the second; this is pycolmap's default.
 _MAX_ERROR_DEG = 10.0
-_CAMERA_ID = 1
 
 
 def average_rotations(
@@ -60,9 +59,16 @@ def average_rotations(
         raise InputError("rotations cannot be averaged without relative rotations of pairs")
     if pairs.min() < 0 or pairs.max() >= num_images:
         raise InputError(f"relative rotations join images outside 0..{num_images - 1}")
-    counts = np.ones(len(pairs)) if weights is None else np.asarray(weights, dtype=np.float64)
-    graph = _pose_graph(pairs, rotations, np.maximum(np.rint(counts), 1.0).astype(np.int64))
-    model = _unposed_model(num_images)
+    graph, model = pycolmap.PoseGraph(), pycolmap.Reconstruction()
+    counts = np.maximum(np.rint(np.broadcast_to(1.0 if weights is None else weights, len(pairs))), 1.0)
+    for (i, j), rotation, count in zip(pairs.tolist(), rotations, counts.tolist(), strict=True):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
+        graph.add_edge(i + 1, j + 1, pycolmap.PoseGraphEdge(cam2_from_cam1=pose, num_matches=int(count)))
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0, 0])
+    model.add_camera_with_trivial_rig(camera)
+    for image_id in range(1, num_images + 1):
+        image = pycolmap.Image(name=str(image_id), camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image)
     options = pycolmap.RotationEstimatorOptions()
     options.random_seed = 0
     options.max_rotation_error_deg = _MAX_ERROR_DEG
@@ -77,26 +83,3 @@ def average_rotations(
                     "pycolmap's rotation averaging failed; check the relative rotations, or give rotations"
                 )
     return rotations_of(model, list(range(1, num_images + 1)))
-
-
-def _pose_graph(pairs: IntArray, rotations: FloatArray, counts: IntArray) -> pycolmap.PoseGraph:
-    """Return the pairs as pycolmap's graph; image k has the id k + 1."""
-    graph = pycolmap.PoseGraph()
-    for (i, j), rotation, count in zip(pairs.tolist(), rotations, counts.tolist(), strict=True):
-        edge = pycolmap.PoseGraphEdge(
-            cam2_from_cam1=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3)), num_matches=count
-        )
-        graph.add_edge(i + 1, j + 1, edge)
-    return graph
-
-
-def _unposed_model(num_images: int) -> pycolmap.Reconstruction:
-    """Return a model of images without poses, each in a frame of its own."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=_CAMERA_ID, model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0, 0])
-    )
-    for image_id in range(1, num_images + 1):
-        image = pycolmap.Image(name=str(image_id), camera_id=_CAMERA_ID, image_id=image_id)
-        model.add_image_with_trivial_frame(image)
-    return model

@@ -99,7 +99,16 @@ def inspect(
     if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
-        return _inspect_graph(Path(source), options, theory=theory)
+        graph = read_graph(source)
+        no_theory = Theory(conditions=None, statement="left out: a bare graph has no centers")
+        return Inspection(
+            directions=f"as given in {source}",
+            num_images=graph.num_nodes,
+            statuses={DirectionStatus.USABLE.value: graph.num_edges},
+            points="no: a bare graph has no matches",
+            diagnosis=diagnose(graph, options),
+            theory=no_theory if theory else None,
+        )
     clock = Clock(progress) if progress else Clock()
     with clock("read"):
         model = read_model(source)
@@ -123,16 +132,3 @@ def inspect(
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),
             )
-
-
-def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspection:
-    """Diagnose the bare graph of a text file."""
-    graph = read_graph(path)
-    return Inspection(
-        directions=f"as given in {path}",
-        num_images=graph.num_nodes,
-        statuses={DirectionStatus.USABLE.value: graph.num_edges},
-        points="no: a bare graph has no matches",
-        diagnosis=diagnose(graph, options),
-        theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
-    )

@@ -30,7 +30,8 @@ from sfm_shapefit.commands.stages.seed import (
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
-from sfm_shapefit.results import LocateResult, match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:

@@ -25,8 +25,8 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
-from sfm_shapefit.results import LocateResult
 from sfm_shapefit.results.map_result import MappedModel, MapResult
+from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components

@@ -20,6 +20,7 @@ right cameras are among those; only the solution tells them from wrong ones (`ju
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -54,69 +55,65 @@ _SMALLEST_CHECKED = 3
 class PieceDiagnosis:
     """A parallel-rigid piece of three cameras or more."""
 
-    num_cameras: int
-    hinges: tuple[str, ...]
-    """Names of the cameras that it shares with other pieces."""
+    num_cameras: Annotated[int, "Cameras of it."]
+    hinges: Annotated[tuple[str, ...], "Names of the cameras that it shares with other pieces."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeakCamera:
     """A camera that would be placed, and may be placed badly."""
 
-    name: str
-    num_pairs: int
-    """Pairs with a usable direction."""
-    spread: float
-    """How far the directions that hold it are from parallel, in [0, 1]; rays to points count."""
-    reasons: tuple[str, ...]
+    name: Annotated[str, "Of its image."]
+    num_pairs: Annotated[int, "Pairs with a usable direction."]
+    spread: Annotated[
+        float, "How far the directions that hold it are from parallel, in [0, 1]; rays to points count."
+    ]
+    reasons: Annotated[tuple[str, ...], "Why it may be placed badly, in words."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corruption:
     """An estimate from the directions alone of how many pairs are wrong."""
 
-    share: float | None
-    """Of the pairs in a triangle; None where none is, or where they are too many to look at."""
-    num_checked: int
-    """Pairs in a triangle."""
-    statement: str
+    share: Annotated[
+        float | None, "Of the pairs in a triangle; null where none is, or where they are too many to look at."
+    ]
+    num_checked: Annotated[int, "Pairs in a triangle."]
+    statement: Annotated[str, "The same in words."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedPlacement:
     """What a placement of the largest piece would do."""
 
-    solver: str
-    solver_reason: str
-    second_start: bool
-    """Whether LUD is solved beside ShapeFit."""
-    finish: str
-    """What becomes of the starts, a sentence."""
+    solver: Annotated[str, "The solver that would run."]
+    solver_reason: Annotated[str, "Why it would be chosen."]
+    second_start: Annotated[bool, "Whether LUD is solved beside ShapeFit."]
+    finish: Annotated[str, "What becomes of the starts, a sentence."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
     """What there is to know of a view graph without solving."""
 
-    dimension: int
-    num_cameras: int
-    num_points: int
-    """3D points that join as further nodes."""
-    num_pairs: int
-    """Pairs of cameras with a usable direction."""
-    components: tuple[int, ...]
-    """Cameras of each connected component, the largest first; single cameras have one of their own."""
-    pieces: tuple[PieceDiagnosis, ...]
-    """Parallel-rigid pieces of three cameras or more, the largest first: that one would be placed, the
-    others written beside it, each with a scale of its own."""
-    left_out: dict[str, str]
-    """Cameras outside the largest piece, and why."""
-    weak: tuple[WeakCamera, ...]
-    corruption: Corruption
-    plan: PlannedPlacement | None
-    """None if nothing can be placed."""
-    obstacle: str
-    """Why nothing can be placed; empty if something can."""
+    dimension: Annotated[int, "Of the locations."]
+    num_cameras: Annotated[int, "Nodes of the graph that are no points."]
+    num_points: Annotated[int, "3D points that join as further nodes."]
+    num_pairs: Annotated[int, "Pairs of cameras with a usable direction."]
+    components: Annotated[
+        tuple[int, ...],
+        "Cameras of each connected component, the largest first; single cameras have one of their own.",
+    ]
+    pieces: Annotated[
+        tuple[PieceDiagnosis, ...],
+        "Parallel-rigid pieces of three cameras or more, the largest first: that one would be placed, the "
+        "others written beside it, each with a scale of its own.",
+    ]
+    left_out: Annotated[dict[str, str], "Cameras outside the largest piece, and why."]
+    weak: Annotated[tuple[WeakCamera, ...], "Cameras that may be placed badly, and why."]
+    corruption: Annotated[Corruption, "How many pairs are wrong, as far as triangles tell."]
+    plan: Annotated[PlannedPlacement | None, "Null if nothing can be placed."]
+    obstacle: Annotated[str, "Why nothing can be placed; empty if something can."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

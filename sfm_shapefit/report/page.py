@@ -45,18 +45,12 @@ _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
 
 def write_report(drawing: Drawing, facts: dict[str, Any], path: Path) -> None:
-    """Write the report of a result.
-
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-        path: the file.
-    """
+    """Write the report of a result; the facts are those of locate.json."""
     path.write_text(report_html(drawing, facts), encoding="utf-8", newline="\n")
 
 
 def report_html(drawing: Drawing, facts: dict[str, Any]) -> str:
-    """Return the page; arguments as of `write_report`."""
+    """Return the page; the facts are those of locate.json."""
     data = page_data(drawing, facts)
     plotly, script = _plotly(), _asset("page.js")
     values = {

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,10 +11,9 @@ import numpy as np
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.report.drawing import Drawing, build_drawing, poses_of
 from sfm_shapefit.results.result import GraphResult, LocateResult
-from sfm_shapefit.results.tables import CameraRow, PairRow, axis_names
+from sfm_shapefit.results.tables import CameraRow, PairRow, read_rows
 
 
 def draw_result(found: LocateResult | GraphResult) -> Drawing:
@@ -52,9 +50,8 @@ def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
     try:
         facts = json.loads((folder / MARKER).read_text(encoding="utf-8"))
         dimension = int(facts.get("dimension", 3))
-        axes = axis_names(dimension)
-        cameras = [_camera_row(cells, axes) for cells in _read_csv(folder / "cameras.csv")]
-        pairs = [_pair_row(cells, axes) for cells in _read_csv(folder / "pairs.csv")]
+        cameras = read_rows(CameraRow, dimension, folder / "cameras.csv")
+        pairs = read_rows(PairRow, dimension, folder / "pairs.csv")
         poses, points = None, None
         if "graph" not in facts["inputs"]:
             model, names = read_model(folder), [row.name for row in cameras]
@@ -79,47 +76,3 @@ def _input_of(facts: dict[str, Any]) -> PosedModel | None:
         return read_model(path) if path.is_dir() else None
     except InputError:
         return None
-
-
-def _read_csv(path: Path) -> Iterator[dict[str, str]]:
-    refuse_irregular_file(path)
-    with path.open(newline="", encoding="utf-8") as stream:
-        yield from csv.DictReader(stream)
-
-
-def _camera_row(cells: dict[str, str], axes: Sequence[str]) -> CameraRow:
-    return CameraRow(
-        name=cells["name"],
-        placed=cells["placed"] == "true",
-        reason=cells["reason"],
-        piece=int(cells["piece"]) if cells["piece"] else None,
-        center=_vector(cells, axes, ""),
-        degree=int(cells["degree"]),
-        trust=_number(cells["trust"]),
-        sigma=_vector(cells, axes, "sigma_"),
-    )
-
-
-def _pair_row(cells: dict[str, str], axes: Sequence[str]) -> PairRow:
-    return PairRow(
-        name1=cells["name1"],
-        name2=cells["name2"],
-        direction=_vector(cells, axes, "v"),
-        support=int(cells["support"]),
-        weight=_number(cells["weight"]),
-        residual_deg=_number(cells["residual_deg"]),
-        dual_norm=_number(cells["dual_norm"]),
-        leverage=_number(cells["leverage"]),
-        verdict=cells["verdict"],
-        reason=cells["reason"],
-    )
-
-
-def _vector(cells: dict[str, str], axes: Sequence[str], prefix: str) -> tuple[float, ...]:
-    """Return the numbers of a vector's columns; nothing where one is empty."""
-    values = [cells[f"{prefix}{axis}"] for axis in axes]
-    return tuple(map(float, values)) if all(values) else ()
-
-
-def _number(cell: str) -> float:
-    return float(cell) if cell else float("nan")

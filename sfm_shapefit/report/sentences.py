@@ -18,6 +18,7 @@ MAX_TEXT = 160
 _FAR_DEG = 1.0
 # Below this trust, reasons are given.
 _LOW_TRUST = 0.75
+_SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 # So many items of a kind are among the first things to look at.
 _SHOWN = 3
 
@@ -42,18 +43,13 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
 
 
 def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
-    """Return what was placed and how certain it is, a sentence each.
-
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-    """
+    """Return what was placed and how certain it is, a sentence each; the facts are those of locate.json."""
     return [
         _placed(drawing),
         _pairs(drawing, facts),
         *_certainty(drawing),
         _optimum(facts["solve"]),
-        f"Scale and origin: {shorten(_scale(facts), 2 * MAX_TEXT)}.",
+        f"Scale and origin: {shorten(facts.get('scale') or _SOLVER_SCALE, 2 * MAX_TEXT)}.",
     ]
 
 
@@ -126,10 +122,6 @@ def _optimum(solve: dict[str, Any]) -> str:
         f"The convex optimum {certified}: its objective {solve['objective']:.4g} is within "
         f"{max(solve['gap'], 0.0):.1e} of the least possible{unique}."
     )
-
-
-def _scale(facts: dict[str, Any]) -> str:
-    return str(facts.get("scale") or "the solver's own units, the centroid at the origin")
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

@@ -48,17 +48,8 @@ class Thresholds:
     """Only its pairs are drawn; all if None."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SelectedPairs:
-    """The pairs that some thresholds leave."""
-
-    rows: IntArray
-    contradicts: BoolArray
-    """By the threshold, not by the verdict."""
-
-
-def select_pairs(drawing: Drawing, thresholds: Thresholds) -> SelectedPairs:
-    """Return which pairs are drawn and how, the worst first."""
+def select_pairs(drawing: Drawing, thresholds: Thresholds) -> tuple[IntArray, BoolArray]:
+    """Return the rows of the pairs that are drawn, the worst first, and which contradict by the threshold."""
     cameras, pairs = drawing.cameras, drawing.pairs
     shown = cameras.placed & ~(cameras.trust < thresholds.min_trust)
     kept = shown[pairs.cameras].all(axis=1) & np.isfinite(pairs.residuals_deg)
@@ -67,7 +58,7 @@ def select_pairs(drawing: Drawing, thresholds: Thresholds) -> SelectedPairs:
         kept &= (pairs.cameras == thresholds.camera).any(axis=1)
     worst = pairs.worst_first()
     rows = worst[kept[worst]][:_MAX_PAIRS]
-    return SelectedPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
+    return rows, pairs.residuals_deg[rows] > thresholds.residual_deg
 
 
 def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> int | None:
@@ -88,13 +79,9 @@ def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> in
 
 
 def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
-    """Start the viewer; it runs until its `stop` is called.
+    """Start the viewer; it runs until its `stop` is called. The facts are those of locate.json.
 
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-        host: the address to listen on; 127.0.0.1 can be reached from this machine only.
-        port: the port; the next free one if it is taken.
+    At the host 127.0.0.1 it can be reached from this machine only. If the port is taken, it is the next one.
 
     Raises:
         InputError: if viser is not installed.
@@ -191,12 +178,11 @@ class _View:
         colors = trust_colors(drawing.cameras.trust[rows])
         colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
         self._frusta("/cameras", rows, drawing.cameras.centers[rows], colors)
-        drawn = select_pairs(drawing, thresholds)
-        kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
-        ends = drawing.cameras.centers[drawing.pairs.cameras[drawn.rows]]
-        self._lines("/pairs", ends, PAIR_COLORS[kinds])
-        against = int(drawn.contradicts.sum())
-        self._counts.value = f"{len(drawn.rows):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
+        drawn, contradicts = select_pairs(drawing, thresholds)
+        kinds = np.where(contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
+        self._lines("/pairs", drawing.cameras.centers[drawing.pairs.cameras[drawn]], PAIR_COLORS[kinds])
+        against = int(contradicts.sum())
+        self._counts.value = f"{len(drawn):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
 
     def _frusta(
         self, name: str, rows: IntArray, centers: FloatArray, colors: Any

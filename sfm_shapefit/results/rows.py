@@ -10,7 +10,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import Placement, count_large
-from sfm_shapefit.results.tables import CameraRow, PairRow, PieceRow
+from sfm_shapefit.results.json_types import Piece
+from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import left_out_reasons
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -139,8 +140,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     return rows
 
 
-def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[PieceRow]:
-    """Return one row per parallel-rigid piece of three cameras or more, and for the largest.
+def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
+    """Return what locate.json says of each parallel-rigid piece of three cameras or more, and of the largest.
 
     Args:
         placement: the graph and its largest piece.
@@ -148,18 +149,18 @@ def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> 
     """
     facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
     large = max(count_large(placement.pieces, placement.num_cameras), 1)
-    rows = []
+    rows: list[Piece] = []
     for k, piece in enumerate(placement.pieces[:large]):
         scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
         hinges = piece.hinges[piece.hinges < placement.num_cameras]
         rows.append(
-            PieceRow(
-                num_cameras=int(np.sum(piece.nodes < placement.num_cameras)),
-                scale=scale,
-                hinges=[placement.graph.name_of(hinge) for hinge in hinges.tolist()],
-                folder=folder_of(k) if k in facts else "",
-                num_placed=num_placed,
-            )
+            {
+                "num_cameras": int(np.sum(piece.nodes < placement.num_cameras)),
+                "scale": scale,
+                "hinges": [placement.graph.name_of(hinge) for hinge in hinges.tolist()],
+                "folder": folder_of(k) if k in facts else "",
+                "num_placed": num_placed,
+            }
         )
     return rows
 

@@ -110,13 +110,7 @@ def make_scene(options: SceneOptions) -> Scene:
 
 
 def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
-    """Photograph, pair and corrupt a layout; `make_scene` says what it raises.
-
-    Args:
-        layout: cameras and surfaces.
-        options: `shape` is not read.
-        rngs: five streams, one for each kind of draw.
-    """
+    """Photograph, pair and corrupt a layout with five streams of draws; raises what `make_scene` does."""
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
     candidates = _candidates(layout, options)

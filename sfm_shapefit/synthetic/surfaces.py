@@ -52,11 +52,6 @@ class Surfaces:
     textures: tuple[ByteArray, ...]
     """The pictures, (height, width, 3): red, green, blue."""
 
-    def mesh(self) -> trimesh.Trimesh:
-        """Return the geometry as a trimesh mesh, its triangles in this order and not joined."""
-        faces = np.arange(3 * len(self.corners)).reshape(-1, 3)
-        return trimesh.Trimesh(vertices=self.corners.reshape(-1, 3), faces=faces, process=False)
-
 
 class _Part(NamedTuple):
     """A mesh with its picture."""
@@ -85,11 +80,7 @@ _ALONG_X = np.array([1.0, 0.0, 0.0])
 def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
     """Return the surfaces that the cameras of a layout look at.
 
-    Args:
-        shape: of the layout.
-        num_images: of the layout; it decides how long a facade or a street is.
-        repeated: fraction of the houses, or of the tower's sides, that are one and the same.
-        rng: every draw comes from it.
+    The fraction `repeated` of the houses, or of the tower's sides, are one and the same.
 
     Raises:
         InputError: if the shape has no surfaces.

@@ -23,10 +23,9 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.glomap_text import read_relative_poses, relative_poses_text
+from sfm_shapefit.formats.glomap_text import read_relative_poses
 from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
-from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
 from tests.program import run
@@ -308,8 +307,12 @@ def relative_poses_of_ring():
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
     model, pairs, rotations, units = relative_poses_of_ring()
-    poses = EpipolarGeometries(names=model.names, pairs=pairs, rotations=rotations, to_second=units)
-    (tmp_path / "relpose.txt").write_text(relative_poses_text(poses))
+    quaternions = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
+    rows = np.column_stack([quaternions, -np.einsum("kab,kb->ka", rotations, units)]).tolist()
+    text = (
+        f"{model.names[i]} {model.names[j]} {row}" for (i, j), row in zip(pairs.tolist(), rows, strict=True)
+    )
+    (tmp_path / "relpose.txt").write_text("\n".join(text).translate(str.maketrans("", "", "[],")))
     back = read_relative_poses(tmp_path / "relpose.txt")
     assert back.names == model.names
     np.testing.assert_array_equal(back.pairs, pairs)

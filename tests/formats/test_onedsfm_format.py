@@ -252,8 +252,8 @@ def test_vertices_that_are_none_twice_or_of_others_are_refused(tmp_path):
     file = tmp_path / "graph.g2o"
     vertex = "VERTEX_SE3:QUAT 0 1 2 3 0 0 0 1\n"
     for text, words in [
-        (vertex * 2, "line 2: gives an earlier vertex a second pose"),
-        (vertex, "has a pose of none of the 1 vertices"),
+        (vertex * 2, "line 2: gives an earlier camera a second rotation"),
+        (vertex, "has a rotation of none of the 1 cameras"),
         ("VERTEX_SE2 0 1 2 0\n", "has no VERTEX_SE3:QUAT"),
     ]:
         file.write_text(text)

@@ -37,12 +37,9 @@ _EQUAL_SCORES = 0.005
 def average_consistently(
     num_images: int, relative: RelativeRotations, min_matches: int = 0
 ) -> AveragedRotations:
-    """Return the most consistent rotations of some images.
+    """Return the most consistent rotations of some images; of several components one is answered.
 
-    Args:
-        num_images: n; the pairs should join them all, for only one component is answered.
-        relative: the relative rotations of their pairs.
-        min_matches: the limit to use; 0 tries several.
+    With `min_matches` 0 several limits are tried.
 
     Raises:
         UnsolvableError: if no averaging succeeds.

@@ -21,7 +21,7 @@ from sfm_shapefit.placement.gauge import (
     unit_gauge,
 )
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.results import Inputs
+from sfm_shapefit.results.result import Inputs
 
 
 def read_priors(
@@ -56,14 +56,7 @@ def choose_gauge(
     """Return scale, origin and axes of the output.
 
     Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
-    given, else the input. A single fixed camera moves only the origin.
-
-    Args:
-        model, placement: the input and its solution.
-        kept: which of the placement's cameras are in the output.
-        rigid: what of the model is rigid.
-        options: what is asked for.
-        priors: of the images; None if they are not wanted.
+    given, else the input. A single fixed camera moves only the origin. Only cameras that are `kept` count.
 
     Raises:
         InputError: if what is asked for is not determined.

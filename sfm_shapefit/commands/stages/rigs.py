@@ -47,12 +47,7 @@ class Rigid(NamedTuple):
 
 
 def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
-    """Return what moves together and what not at all.
-
-    Args:
-        model: the input.
-        options: which images are fixed, and the scale asked for.
-        has_priors: whether position priors are to set scale and axes.
+    """Return what moves together and what not at all; priors, if there are any, set scale and axes.
 
     Raises:
         InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is

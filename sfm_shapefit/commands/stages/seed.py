@@ -16,7 +16,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
-from sfm_shapefit.results import FurtherPiece
+from sfm_shapefit.results.result import FurtherPiece
 
 if TYPE_CHECKING:
     import pycolmap
