@@ -48,7 +48,7 @@ def write_database(
     ):
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         for name in names:
-            keypoints = found[name]["keypoints"][:] + 0.5  # COLMAP's first pixel has its centre at 0.5
+            keypoints = found[name]["keypoints"][:] + 0.5  # COLMAP's first pixel has its center at 0.5
             opened.write_keypoints(ids[name], keypoints.astype(np.float32))
         for name0, name1 in pairs:
             key, is_reversed = pair_key(matched, name0, name1)

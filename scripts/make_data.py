@@ -40,7 +40,7 @@ SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
         " a way that looks right, and 5 % of the matches of every pair are wrong. `sparse/0` knows the"
-        " rotations only: all centres are at the origin and there are no points. `truth` is the exact model.",
+        " rotations only: all centers are at the origin and there are no points. `truth` is the exact model.",
         scene=SceneOptions(
             shape="courtyard",
             num_images=25,

@@ -28,7 +28,7 @@ from sfm_shapefit.geometry import (
 )
 
 _ON_A_LINE = (
-    "the camera centres lie on a line, so the alignment's rotation about it is arbitrary; position errors "
+    "the camera centers lie on a line, so the alignment's rotation about it is arbitrary; position errors "
     "across the line are a lower bound"
 )
 
@@ -214,7 +214,7 @@ def _check_poses(owner: str, poses: CameraPoses) -> None:
     count = len(names)
     if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
         raise InputError(
-            f"{owner} has {count} names, rotations of shape {rotations.shape} and centres of shape"
+            f"{owner} has {count} names, rotations of shape {rotations.shape} and centers of shape"
             f" {centers.shape}; give ({count}, 3, 3) and ({count}, 3)"
         )
     if len(set(names)) < count:

@@ -103,7 +103,7 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
     with pytest.raises(TypeError, match="'min_trus' is no option of LocateOptions; did you mean min_trust"):
         merge_options(given, LocateOptions, {"min_trus": 0.0})
     with pytest.raises(TypeError, match="known are"):
-        merge_options(None, SolverOptions, {"colour": 3})
+        merge_options(None, SolverOptions, {"color": 3})
 
 
 def test_completion_shows_public_names_only():

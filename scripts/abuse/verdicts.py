@@ -65,9 +65,9 @@ def faults_of_tables(out: Path) -> Iterator[str]:
     placed = [row for row in rows if row["placed"] == "true"]
     axes = [name for name in rows[0] if name in "xyz" or name.startswith("x")] if rows else []
     if any(not math.isfinite(float(row[axis] or "nan")) for row in placed for axis in axes):
-        yield "a placed camera without a finite centre"
+        yield "a placed camera without a finite center"
     if any(row[axis] for row in rows if row["placed"] != "true" and not row["piece"] for axis in axes):
-        yield "a camera that is not placed has a centre"
+        yield "a camera that is not placed has a center"
     if facts["num_placed"] != len(placed):
         yield f"{facts['num_placed']} placed in locate.json, {len(placed)} in cameras.csv"
     gap = facts["solve"]["gap"]
@@ -96,7 +96,7 @@ def read_cameras(out: Path) -> list[dict[str, str]]:
 
 
 def positions(out: Path) -> list[tuple[float, ...]]:
-    """Return the centres of the placed cameras, sorted: they identify cameras whose names were changed."""
+    """Return the centers of the placed cameras, sorted: they identify cameras whose names were changed."""
     rows = (row for row in read_cameras(out) if row["placed"] == "true")
     return sorted(tuple(float(row[axis]) for axis in "xyz") for row in rows)
 

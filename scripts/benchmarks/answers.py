@@ -130,7 +130,7 @@ def _collect(out: Path, answer: Answer) -> None:
 
 
 def _model(folder: Path) -> dict[str, Any]:
-    """Return the poses of a model by image name, centre and quaternion, and figures of its points."""
+    """Return the poses of a model by image name, center and quaternion, and figures of its points."""
     model = pycolmap.Reconstruction(folder)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)

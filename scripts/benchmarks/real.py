@@ -302,14 +302,14 @@ _ADJUSTED_NOTE = (
 )
 _AVERAGED_NOTE = (
     "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15 matches or"
-    " more), intrinsics of sparse/0, no centres; position error median / mean / max and rotation error in"
+    " more), intrinsics of sparse/0, no centers; position error median / mean / max and rotation error in"
     " degrees, once with the rotations kept and once with `--refine-rotations`. The target is that of the"
     " kept rotations."
 )
 _CAVEATS = (
     "Caveats: liberty* are judged against the model that gives their rotations, which flatters every method"
     " in the tables. Five of lego100's given rotations are wrong; they set its mean and maximum, so look at"
-    " its median. Differences below about 1 mm on the sets in metres mean nothing: that is the accuracy of"
+    " its median. Differences below about 1 mm on the sets in meters mean nothing: that is the accuracy of"
     " their truth. Where the load average is above the number of cores, times are upper bounds;"
     " the CPU column depends less on the load."
 )

@@ -44,7 +44,7 @@ class Outcome(NamedTuple):
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--images", type=positive, default=90, help="of a drive, six per metre and a half")
+    parser.add_argument("--images", type=positive, default=90, help="of a drive, six per meter and a half")
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:

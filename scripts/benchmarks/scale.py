@@ -2,7 +2,7 @@
 
 Each problem is drawn in one process and solved in another, fresh one, so that its peak of memory is its
 own. There, a small problem is solved first (nothing is compiled while the clock runs); then the problem
-itself, once, everything included: checks, rigidity, ordering, symbolic analysis, factorisations,
+itself, once, everything included: checks, rigidity, ordering, symbolic analysis, factorizations,
 certificate. From `on_iteration` come the objective and the clock after each iteration, and in hindsight the
 time at which the objective came, and stayed, within 1e-4 of the best one known. That is the lower of the
 run's own and of a second, tighter run's.

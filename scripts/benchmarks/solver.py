@@ -343,7 +343,7 @@ def show_limit(one: Compared, rival: int) -> str:
 
 
 _REAL_NOTE = (
-    "Factorisations are the Newton steps and the one of the start. The distance is that of `auto`'s locations"
+    "Factorizations are the Newton steps and the one of the start. The distance is that of `auto`'s locations"
     " from those of a gap of 1e-11: what is lost by stopping where it stops. The limits were measured on"
     " graphs of cameras alone: those have a limit of 32 ms. The same graphs with the points that"
     " `locate` joins are several times larger and have none."

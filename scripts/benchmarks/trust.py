@@ -1,4 +1,4 @@
-"""Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognised?
+"""Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognized?
 
 Calibration: scenes of known truth, directions with known or unknown covariances, and photographed scenes
 through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are.

@@ -1,7 +1,7 @@
 """The README's picture: `python scripts/figure.py courtyard --out docs/courtyard.png`.
 
 The bundled courtyard from above: on the left what `locate` is given (a direction per pair, a quarter of
-them wrong), on the right what it returns, coloured by verdict.
+them wrong), on the right what it returns, colored by verdict.
 """
 
 import argparse

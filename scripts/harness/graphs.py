@@ -57,7 +57,7 @@ def view_graph(problem: "GraphProblem") -> "ViewGraph":
 
 
 def relative_error(locations: "FloatArray", truth: "FloatArray") -> float:
-    """Return the paper's error: the distance of the two sets, each centred and scaled to unit norm.
+    """Return the paper's error: the distance of the two sets, each centered and scaled to unit norm.
 
     Source: Hand, Lee, Voroninski (2015), section 4.
     """

@@ -53,7 +53,7 @@ def inspect_command(
     database: Database = None,
     theory: Annotated[
         bool,
-        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centres."),
+        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centers."),
     ] = False,
     as_json: Json = False,
     **given: Any,

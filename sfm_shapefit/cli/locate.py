@@ -99,7 +99,7 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
         ("pairs", _describe_pairs(facts)),
         ("objective", describe_objective(found.certified)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
-        ("centres", found.placement.refined.statement()),
+        ("centers", found.placement.refined.statement()),
         ("scale", found.gauge.statement),
         ("points", _describe_points(facts)),
         *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),

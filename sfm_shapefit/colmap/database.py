@@ -192,7 +192,7 @@ class MatchDatabase:
         rows, cols, data = found[0]
         if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
-        with np.errstate(invalid="ignore"):  # a signalling NaN
+        with np.errstate(invalid="ignore"):  # a signaling NaN
             xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
         if np.isfinite(xy).all():
             return xy

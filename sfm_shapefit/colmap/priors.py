@@ -140,7 +140,7 @@ def _priors(
         transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
         positions = np.asarray(transform.ellipsoid_to_enu(positions, latitude, longitude, altitude))
         statement += (
-            f", in metres east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+            f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
     return PositionPriors(
         cameras=np.array(cameras, dtype=np.int64),

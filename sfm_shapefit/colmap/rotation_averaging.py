@@ -1,6 +1,6 @@
 """Rotations of cameras from relative rotations of pairs: pycolmap's rotation averaging, on plain arrays.
 
-    minimize  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
+    minimize  sum_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
 
 from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs more than 10
 degrees off the result are left out and what stays connected is averaged once more, as pycolmap's global
@@ -34,7 +34,6 @@ def average_rotations(
     weights: npt.ArrayLike | None = None,
     *,
     loss: Loss = "geman-mcclure",
-    count_matches: bool = True,
 ) -> tuple[FloatArray, BoolArray]:
     """Return a rotation for each image that the pairs tie to the largest consistent component.
 
@@ -42,11 +41,9 @@ def average_rotations(
         num_images: n.
         pairs: (k, 2) images (i, j), i != j, each pair once.
         rotations: (k, 3, 3) cam_j_from_cam_i.
-        weights: (k,) numbers of matches, rounded; the spanning tree takes pairs of many, and they count in
-            proportion. All alike if None.
+        weights: (k,) numbers of matches, rounded, of which the spanning tree takes pairs of many; all alike
+            if None. Residuals count alike: so a few false pairs of many matches do less harm.
         loss: of the residual angles; "half-norm" (their square root) is finer, but fails more often.
-        count_matches: False leaves the weights to the spanning tree alone: a few false pairs of many matches
-            then do less harm.
 
     Returns:
         Rotations (n, 3, 3) cam_from_world, the identity where there is none, and (n,) who has one.
@@ -73,8 +70,6 @@ def average_rotations(
     options.random_seed = 0
     options.max_rotation_error_deg = _MAX_ERROR_DEG
     options.weight_type = _LOSSES[loss]
-    if weights is not None and count_matches:
-        options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
     with quiet_output():
         for again in (False, True):
             options.filter_unregistered = again

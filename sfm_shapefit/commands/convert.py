@@ -4,7 +4,7 @@
     colmap-txt    a folder, text
     nerf          transforms.json             .json           nerfstudio, instant-ngp
     tum           trajectory                  .tum, .txt      evo, SLAM tools
-    csv           name, centre, rotation      .csv
+    csv           name, center, rotation      .csv
 
 Only the COLMAP formats hold points.
 """

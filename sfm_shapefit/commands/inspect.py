@@ -84,7 +84,7 @@ def inspect(
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
         **overrides: single options by name.
-        theory: also compute the constants of the recovery theorems at the model's centres.
+        theory: also compute the constants of the recovery theorems at the model's centers.
         progress: called as stages advance.
 
     Returns:

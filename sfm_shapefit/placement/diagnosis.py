@@ -118,7 +118,7 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Theory:
-    """The constants of the recovery theorems for given centres, or why they are left out."""
+    """The constants of the recovery theorems for given centers, or why they are left out."""
 
     conditions: RecoveryConditions | None
     statement: str
@@ -165,11 +165,11 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
 
 
 def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory:
-    """Return what the paper's theorems grant for the graph of all pairs and given centres.
+    """Return what the paper's theorems grant for the graph of all pairs and given centers.
 
     Args:
         graph: the pairs with usable directions; cameras without any are left aside.
-        centers: (n, d) true, or as good as true, centres of its cameras.
+        centers: (n, d) true, or as good as true, centers of its cameras.
         threads: the result does not depend on it.
     """
     joined, cameras = graph.restricted_to(np.arange(graph.num_edges))
@@ -265,7 +265,7 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
 
 
 def _in_triangle(graph: ViewGraph) -> BoolArray:
-    """Return which pairs (m,) have a common neighbour."""
+    """Return which pairs (m,) have a common neighbor."""
     i, j = graph.edges.T
     n = graph.num_nodes
     half = coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()

@@ -1,7 +1,7 @@
 """Scale, origin and axes of the answer: what directions cannot tell, chosen by the user and stated.
 
 The program leaves scale and shift free (sum_i t_i = 0, L(T) = kappa); rotations are given, so the axes are
-the input's. A gauge is a scale and a shift of the centres and, with position priors alone, a turn of the
+the input's. A gauge is a scale and a shift of the centers and, with position priors alone, a turn of the
 whole model onto their axes.
 """
 
@@ -22,9 +22,9 @@ from sfm_shapefit.geometry import (
 )
 from sfm_shapefit.refinement.options import Scale
 
-_CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
-_ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
-_COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
+_CAP_OF_SIZE = 0.5  # an input center that is farther off is lost, and must not set the scale
+_ROUGH = 0.1  # median distance of the input's centers from the answer, of their spread
+_COINCIDENT = 1e-9  # spread of centers, relative to their distance from the origin, that counts as none
 _FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
 _FLAT = 5.0  # times their residual: a spread across a line that is smaller says nothing of the turn about it
@@ -79,29 +79,29 @@ class PositionPriors:
 
 
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
-    """Return the gauge of the input's centres: a robust similarity (L1) that keeps the axes.
+    """Return the gauge of the input's centers: a robust similarity (L1) that keeps the axes.
 
-    Without usable input centres it becomes "unit", and says so.
+    Without usable input centers it becomes "unit", and says so.
 
     Args:
         locations: (n, 3) the solver's answer.
-        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
     """
     spread = np.ptp(input_centers, axis=0).max()
     if spread <= _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
-        return unit_gauge(locations, "the input's centres coincide, so the scale is free; ")
+        return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
     size = median_spread(input_centers) or spread
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
     if similarity.scale <= 0.0:
-        return unit_gauge(locations, "the input's centres contradict the answer; ")
+        return unit_gauge(locations, "the input's centers contradict the answer; ")
     off = float(np.median(np.linalg.norm(similarity.apply(locations) - input_centers, axis=1))) / size
     warning = ""
     if off > _ROUGH:
         warning = (
-            f"the input's centres are {off:.0%} of their spread off the answer, so the scale taken from them "
+            f"the input's centers are {off:.0%} of their spread off the answer, so the scale taken from them "
             "is rough; use the scale unit if they mean nothing"
         )
-    statement = "input: scale and origin of the input's centres, its axes"
+    statement = "input: scale and origin of the input's centers, its axes"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
 
 
@@ -113,7 +113,7 @@ def metric_gauge(
     Args:
         locations: (n, 3) the solver's answer.
         unit: length of the output's unit in theirs.
-        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
         fixed: (n,) the cameras that stay where the input has them.
         has_rigs: whether the scale is that of rigs; else it is that of the fixed cameras.
     """
@@ -122,7 +122,7 @@ def metric_gauge(
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
     elif np.ptp(input_centers, axis=0).max() > _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
-        shift, origin = np.median(shifts, axis=0), "origin of the input's centres"
+        shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
     similarity = Similarity(scale=scale, rotation=np.eye(3), translation=shift)

@@ -89,7 +89,7 @@ class Placement(Displayed):
 
     @property
     def locations(self) -> FloatArray:
-        """The centres (k, d) of `cameras`, in the solver's units."""
+        """The centers (k, d) of `cameras`, in the solver's units."""
         return self.refined.locations[: len(self.cameras)]
 
     @property

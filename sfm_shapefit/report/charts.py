@@ -40,7 +40,7 @@ class Matrix:
 
 
 def residual_histogram(pairs: Pairs) -> Histogram:
-    """Return the residuals at the input's centres, at the convex optimum and at the output's centres.
+    """Return the residuals at the input's centers, at the convex optimum and at the output's centers.
 
     All count the same pairs: those with a residual at the output and, where it is known, at the optimum.
     """

@@ -29,7 +29,7 @@ MAX_POINTS = 20_000
 # A point is left out if it is farther from the median than this many times the distance within which 90 % of
 # points and cameras lie.
 _FAR_POINT = 4.0
-# The depth of a frustum is a share of the median distance between neighbours, within limits that are shares
+# The depth of a frustum is a share of the median distance between neighbors, within limits that are shares
 # of the extent.
 _FRUSTUM_SHARE = 0.4
 _FRUSTUM_OF_EXTENT = (0.008, 0.05)
@@ -40,7 +40,7 @@ _UPRIGHT = 0.1
 
 
 class PairClass(enum.IntEnum):
-    """What became of a pair, as the page counts and colours it."""
+    """What became of a pair, as the page counts and colors it."""
 
     AGREES = 0
     CONTRADICTS = 1
@@ -92,11 +92,11 @@ class Pairs:
     leverages: FloatArray
     dual_norms: FloatArray
     residuals_deg: FloatArray
-    """(m,) at the output's centres."""
+    """(m,) at the output's centers."""
     certified_deg: FloatArray
     """(m,) at the convex optimum, before any refinement; NaN where it is not known."""
     input_deg: FloatArray
-    """(m,) at the input's centres; NaN where those mean nothing."""
+    """(m,) at the input's centers; NaN where those mean nothing."""
     reasons: tuple[str, ...]
 
     def worst_first(self) -> IntArray:
@@ -132,7 +132,7 @@ class Drawing:
     dimension: int = 3
     """Of the graph; others than 3 are bare graphs."""
     input_is_aligned: bool = False
-    """Whether the input's centres are in the output's units, so that both can be drawn together."""
+    """Whether the input's centers are in the output's units, so that both can be drawn together."""
     history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
 
@@ -328,7 +328,7 @@ def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArra
 
 
 def _frustum_depth(positions: FloatArray) -> float:
-    """Return how deep frusta are drawn: well below the distance between neighbours."""
+    """Return how deep frusta are drawn: well below the distance between neighbors."""
     if len(positions) < 2:
         return 1.0
     low, high = np.quantile(positions, [0.05, 0.95], axis=0)

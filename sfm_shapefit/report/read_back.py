@@ -37,7 +37,7 @@ def draw_result(found: LocateResult | GraphResult) -> Drawing:
 def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
     """Return the drawing of an output folder, and the contents of its locate.json.
 
-    The convex optimum and its iterations are not in the files, and the input's centres only where the input
+    The convex optimum and its iterations are not in the files, and the input's centers only where the input
     still is where it was.
 
     Raises:

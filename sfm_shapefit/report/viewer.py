@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 """Of a pyramid: apex, then corners."""
-_GREY = (140, 140, 140)
+_GRAY = (140, 140, 140)
 _CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
 _FEWEST_FITTED = 3
-# A click means the camera whose centre is at most this far off.
+# A click means the camera whose center is at most this far off.
 _PICKED_DEG = 2.0
 # The slider is logarithmic, from here to 180 degrees.
 _LEAST_DEG = 0.01
@@ -62,7 +62,7 @@ def select_pairs(drawing: Drawing, thresholds: Thresholds) -> tuple[IntArray, Bo
 
 
 def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> int | None:
-    """Return the placed camera whose centre is nearest to a ray in angle, within 2 degrees; None if none is.
+    """Return the placed camera whose center is nearest to a ray in angle, within 2 degrees; None if none is.
 
     Args:
         drawing: what is drawn.
@@ -127,12 +127,12 @@ class _View:
             )
 
     def _add_input(self) -> None:
-        """Draw the input's cameras in grey where they can be brought into the output's units."""
+        """Draw the input's cameras in gray where they can be brought into the output's units."""
         self._input = None
         centers = input_centers(self._drawing)
         if centers is not None:
             rows = np.flatnonzero(np.isfinite(centers).all(axis=1))
-            self._input = self._frusta("/input", rows, centers[rows], np.tile(_GREY, (len(rows), 1)))
+            self._input = self._frusta("/input", rows, centers[rows], np.tile(_GRAY, (len(rows), 1)))
 
     def _add_controls(self, facts: dict[str, Any]) -> None:
         gui, drawing = self._server.gui, self._drawing
@@ -151,7 +151,7 @@ class _View:
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
         self._counts = gui.add_text("pairs drawn", "", disabled=True)
         if self._input is not None:
-            handle, shown = self._input, gui.add_checkbox("input's poses (grey)", True)
+            handle, shown = self._input, gui.add_checkbox("input's poses (gray)", True)
             shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
         for control in (self._residual, self._support, self._trust, self._picked):
             control.on_update(lambda _event: self._draw())
@@ -198,7 +198,7 @@ class _View:
         return self._lines(name, segments, shades)
 
     def _lines(self, name: str, ends: FloatArray, colors: Any) -> "viser.LineSegmentsHandle | None":
-        """Draw lines (k, 2, 3) in colours (k, 3); nothing is left of the name if there are none."""
+        """Draw lines (k, 2, 3) in colors (k, 3); nothing is left of the name if there are none."""
         if len(ends) == 0:
             self._server.scene.remove_by_name(name)
             return None
@@ -210,9 +210,9 @@ class _View:
 
 
 def input_centers(drawing: Drawing) -> FloatArray | None:
-    """Return the input's centres (n, 3) in the output's units and axes, brought there by a fit if need be.
+    """Return the input's centers (n, 3) in the output's units and axes, brought there by a fit if need be.
 
-    None where the input has no centres, or they all coincide.
+    None where the input has no centers, or they all coincide.
     """
     before, after = drawing.cameras.poses.centers, drawing.cameras.centers
     common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)

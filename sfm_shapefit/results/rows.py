@@ -33,7 +33,7 @@ def camera_rows(
 
     Args:
         placement: the graph and its solution.
-        centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
+        centers: (k, d) centers of the placed cameras in the output's units; NaN for those that are left out
             because they are not trusted.
         scale: the output's units in one unit of the solver.
         further: the other pieces that are solved; the rows of their cameras say where they stand.

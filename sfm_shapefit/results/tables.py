@@ -34,7 +34,7 @@ class CameraRow:
     """The parallel-rigid piece it belongs to, 0 the largest, which is the output; N stands in pieces/N with
     a scale of its own. None outside every piece of 3 cameras."""
     center: tuple[float, ...] = ()
-    """Centre in the output's units, d numbers; empty when not placed. Columns x, y, z."""
+    """Center in the output's units, d numbers; empty when not placed. Columns x, y, z."""
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
@@ -42,7 +42,7 @@ class CameraRow:
     agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
     `judgement.trust`."""
     sigma: tuple[float, ...] = ()
-    """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
+    """Standard deviation of the solved center, in the output's units, with centroid and scale held fixed.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
 
 

@@ -89,7 +89,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
         yield (
             f"the matches of {twofold} pairs agree on two directions each, those of {usable} on one: things "
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
-            "contradiction behind; compare images of neighbouring cameras before trusting them"
+            "contradiction behind; compare images of neighboring cameras before trusting them"
         )
     against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
     if against > _ALARMING_SHARE * len(directions.pairs):

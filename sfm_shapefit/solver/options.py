@@ -101,7 +101,7 @@ class SolverOptions(Settings):
     )
     uniqueness: bool = option(
         True,
-        "Also examine whether the certificate proves the optimum unique; costs one sparse factorisation.",
+        "Also examine whether the certificate proves the optimum unique; costs one sparse factorization.",
     )
     factor_memory_mb: int = option(
         2000,

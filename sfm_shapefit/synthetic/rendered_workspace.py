@@ -8,7 +8,7 @@
 Nothing about keypoints and matches is made up: they err, miss and mistake one house for another as they do
 for photographs. What is known is the truth: the surface point under every keypoint, and so of every match
 whether it is right (`judge_matches`). The points of the exact model are those surface points, joined along
-right matches. On the CPU and with a seed, all of it is the same on every run and for any number of threads.
+right matches. On the CPU and with a seed, all of it is the same on every run, byte by byte.
 """
 
 from pathlib import Path
@@ -135,6 +135,8 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
     reader.camera_params = ",".join(repr(value) for value in _camera(scene).params.tolist())
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = scene.options.max_keypoints_per_image
+    # Images get their ids in the order in which threads finish; one thread keeps that of their names.
+    extraction.num_threads = 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = scene.options.min_matches
     verification.compute_relative_pose = relative_poses

@@ -97,7 +97,7 @@ def batch_of(pairs, num_points):
 
 
 def seeded(reconstruction, centers=None, placed=None, keypoints=None, batches=None):
-    """The seed of a reconstruction at the given centres, or its own, and the graph of its matches."""
+    """The seed of a reconstruction at the given centers, or its own, and the graph of its matches."""
     model = read_model(reconstruction)
     placed = np.ones(model.num_images, dtype=bool) if placed is None else placed
     centers = model.centers if centers is None else centers
@@ -208,7 +208,7 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
         np.testing.assert_array_equal([p.xy for p in seed.image(image_id).points2D], own)
 
 
-def test_a_placed_image_without_finite_centre_is_refused_by_name():
+def test_a_placed_image_without_finite_center_is_refused_by_name():
     model = read_model(ring_model()[0])
     centers = model.centers.copy()
     centers[4, 1] = np.nan
@@ -220,7 +220,7 @@ def test_a_placed_image_without_finite_centre_is_refused_by_name():
 
 
 @SOURCES
-def test_exact_data_give_every_point_back_with_its_colour(source):
+def test_exact_data_give_every_point_back_with_its_color(source):
     original, points = ring_model()
     structure = color_points(triangulate(*seeded_with(source, original)), original)
     assert structure.num_points3D() == len(points)
@@ -352,7 +352,7 @@ def test_tracks_of_a_model_with_other_keypoints_are_refused():
         triangulate(seed, original)
 
 
-def test_a_source_without_colours_leaves_colours_as_they_are_and_costs_no_copy():
+def test_a_source_without_colors_leaves_colors_as_they_are_and_costs_no_copy():
     original, _ = ring_model()
     structure = triangulate(seeded(original)[0], original)
     for point in original.points3D.values():
@@ -361,7 +361,7 @@ def test_a_source_without_colours_leaves_colours_as_they_are_and_costs_no_copy()
     assert all(point.color.any() for point in structure.points3D.values())
 
 
-def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
+def test_a_point_takes_the_mean_color_of_the_points_whose_observations_it_shares():
     # every point of the source is split in two of 4 images each, which matches of all images join again
     original, _ = ring_model()
     for point_id in list(original.point3D_ids()):
@@ -382,7 +382,7 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         np.testing.assert_array_equal(point.color, [15, 20, 32])
 
 
-def test_colours_come_only_from_images_with_the_same_keypoints():
+def test_colors_come_only_from_images_with_the_same_keypoints():
     original, _ = ring_model()
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):

@@ -3,7 +3,6 @@
 import json
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -192,7 +191,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement():
     bad = (relative.pairs == 3).any(axis=1)
     rotations = relative.rotations.copy()
     rotations[bad] = Rotation.random(int(bad.sum()), random_state=np.random.default_rng(1)).as_matrix()
-    answer = average_consistently(14, replace(relative, rotations=rotations))
+    answer = average_consistently(14, relative._replace(rotations=rotations))
     others = np.delete(np.arange(14), 3)
     assert answer.agreements[3] < 0.25
     assert answer.agreements[others].min() > 0.8
@@ -204,7 +203,7 @@ def test_pairs_that_contradict_known_focal_lengths_are_left_out_where_they_can_b
     sound = np.random.default_rng(3).permutation(len(relative.pairs)) >= 30
     rotations = relative.rotations.copy()
     rotations[~sound] = Rotation.random(30, random_state=np.random.default_rng(2)).as_matrix()
-    answer = average_consistently(14, replace(relative, rotations=rotations, sound=sound))
+    answer = average_consistently(14, relative._replace(rotations=rotations, sound=sound))
     assert answer.sound_only
     assert answer.share > 0.99
     assert worst_error_deg(answer, truth) < 0.5

@@ -144,7 +144,7 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
     scale = np.sqrt(np.repeat(np.trace(covariances, axis1=1, axis2=2) / 2, 2))
     predicted = (sampled / scale).T @ (sampled / scale) / len(sampled)
     measured = (np.array(real) / scale).T @ (np.array(real) / scale) / len(real)
-    # Away from the image's centre a pixel is a smaller angle, in a real scene a smaller noise.
+    # Away from the image's center a pixel is a smaller angle, in a real scene a smaller noise.
     measured /= np.mean(np.diag(measured))
     assert np.mean(np.diag(predicted)) == pytest.approx(1.0, abs=0.05)
     # Entries scatter by 0.10 (96 samples) and 0.05 (400 draws); independent pairs have 0 off the blocks.

@@ -467,7 +467,7 @@ def test_approximate_cholesky_of_a_tree_is_exact():
     w = random_weights(n - 1, 1)
     rhs = balanced_rhs((n, 2), 2)
     x = approximate_cholesky(adjacency(n, edges), w, seed=0).solve(rhs)
-    # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbour.
+    # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbor.
     assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), 1, rhs), 1e-10)
 
 

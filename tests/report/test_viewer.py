@@ -92,7 +92,7 @@ def test_thresholds_decide_which_pairs_are_drawn():
     np.testing.assert_array_equal(contradicts, drawing.pairs.residuals_deg[rows] > 4.0)
 
 
-def test_the_inputs_centres_are_brought_into_the_outputs_units():
+def test_the_inputs_centers_are_brought_into_the_outputs_units():
     from dataclasses import replace
 
     drawing, _ = make_drawing()
@@ -120,7 +120,7 @@ def test_moving_a_control_redraws():
         before = controls["pairs drawn"].value
         controls["least matches"].value = 100
         assert controls["pairs drawn"].value != before
-        assert "input's poses (grey)" in controls
+        assert "input's poses (gray)" in controls
         (clicked,) = server.scene._scene_pointer_cb
         middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
         towards = drawing.cameras.centers[3] - middle - np.array([50.0, 0.0, 0.0])

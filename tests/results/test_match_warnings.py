@@ -17,7 +17,7 @@ from sfm_shapefit.synthetic.scenes import project_points
 from sfm_shapefit.synthetic.workspace import write_workspace
 
 NO_DIRECTION = DirectionOptions(min_inliers=200)
-PERIOD = np.array([2.0, 0.0, 0.0])  # along the wall, in metres
+PERIOD = np.array([2.0, 0.0, 0.0])  # along the wall, in meters
 
 
 def statuses(**counts):

@@ -70,9 +70,7 @@ def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> 
             pairs, rotations, counts, _ = relative.subset(used)
             for loss in _LOSSES:
                 with suppress(UnsolvableError):
-                    found = average_rotations(
-                        num_images, pairs, rotations, counts, loss=loss, count_matches=False
-                    )
+                    found = average_rotations(num_images, pairs, rotations, counts, loss=loss)
                     answers.append(_judge(relative, found, limit, loss, sound_only))
     return answers
 

@@ -34,7 +34,7 @@ class MatchSource:
     def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
         """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
         if self.database is None:
-            return track_matches(self.model, 1)
+            return track_matches(self.model)
         return self.database.iter_matches(1, self.economy.batch, among)
 
     def counted(

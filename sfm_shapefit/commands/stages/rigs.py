@@ -1,7 +1,7 @@
 """Rigs and fixed cameras in `locate`: which images form rigid groups, and how these are placed.
 
 The frames of a model with rigs are groups with metric offsets. Cameras that are fixed stand where the input
-has them: two or more are one group, whose offsets are their centres; of a single one only the origin can be
+has them: two or more are one group, whose offsets are their centers; of a single one only the origin can be
 taken.
 """
 
@@ -24,7 +24,7 @@ from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_grou
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# Extent of the fixed centres, of their distance from the origin, that counts as none.
+# Extent of the fixed centers, of their distance from the origin, that counts as none.
 _COINCIDENT = 1e-9
 
 

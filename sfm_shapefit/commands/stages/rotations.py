@@ -31,7 +31,7 @@ def refine_model_rotations(
 ) -> tuple[PosedModel, FloatArray]:
     """Return the model with refined rotations, and by how many degrees each camera turned, shape (n,).
 
-    Directions need rotations and the refinement needs centres: cameras are placed, rotations refined, and
+    Directions need rotations and the refinement needs centers: cameras are placed, rotations refined, and
     both once more, for with better rotations more pairs have a direction. What a camera may turn is
     always judged against its given rotation.
     """

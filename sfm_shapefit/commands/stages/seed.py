@@ -1,4 +1,4 @@
-"""From placed cameras to seeded models: poses, points, colours, and bundle adjustment if asked for."""
+"""From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -71,8 +71,8 @@ def build_seeded_model(
             adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
-    if source.database is not None:  # points of the model's own tracks have their colours already
-        with clock("colours"):
+    if source.database is not None:  # points of the model's own tracks have their colors already
+        with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
     return seeded if axes is None else turn_model(seeded, axes), adjusted
 
