@@ -86,7 +86,7 @@ def main(
     pycolmap.verify_matches(database, pairs_file)
 
     found = sfm_shapefit.map_database(database)
-    sfm_shapefit.write_map_result(found, out / "models")
+    sfm_shapefit.write_result(found, out / "models")
     adjusted = pycolmap.Reconstruction(found.models[0].located.reconstruction)
     pycolmap.bundle_adjustment(adjusted)  # refines focal length and distortion too
     (out / "sparse" / "0").mkdir(parents=True)

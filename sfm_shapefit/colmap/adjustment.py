@@ -114,7 +114,15 @@ def _solve(
     for frame_id in sorted(set(fixed_frames) & set(reconstruction.reg_frame_ids())):
         config.set_constant_rig_from_world_pose(frame_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    settings = _settings(loss_scale_px)
+    settings = pycolmap.BundleAdjustmentOptions()
+    settings.print_summary = is_heard()
+    settings.refine_focal_length = settings.refine_principal_point = settings.refine_extra_params = False
+    settings.refine_sensor_from_rig = False
+    settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    settings.ceres.loss_function_scale = loss_scale_px
+    settings.ceres.solver_options.function_tolerance = _FUNCTION_TOLERANCE
+    settings.ceres.solver_options.max_num_iterations = _MAX_STEPS
+    settings.ceres.solver_options.num_threads = 1
     with quiet_stderr():
         adjuster = pycolmap.create_default_ceres_bundle_adjuster(settings, config, reconstruction)
         summary = cast("pycolmap.CeresBundleAdjustmentSummary", adjuster.solve())
@@ -124,19 +132,3 @@ def _solve(
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps - 1  # the start counts as one
     return steps, converged
-
-
-def _settings(loss_scale_px: float) -> pycolmap.BundleAdjustmentOptions:
-    """Return pycolmap's options for one round."""
-    settings = pycolmap.BundleAdjustmentOptions()
-    settings.print_summary = is_heard()
-    settings.refine_focal_length = False
-    settings.refine_extra_params = False
-    settings.refine_principal_point = False
-    settings.refine_sensor_from_rig = False
-    settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    settings.ceres.loss_function_scale = loss_scale_px
-    settings.ceres.solver_options.function_tolerance = _FUNCTION_TOLERANCE
-    settings.ceres.solver_options.max_num_iterations = _MAX_STEPS
-    settings.ceres.solver_options.num_threads = 1
-    return settings

@@ -64,10 +64,8 @@ UInt64Array = npt.NDArray[np.uint64]
 def check_model_files(folder: Path) -> None:
     """Refuse a model folder that pycolmap must not be given.
 
-    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads.
-
-    Args:
-        folder: holds cameras, images and points3D, and either both or none of rigs and frames.
+    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads. It
+    must have cameras, images and points3D, and either both or none of rigs and frames.
 
     Raises:
         InputError: naming the file, and the record or the line, that is missing, truncated, not finite,

@@ -274,7 +274,13 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
 
     cameras = [reconstruction.camera(image.camera_id) for image in images]
     poses = [image.cam_from_world() for image in images]
-    rotations = _check_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
+    quaternions_xyzw = np.array([pose.rotation.quat for pose in poses], dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Quaternions are unit up to rounding in a file.
+        sound = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+    if not sound.all():
+        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
+    rotations = rotation_matrices(quaternions_xyzw[:, [3, 0, 1, 2]])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
@@ -309,16 +315,6 @@ def _frame_offset(label: str, image: pycolmap.Image, reconstruction: pycolmap.Re
     assert rig_from_world is not None
     in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
     return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
-
-
-def _check_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
-    """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
-    quaternions = np.array(quaternions_xyzw, dtype=np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
-    if not sound.all():
-        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
-    return rotation_matrices(quaternions[:, [3, 0, 1, 2]])
 
 
 def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:

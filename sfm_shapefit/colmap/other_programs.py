@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, model_of_images
@@ -29,9 +29,11 @@ def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reco
         if not made.verify_params():
             raise InputError(f"{label}: camera {k - 1} has parameters that do not fit {camera.model}")
         model.add_camera_with_trivial_rig(made)
-    observed, pixels = _unambiguous(scene)
-    order = np.argsort(observed[:, 1], kind="stable")
-    observed, pixels = observed[order], pixels[order]
+    first = np.sort(np.unique(scene.observed, axis=0, return_index=True)[1])
+    often = np.bincount(scene.observed[first, 0], minlength=1)[scene.observed[first, 0]] >= 2
+    kept = first[often]
+    kept = kept[np.argsort(scene.observed[kept, 1], kind="stable")]
+    observed, pixels = scene.observed[kept], scene.pixels[kept]
     bounds = np.searchsorted(observed[:, 1], np.arange(len(scene.names) + 1))
     for k, name in enumerate(scene.names):
         image = pycolmap.Image(
@@ -90,16 +92,6 @@ def intrinsics_of(camera: pycolmap.Camera) -> Intrinsics:
 def make_camera(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
     """Return a camera of pycolmap's whose focal length is known."""
     return pycolmap.Camera(**intrinsics._asdict(), camera_id=camera_id, has_prior_focal_length=True)
-
-
-def _unambiguous(scene: PosedModelFile) -> tuple[IntArray, FloatArray]:
-    """Return the first observation of each point in each image, of points that two images or more see."""
-    if not len(scene.observed):
-        return scene.observed, scene.pixels
-    first = np.sort(np.unique(scene.observed, axis=0, return_index=True)[1])
-    observed, pixels = scene.observed[first], scene.pixels[first]
-    often = np.bincount(observed[:, 0], minlength=len(scene.points))[observed[:, 0]] >= 2
-    return observed[often], pixels[often]
 
 
 def _add_points(

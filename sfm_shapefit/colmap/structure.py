@@ -206,7 +206,14 @@ def _triangulate_tracks(
 ) -> None:
     """Add to our own `structure` the points of another model, each triangulated from its own track."""
     registered = sorted(structure.reg_image_ids())
-    observations = _observe(structure, source, registered)
+    parts = []
+    for image_id in registered:
+        image = structure.image(image_id)
+        if image.num_points2D() != source.image(image_id).num_points2D():
+            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
+        keypoints, ids = observed_points(source.image(image_id))
+        parts.append((ids, keypoints, points2d_xy(image)[keypoints]))
+    observations = _Observations(*sort_observations(parts))
     _, firsts, lengths = np.unique(observations.points, return_index=True, return_counts=True)
     is_long = lengths >= options.min_track_length
     tracks = [slice(first, first + k) for first, k in zip(firsts[is_long], lengths[is_long], strict=True)]
@@ -221,9 +228,11 @@ def _triangulate_tracks(
         )
         for chosen in (tracks[k : k + _TRACKS_A_TASK] for k in range(0, len(tracks), _TRACKS_A_TASK))
     )
-    parts = map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
+    answered = (
+        map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
+    )
     done = 0
-    for part in parts:
+    for part in answered:
         for track, found in zip(tracks[done : done + len(part)], part, strict=True):
             if found is None:
                 continue
@@ -275,20 +284,6 @@ class _Observations(NamedTuple):
     """(O,) index into the image's points2D."""
     xy: FloatArray
     """(O, 2) pixels of that point."""
-
-
-def _observe(
-    structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, image_ids: list[int]
-) -> _Observations:
-    """Return the observations of the `source`, and their pixels in the `structure`."""
-    parts = []
-    for image_id in image_ids:
-        image = structure.image(image_id)
-        if image.num_points2D() != source.image(image_id).num_points2D():
-            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
-        keypoints, ids = observed_points(source.image(image_id))
-        parts.append((ids, keypoints, points2d_xy(image)[keypoints]))
-    return _Observations(*sort_observations(parts))
 
 
 # --- colors ---------------------------------------------------------------------------------------

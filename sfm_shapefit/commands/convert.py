@@ -27,13 +27,7 @@ if TYPE_CHECKING:
 
 Format = Literal["colmap", "colmap-txt", "nerf", "tum", "csv"]
 
-_BY_SUFFIX: dict[str, Format] = {
-    "": "colmap",
-    ".json": "nerf",
-    ".tum": "tum",
-    ".txt": "tum",
-    ".csv": "csv",
-}
+_BY_SUFFIX: dict[str, Format] = {"": "colmap", ".json": "nerf", ".tum": "tum", ".txt": "tum", ".csv": "csv"}
 _TEXTS = {"nerf": nerf_text, "tum": tum_text, "csv": poses_csv}
 
 

@@ -12,12 +12,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.commands.stages.measure import (
-    add_evidence,
-    build_graph,
-    count_work,
-    measure_directions,
-)
+from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.commands.stages.rotations import refine_model_rotations

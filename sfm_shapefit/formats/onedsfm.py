@@ -53,12 +53,8 @@ class EpipolarGeometries:
 
     def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
         """Return some of the pairs of the same cameras."""
-        return EpipolarGeometries(
-            names=self.names,
-            pairs=self.pairs[rows],
-            rotations=self.rotations[rows],
-            to_second=self.to_second[rows],
-        )
+        pairs, rotations, to_second = self.pairs[rows], self.rotations[rows], self.to_second[rows]
+        return replace(self, pairs=pairs, rotations=rotations, to_second=to_second)
 
     def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
         """Return (m,) by how many degrees each relative rotation contradicts the cameras' (n, 3, 3)."""

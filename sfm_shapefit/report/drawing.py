@@ -245,7 +245,7 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
     centers = np.full((len(rows), 3), np.nan)
     for k, row in enumerate(rows):
         if row.center:
-            centers[k] = _in_three_dimensions(np.array(row.center))
+            centers[k] = [*row.center, 0.0, 0.0][:3]
     return Cameras(
         names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
@@ -257,13 +257,6 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
         sigmas=np.array([max(row.sigma, default=np.nan) for row in rows], dtype=np.float64),
         poses=poses,
     )
-
-
-def _in_three_dimensions(points: FloatArray) -> FloatArray:
-    """Return points (..., d) with coordinates added or left out to make three."""
-    missing = max(3 - points.shape[-1], 0)
-    widths = [(0, 0)] * (points.ndim - 1) + [(0, missing)]
-    return np.pad(points, widths)[..., :3]
 
 
 def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:

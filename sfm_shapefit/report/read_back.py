@@ -2,6 +2,7 @@
 
 import csv
 import json
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
-from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.report.drawing import Drawing, build_drawing, poses_of
 from sfm_shapefit.results.result import GraphResult, LocateResult
@@ -55,8 +56,10 @@ def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
         poses, points = None, None
         if "graph" not in facts["inputs"]:
             model, names = read_model(folder), [row.name for row in cameras]
-            points = model.reconstruction
-            poses = replace(poses_of(model, names), centers=poses_of(_input_of(facts), names).centers)
+            points, given, before = model.reconstruction, Path(facts["inputs"]["model"]), None
+            with suppress(InputError):
+                before = read_model(given) if given.is_dir() else None
+            poses = replace(poses_of(model, names), centers=poses_of(before, names).centers)
         drawing = replace(
             build_drawing(cameras, pairs, poses=poses, points=points),
             input_is_aligned=str(facts.get("scale", "")).startswith("input:"),
@@ -67,12 +70,3 @@ def read_output(folder: Path) -> tuple[Drawing, dict[str, Any]]:
             f"the files of {folder} are damaged or of another version ({error}); run locate again"
         ) from error
     return drawing, facts
-
-
-def _input_of(facts: dict[str, Any]) -> PosedModel | None:
-    """Return the input, if it can still be read."""
-    path = Path(facts["inputs"]["model"])
-    try:
-        return read_model(path) if path.is_dir() else None
-    except InputError:
-        return None

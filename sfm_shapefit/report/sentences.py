@@ -65,18 +65,15 @@ def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     ]
 
 
-def _noun(drawing: Drawing) -> str:
-    return "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
-
-
 def _placed(drawing: Drawing) -> str:
     placed, total = int(drawing.cameras.placed.sum()), len(drawing.cameras.names)
+    noun = "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
     if placed == total:
-        return f"All {total:,} {_noun(drawing)} were placed."
+        return f"All {total:,} {noun} were placed."
     elsewhere = int(np.sum(~drawing.cameras.placed & (drawing.cameras.pieces > 0)))
     note = f" ({elsewhere:,} in smaller pieces)" if elsewhere else ""
     missing = f"{total - placed:,} {'is' if total - placed == 1 else 'are'} not in this model"
-    return f"{placed:,} of {total:,} {_noun(drawing)} were placed; {missing}{note}."
+    return f"{placed:,} of {total:,} {noun} were placed; {missing}{note}."
 
 
 def _pairs(drawing: Drawing, facts: dict[str, Any]) -> str:
@@ -112,15 +109,11 @@ def _optimum(solve: dict[str, Any]) -> str:
     """Say what the certificate proves."""
     if solve["status"] == "not_solved":
         return f"Nothing certifies these positions as a whole ({solve['method']}: {solve['method_reason']})."
-    unique = {
-        True: ", and no other placement is as good",
-        False: ", but others may be as good",
-        None: "",
-    }[solve["unique"]]
+    others = {True: ", and no other placement is as good", False: ", but others may be as good", None: ""}
     certified = "is certified" if solve["status"] == "converged" else "is not certified to the tolerance"
     return (
         f"The convex optimum {certified}: its objective {solve['objective']:.4g} is within "
-        f"{max(solve['gap'], 0.0):.1e} of the least possible{unique}."
+        f"{max(solve['gap'], 0.0):.1e} of the least possible{others[solve['unique']]}."
     )
 
 

@@ -11,10 +11,7 @@ from sfm_shapefit.results.result import GraphResult
 def export_files(found: GraphResult, *, g2o: bool, onedsfm: bool) -> dict[str, str]:
     """Return the texts of the formats that are wanted, by their path in the output folder.
 
-    Args:
-        found: the placed graph.
-        g2o: `positions.g2o`, the placed nodes as vertices.
-        onedsfm: a folder `1dsfm`, the pairs that agree with the solution and the placed cameras.
+    `positions.g2o` has the placed nodes as vertices, the folder `1dsfm` the pairs that agree and the cameras.
 
     Raises:
         InputError: if a format has no such dimension.

@@ -40,8 +40,21 @@ def camera_rows(
         axes: (d, d) rotation from the input's axes to the output's; the same if None.
     """
     graph = placement.graph
-    homes = _home_pieces(placement)
-    reasons = _with_folders(left_out_reasons(placement.considered, placement.pieces), further)
+    # Each camera's home is the first piece of three cameras or more that holds it, or the largest.
+    homes: list[int | None] = [None] * graph.num_nodes
+    for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
+        for camera in placement.pieces[k].nodes.tolist():
+            homes[camera] = k
+    reasons = left_out_reasons(placement.considered, placement.pieces)
+    folders: dict[int, list[str]] = {}
+    for piece in further:
+        for camera in piece.cameras.tolist():
+            folders.setdefault(camera, []).append(folder_of(piece.piece))
+    reasons |= {
+        camera: f"{reasons[camera]}; see {', '.join(names)}"
+        for camera, names in folders.items()
+        if camera in reasons
+    }
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
     rows = [
         CameraRow(
@@ -183,25 +196,3 @@ def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int,
 def folder_of(piece: int) -> str:
     """Return where a piece stands in the output."""
     return f"pieces/{piece}" if piece else "."
-
-
-def _with_folders(reasons: dict[int, str], further: Sequence[Placement]) -> dict[int, str]:
-    """Add to the reason for which a camera is left out in which further pieces it stands."""
-    homes: dict[int, list[str]] = {}
-    for placement in further:
-        for camera in placement.cameras.tolist():
-            homes.setdefault(camera, []).append(folder_of(placement.piece))
-    return {
-        camera: f"{reason}; see {', '.join(homes[camera])}" if camera in homes else reason
-        for camera, reason in reasons.items()
-    }
-
-
-def _home_pieces(placement: Placement) -> list[int | None]:
-    """Return the first piece of three cameras or more that holds each camera, or the largest."""
-    homes: list[int | None] = [None] * placement.graph.num_nodes
-    large = max(count_large(placement.pieces, placement.num_cameras), 1)
-    for k in reversed(range(large)):
-        for camera in placement.pieces[k].nodes.tolist():
-            homes[camera] = k
-    return homes
