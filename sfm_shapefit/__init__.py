@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import inspect
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.map import map_database
-    from sfm_shapefit.commands.write import write_map_result, write_result
+    from sfm_shapefit.commands.write import WriteOptions, write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.options import LocateOptions, MapOptions
     from sfm_shapefit.placement.place import Placement, place
@@ -46,7 +46,7 @@ _HOMES = {
     "commands.inspect": ("inspect",),
     "commands.locate": ("locate",),
     "commands.map": ("map_database",),
-    "commands.write": ("write_map_result", "write_result"),
+    "commands.write": ("WriteOptions", "write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "options": ("LocateOptions", "MapOptions"),
     "placement.place": ("Placement", "place"),
@@ -76,6 +76,7 @@ __all__ = [
     "Status",
     "UnsolvableError",
     "ViewGraph",
+    "WriteOptions",
     "certify",
     "convert",
     "evaluate",
