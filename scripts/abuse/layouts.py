@@ -21,7 +21,7 @@ _RECORDS = {
         ("Q", "count", (("dd", "xy"), ("Q", "point reference"))),
     ),
     "points3D": (
-        *(("Q", "id"), ("ddd", "xyz"), ("BBB", "colour"), ("d", "error")),
+        *(("Q", "id"), ("ddd", "xyz"), ("BBB", "color"), ("d", "error")),
         ("Q", "count", (("I", "image reference"), ("I", "reference"))),
     ),
     "rigs": (("I", "id"), ("I", "count", _SENSOR, (*_SENSOR, ("B", "has pose", (_POSE,))))),

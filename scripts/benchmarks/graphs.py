@@ -42,7 +42,7 @@ class Problem:
     spec: GraphSpec
     """The family "street" has cameras and points; "madrid" is the pairs of 1DSfM's Madrid_Metropolis."""
     jitter: float = 0.0
-    """Of a street, in metres."""
+    """Of a street, in meters."""
     over_oracle: float | None = None
     error: float | None = None
     below_lud: bool = False

@@ -198,7 +198,12 @@ def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tm
         ("bundler", "0 0 1\n-1 0 0\n2", "0 0 2\n-1 0 0\n2", r"camera 0 has no rotation"),
         ("bundler", "1 8 -10 20", "9 8 -10 20", r"point 0 is seen by camera 9 of 2"),
         ("bundler", "1 8 -10 20", "1 8 -10", r"ends early, in line 15"),
-        ("openmvg", '"center": [1.0, 2.0, 3.0]', '"centroid": 0', r"extrinsics\[0\]/value has no key 'center'"),
+        (
+            "openmvg",
+            '"center": [1.0, 2.0, 3.0]',
+            '"centroid": 0',
+            r"extrinsics\[0\]/value has no key 'center'",
+        ),
         ("openmvg", '"focal_length": 100.0', '"focal_length": NaN', r"value0/focal_length is not finite"),
         ("openmvg", '"id_intrinsic": 0', '"id_intrinsic": 3', r"has the intrinsic 3, which is not among"),
         ("openmvg", "[[0.0, -1.0", "[[0.5, -1.0", r"extrinsics\[0\]/value/rotation is no rotation"),
