@@ -27,9 +27,9 @@ from pathlib import Path
 from sfm_shapefit.errors import InputError
 
 MARKER = "locate.json"
-"""The file by which an output folder of `locate` and `solve` is recognised."""
+"""The file by which an output folder of `locate` and `solve` is recognized."""
 MAP_MARKER = "map.json"
-"""The file by which an output folder of `map` is recognised."""
+"""The file by which an output folder of `map` is recognized."""
 
 
 def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""The estimator of one direction from the matches of one pair, compiled; the package's header has the maths.
+"""The estimator of one direction from the matches of one pair, compiled; the package's header has the math.
 
 Every kernel works on the matches of one pair: (n, 3) unit rays a and b in world axes and their epipolar
 normals, the cross products in pixels. Lengths and residuals are in pixels.

@@ -8,7 +8,7 @@ all of these. Here its loose cameras are put into groups that move together, wit
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
     on a line   the group lies on a line, along which nothing fixes their spacing
-    together    each camera is held well by its neighbours, the group is not held by the rest
+    together    each camera is held well by its neighbors, the group is not held by the rest
     distance    nothing holds it at any distance: the refinement had thrown it out of the scene
 """
 

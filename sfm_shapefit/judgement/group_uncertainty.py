@@ -1,6 +1,6 @@
 """How uncertain the locations of rigid groups are, and how much each direction decides for itself.
 
-As in `uncertainty`, with the centres f of the groups as unknowns and their scale s held: it is the unit in
+As in `uncertainty`, with the centers f of the groups as unknowns and their scale s held: it is the unit in
 which positions are given. The information about f is the Laplacian of the graph of groups, its null space the
 translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T f held fixed: the mean of the
 cameras, or one group that stays where it is. All nodes of a group share its covariance.

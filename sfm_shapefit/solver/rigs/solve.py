@@ -66,12 +66,15 @@ def solve_groups(
     return run_choice(between, _choose_method(unit, options), options, on_iteration, prove, start)
 
 
+def refuse_admm(options: SolverOptions) -> None:
+    """Raise InputError if the solver is asked for that does not know groups."""
+    if options.solver == "admm":
+        raise InputError("rigs and fixed cameras have no solver admm; choose auto, newton or conic")
+
+
 def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
     """Return the solver that is asked for, if it knows groups."""
-    if options.solver == "admm":
-        raise InputError(
-            "solver 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
-        )
+    refuse_admm(options)
     by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
