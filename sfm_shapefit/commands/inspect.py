@@ -1,6 +1,6 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -118,7 +118,7 @@ def inspect(
             directions = measure_directions(matches, options, clock)
         with clock("diagnosis"):
             measured = build_graph(matches, directions, options)
-            measured = measured.with_evidence(collect_evidence(directions))
+            measured = replace(measured, evidence=collect_evidence(directions))
             grouped = group_frames(model, measured)
             work = describe_work(count_work(matches, directions), grouped, options)
             pairs = view_graph(model, directions)

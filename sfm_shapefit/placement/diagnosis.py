@@ -155,7 +155,13 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
         num_points=measured.num_points,
         num_pairs=pairs.num_edges,
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
-        pieces=_piece_diagnoses(graph, pieces, n),
+        pieces=tuple(
+            PieceDiagnosis(
+                num_cameras=int(np.sum(piece.nodes < n)),
+                hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < n),
+            )
+            for piece in pieces[: count_large(pieces, n)]
+        ),
         left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
         weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against),
         corruption=_corruption(pairs, scores),
@@ -186,32 +192,15 @@ def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory
     return Theory(conditions=found, statement=_granted_in_words(found))
 
 
-def _piece_diagnoses(
-    graph: ViewGraph, pieces: list[RigidPiece], num_cameras: int
-) -> tuple[PieceDiagnosis, ...]:
-    """Return the pieces of three cameras or more."""
-    return tuple(
-        PieceDiagnosis(
-            num_cameras=int(np.sum(piece.nodes < num_cameras)),
-            hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < num_cameras),
-        )
-        for piece in pieces[: count_large(pieces, num_cameras)]
-    )
-
-
 def _find_weak_cameras(
     measured: MeasuredGraph, piece: RigidPiece, contradicted: BoolArray, against: IntArray
 ) -> tuple[WeakCamera, ...]:
     """Return the cameras of the largest piece that little holds, or that most triangles contradict.
 
-    Args:
-        measured: cameras and points.
-        piece: its largest piece.
-        contradicted: (m,) pairs that are wrong by their triangles; they hold nothing.
-        against: (q, 2) pairs without a direction because their matches contradict the rotations.
+    Pairs (m,) that their triangles contradict hold nothing; the matches of those `against` (q, 2) contradict
+    the given rotations.
     """
-    graph, num_cameras = measured.graph, measured.num_cameras
-    n = graph.num_nodes
+    graph, n = measured.graph, measured.graph.num_nodes
     ends, is_pair = graph.edges[piece.edges], measured.is_pair[piece.edges]
     wrong = contradicted[piece.edges]
     num_pairs = np.bincount(ends[is_pair].ravel(), minlength=n)
@@ -220,7 +209,7 @@ def _find_weak_cameras(
     spread = direction_spread(n, ends[~wrong], graph.directions[piece.edges[~wrong]])
     num_against = np.bincount(against.ravel(), minlength=n)
     weak = []
-    for camera in piece.nodes[piece.nodes < num_cameras].tolist():
+    for camera in piece.nodes[piece.nodes < measured.num_cameras].tolist():
         reasons = []
         if num_ties[camera] <= FEW_PAIRS and len(piece.nodes) >= _SMALLEST_CHECKED:
             reasons.append("two pairs or fewer hold it")
@@ -267,11 +256,9 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
 def _in_triangle(graph: ViewGraph) -> BoolArray:
     """Return which pairs (m,) have a common neighbor."""
     i, j = graph.edges.T
-    n = graph.num_nodes
-    half = coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    half = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_nodes, graph.num_nodes)).tocsr()
     adjacency = half + half.T
-    found: BoolArray = np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0
-    return found
+    return np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0
 
 
 def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlacement:

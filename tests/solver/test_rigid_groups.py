@@ -256,7 +256,7 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
         again = solve_groups(graph, groups, other)
         np.testing.assert_array_equal(again.locations, result.locations)
         np.testing.assert_array_equal(again.dual, result.dual)
-    with pytest.raises(InputError, match="'admm' does not know rigs"):
+    with pytest.raises(InputError, match="have no solver admm"):
         solve_groups(graph, groups, SolverOptions(solver="admm"))
     with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
         ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)

@@ -155,4 +155,4 @@ def add_evidence(
         draws = np.random.default_rng(0).standard_normal((len(own), *errors.shape[1:]))
         sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
         errors = np.concatenate([errors, sigmas[:, None, :] * draws])
-    return measured.with_evidence(replace(evidence, support=support, errors=errors))
+    return replace(measured, evidence=replace(evidence, support=support, errors=errors))
