@@ -64,7 +64,7 @@ def test_a_complete_graph_is_typical_for_the_p_of_the_definition():
     assert t.holds
 
 
-def test_cameras_without_a_common_neighbour_make_a_graph_atypical():
+def test_cameras_without_a_common_neighbor_make_a_graph_atypical():
     ring = np.array([[i, (i + 1) % 8] for i in range(8)])
     t = graph_typicality(8, ring)
     assert t.connected
@@ -148,7 +148,7 @@ def test_in_ten_dimensions_the_bracket_holds_what_sampling_finds():
     assert 0.0 < low <= high <= sampled
 
 
-def test_a_collinear_common_neighbour_counts_in_full():
+def test_a_collinear_common_neighbor_counts_in_full():
     t = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])
     adjacency = ~np.eye(3, dtype=bool)
     adjacency[0, 1] = adjacency[1, 0] = False

@@ -151,7 +151,7 @@ def test_a_config_file_sets_options_and_flags_win(tmp_path):
     assert (options["scale"], options["min_inliers"]) == ("unit", 16)
 
 
-@pytest.mark.parametrize("text", ["scale = ", "colour = 3", "min_inliers = 'many'", "scale = 'metric'"])
+@pytest.mark.parametrize("text", ["scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'"])
 def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
     run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)
@@ -335,7 +335,7 @@ def test_evaluate_does_not_write_over_other_files(ring_out, tmp_path):
     assert (tmp_path / "images.bin").read_bytes() == b"precious"
 
 
-def test_a_scale_from_meaningless_centres_is_warned_about(tmp_path):
+def test_a_scale_from_meaningless_centers_is_warned_about(tmp_path):
     model = pycolmap.Reconstruction(RING_MODEL)
     rng = np.random.default_rng(0)
     for frame in model.frames.values():

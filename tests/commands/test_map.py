@@ -3,7 +3,6 @@
 import json
 import sqlite3
 from contextlib import closing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ import sfm_shapefit
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
-from sfm_shapefit.commands.stages.averaging import averaged
+from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from tests.program import run
@@ -176,9 +175,9 @@ def worst_error_deg(answer, truth):
 
 def test_the_most_consistent_of_several_averagings_is_kept():
     truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    misled = averaged(14, relative, min_matches=15)
+    misled = average_consistently(14, relative, min_matches=15)
     assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
-    answer = averaged(14, relative)
+    answer = average_consistently(14, relative)
     assert answer.registered.all()
     assert answer.min_matches == 20
     assert worst_error_deg(answer, truth) < 0.5
@@ -192,7 +191,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement():
     bad = (relative.pairs == 3).any(axis=1)
     rotations = relative.rotations.copy()
     rotations[bad] = Rotation.random(int(bad.sum()), random_state=np.random.default_rng(1)).as_matrix()
-    answer = averaged(14, replace(relative, rotations=rotations))
+    answer = average_consistently(14, relative._replace(rotations=rotations))
     others = np.delete(np.arange(14), 3)
     assert answer.agreements[3] < 0.25
     assert answer.agreements[others].min() > 0.8
@@ -204,7 +203,7 @@ def test_pairs_that_contradict_known_focal_lengths_are_left_out_where_they_can_b
     sound = np.random.default_rng(3).permutation(len(relative.pairs)) >= 30
     rotations = relative.rotations.copy()
     rotations[~sound] = Rotation.random(30, random_state=np.random.default_rng(2)).as_matrix()
-    answer = averaged(14, replace(relative, rotations=rotations, sound=sound))
+    answer = average_consistently(14, relative._replace(rotations=rotations, sound=sound))
     assert answer.sound_only
     assert answer.share > 0.99
     assert worst_error_deg(answer, truth) < 0.5

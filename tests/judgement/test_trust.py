@@ -154,7 +154,7 @@ def real_cameras(name):
 
 
 @pytest.mark.slow
-def test_the_five_turned_cameras_of_lego_are_recognised():
+def test_the_five_turned_cameras_of_lego_are_recognized():
     lost = {row.name for row in real_cameras("lego100") if not row.placed}
     assert len(lost & WRONG_OF_LEGO) >= 4
     assert len(lost - WRONG_OF_LEGO) <= 6

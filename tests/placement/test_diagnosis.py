@@ -198,7 +198,7 @@ def test_a_bare_graph_is_diagnosed_too(tmp_path):
     result = run("inspect", tmp_path / "graph.txt", "--theory")
     assert result.exit_code == 0
     assert "5: pendant" in result.stdout
-    assert "no centres" in result.stdout
+    assert "no centers" in result.stdout
     run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)

@@ -1,4 +1,4 @@
-"""Scale, origin and axes: of the input's centres, of a known distance, of position priors."""
+"""Scale, origin and axes: of the input's centers, of a known distance, of position priors."""
 
 import json
 import sqlite3
@@ -55,7 +55,7 @@ def test_a_few_wild_cameras_do_not_set_the_scale():
 
 
 @pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6)])
-def test_without_input_centres_the_scale_is_unit_and_said_so(centers):
+def test_without_input_centers_the_scale_is_unit_and_said_so(centers):
     t = cameras(10)
     gauge = input_gauge(t, centers)
     placed = gauge.similarity.apply(t)
@@ -65,7 +65,7 @@ def test_without_input_centres_the_scale_is_unit_and_said_so(centers):
     assert np.median(np.linalg.norm(placed, axis=1)) == pytest.approx(1.0, rel=1e-12)
 
 
-def test_centres_that_contradict_the_answer_do_not_turn_it_inside_out():
+def test_centers_that_contradict_the_answer_do_not_turn_it_inside_out():
     t = cameras(11)
     gauge = input_gauge(t, -t)
     assert gauge.scale == "unit"
@@ -175,7 +175,7 @@ def test_standard_deviations_of_a_table_become_covariances(ring, tmp_path):
     np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
 
 
-def test_latitudes_and_longitudes_become_metres_east_north_up(ring, tmp_path):
+def test_latitudes_and_longitudes_become_meters_east_north_up(ring, tmp_path):
     path = tmp_path / "gps.csv"
     names = ring.names[:3]
     path.write_text(
@@ -294,7 +294,7 @@ def test_priors_without_effect_are_refused(ring, tmp_path):
 
 
 def test_priors_with_refinement_mend_what_directions_leave_open():
-    """A drive along a line: directions with errors drift; positions known to a few centimetres do not."""
+    """A drive along a line: directions with errors drift; positions known to a few centimeters do not."""
     terms, start, truth, priors = drive(sigma=0.05)
     before = np.linalg.norm(start - truth, axis=1)
     moved = refine_anchored(*terms, priors)

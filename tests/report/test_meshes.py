@@ -49,7 +49,7 @@ def test_in_the_glb_y_is_up_and_the_cameras_are_around_the_origin(folder):
     np.testing.assert_allclose(np.median(apexes, axis=0), 0.0, atol=1e-5)
 
 
-def test_the_ply_is_in_the_axes_of_the_model_and_coloured_by_trust(folder):
+def test_the_ply_is_in_the_axes_of_the_model_and_colored_by_trust(folder):
     drawing, _ = make_drawing()
     mesh = trimesh.load(folder / "scene.ply", process=False)
     placed = drawing.cameras.centers[drawing.cameras.placed]
@@ -79,7 +79,7 @@ def test_the_ply_has_a_ribbon_for_each_pair_of_placed_cameras(folder):
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 
-def test_trust_is_red_at_0_green_at_1_and_grey_where_unknown():
+def test_trust_is_red_at_0_green_at_1_and_gray_where_unknown():
     low, high, unknown = trust_colors(np.array([0.0, 1.0, np.nan])).astype(int)
     assert low[0] > 3 * low[1]
     assert high[1] > 3 * high[0]

@@ -249,7 +249,7 @@ def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
 
 
 def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():
-    """A flat grid of squares, in 3D: each square is a rigid 4-cycle, and neighbours share two cameras."""
+    """A flat grid of squares, in 3D: each square is a rigid 4-cycle, and neighbors share two cameras."""
     side = 40
     number = np.arange(side * side).reshape(side, side)
     across = np.column_stack([number[:, :-1].ravel(), number[:, 1:].ravel()])
@@ -295,7 +295,7 @@ def test_labels_do_not_depend_on_the_order_or_orientation_of_the_edges(dimension
 
 
 @pytest.mark.parametrize("dimension", DIMENSIONS)
-def test_relabelling_the_cameras_keeps_the_partition(dimension):
+def test_relabeling_the_cameras_keeps_the_partition(dimension):
     rng = np.random.default_rng(12)
     for _ in range(20):
         edges = random_graph(rng, 30, int(rng.integers(30, 60)))

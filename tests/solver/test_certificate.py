@@ -301,7 +301,7 @@ def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
-def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma):
+def test_newton_started_from_a_certified_point_needs_fewer_factorizations(sigma):
     graph = draw_family("geo", 400, 24, sigma=sigma)
     split = solve_admm(graph, 1e-7, 400)
     certificate = certify(graph, split.locations, split.dual)

@@ -226,7 +226,7 @@ def test_corrupted_pairs_are_as_many_as_asked_and_agree_on_a_wrong_direction(sha
         # 0.5 / sqrt(2 k) px, and four of them are granted.
         bound_px = 0.5 + 4.0 * 0.5 / np.sqrt(2.0 * len(scene.matches_of(pair)))
         assert residual_rad * scene.options.focal_length_px < bound_px
-    # False centres are 10 degrees off or more; at 0.5 px the estimate strays by far less than 5 degrees.
+    # False centers are 10 degrees off or more; at 0.5 px the estimate strays by far less than 5 degrees.
     assert min(errors_deg) > 5.0
     assert np.median(errors_deg) > 20.0
     assert min(cheirality) > 0.9
@@ -327,7 +327,7 @@ def test_pycolmap_reads_back_the_scene_from_a_workspace(tmp_path):
             np.testing.assert_allclose(pose.translation, scene.relative_translations[pair], atol=1e-12)
 
 
-def test_model_points_have_the_tracks_and_colours_of_the_scene(tmp_path):
+def test_model_points_have_the_tracks_and_colors_of_the_scene(tmp_path):
     scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
     write_workspace(scene, tmp_path / "out", WorkspaceOptions(database=False))
     assert not (tmp_path / "out/database.db").exists()
@@ -499,7 +499,7 @@ def test_graph_problems_are_simple_connected_and_exact_without_noise(family):
     i, j = problem.edges.T
     assert (i < j).all()
     assert len(np.unique(problem.edges, axis=0)) == len(problem.edges)
-    # Normalised twice: a few roundings.
+    # Normalized twice: a few roundings.
     np.testing.assert_allclose(problem.directions, true_directions(problem), rtol=0.0, atol=1e-15)
     assert not problem.corrupted.any()
     n = len(problem.locations)
