@@ -69,7 +69,7 @@ def kernel(function: Kernel) -> Kernel:
 
 
 def inner_kernel(function: Kernel) -> Kernel:
-    """Let kernels call a function, which is compiled as a part of them; for Python it stays a plain function."""
+    """Let kernels call a function, which is compiled as a part of them; Python calls it as it is written."""
     return cast(Kernel, register_jitable(**_OPTIONS)(function))
 
 

@@ -48,14 +48,14 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     scale = problem.kappa / dot(problem.c, problem.c)
     combine(scale, problem.c, 0.0, problem.c, t)
     weigh(problem, t, np.inf, step.ratios, gradient, degrees)
-    left = descend(problem, step, t, gradient, degrees, downhill, np.int64(_FIRST_STEPS))
+    left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
     if left > _LEFT * dot(t, gradient):
         return False
     mean = weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     eps = _EPS
     for _ in range(_ROUNDS):
         mean = weigh(problem, t, eps * mean, step.ratios, gradient, degrees)
-        descend(problem, step, t, gradient, degrees, downhill, np.int64(_STEPS))
+        descend(problem, step, t, gradient, degrees, downhill, _STEPS)
         eps *= _SHRINK
     set_residuals(problem, t, iterate.r)
     iterate.feasible[:] = 0.0

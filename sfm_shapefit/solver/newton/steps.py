@@ -398,7 +398,6 @@ def take_step(problem: Any, iterate: Any, step: Any, mu: float, progress: Any, t
 def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> float:
     """Return the change of sum_e w_e rho_e from r to r + alpha dr, without cancellation."""
     r, dr = iterate.r, step.r
-    total = 0.0
     for e in range(len(problem.w)):
         rd = dd = 0.0
         for k in range(len(problem.transverse)):
@@ -406,8 +405,8 @@ def increase(problem: Any, iterate: Any, step: Any, mu: float, alpha: float) -> 
             dd += dr[e, k] * dr[e, k]
         change = alpha * (2.0 * rd + alpha * dd)
         then = max(step.rho[e] * step.rho[e] + change, mu * mu)
-        total += problem.w[e] * change / (step.rho[e] + np.sqrt(then))
-    return total
+        step.ratios[e] = problem.w[e] * change / (step.rho[e] + np.sqrt(then))
+    return add_up(step.ratios)
 
 
 @inner_kernel
@@ -455,6 +454,21 @@ def largest(x: Any) -> float:
 
 
 @inner_kernel
+def add_up(x: Any) -> float:
+    """Return the sum of an array; by four sums, as in `largest`."""
+    a = b = c = d = 0.0
+    whole = len(x) // 4 * 4
+    for e in range(0, whole, 4):
+        a += x[e]
+        b += x[e + 1]
+        c += x[e + 2]
+        d += x[e + 3]
+    for e in range(whole, len(x)):
+        a += x[e]
+    return (a + b) + (c + d)
+
+
+@inner_kernel
 def move(
     problem: Any, iterate: Any, step: Any, alpha: float, keep: float, gain: float
 ) -> tuple[float, float]:
@@ -464,7 +478,6 @@ def move(
         sum_e w_e ||r_e|| and sum_e <y_e, r_e> with the feasible y.
     """
     combine(1.0, iterate.t, alpha, step.t, iterate.t)
-    residual = bound = 0.0
     for e in range(len(problem.w)):
         rr = yr = pp = 0.0
         for k in range(len(problem.transverse)):
@@ -478,9 +491,9 @@ def move(
         inside = problem.w[e] / max(np.sqrt(pp), problem.w[e])
         for k in range(len(problem.transverse)):
             iterate.y[e, k] = inside * step.y[e, k]
-        residual += problem.w[e] * np.sqrt(rr)
-        bound += yr
-    return residual, bound
+        step.ratios[e] = problem.w[e] * np.sqrt(rr)
+        step.rho[e] = yr
+    return add_up(step.ratios), add_up(step.rho)
 
 
 @kernel
