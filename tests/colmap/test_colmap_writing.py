@@ -185,8 +185,13 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
     assert triangulate(seed, original).num_points3D() == 120
 
 
-def test_images_that_had_no_pose_stay_without_one(tmp_path):
+def test_images_without_a_pose_stay_so_and_a_placed_one_without_a_center_is_refused_by_name(tmp_path):
     original, _ = ring_model()
+    model = read_model(original)
+    centers = model.centers.copy()
+    centers[4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
+        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
     original.deregister_frame(original.image(25).frame_id)
     seed, _ = seeded(original, batches=[])
     write_model(seed, tmp_path)
@@ -206,14 +211,6 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
     for image_id in (15, 25):
         own = [p.xy for p in original.image(image_id).points2D]
         np.testing.assert_array_equal([p.xy for p in seed.image(image_id).points2D], own)
-
-
-def test_a_placed_image_without_finite_centre_is_refused_by_name():
-    model = read_model(ring_model()[0])
-    centers = model.centers.copy()
-    centers[4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
-        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
 
 
 # --- triangulation --------------------------------------------------------------------------------------
@@ -272,29 +269,20 @@ def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
 
 
 @SOURCES
-def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
-    original, _ = ring_model(noise_px=3.0)
-    seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
-    copied = dump(triangulate(seed, tracks))
-    assert seed.num_points3D() == 0
-    structure = triangulate(seed, tracks, in_place=True)
-    assert structure is seed
-    assert dump(structure) == copied
-
-
-@SOURCES
-def test_twice_the_same_gives_the_same_bits(source):
+def test_the_same_gives_the_same_bits_again_and_in_place(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)
 
-    def run():
+    def run(in_place=False):
         seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
-        structure = color_points(triangulate(seed, tracks), original)
-        return dump(structure), dump(bundle_adjust(seed, tracks).reconstruction)
+        adjusted = dump(bundle_adjust(seed, tracks).reconstruction)
+        structure = triangulate(seed, tracks, in_place=in_place)
+        assert (structure is seed) == in_place == (seed.num_points3D() > 0)
+        return dump(color_points(structure, original)), adjusted
 
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
-    assert run() == first
+    assert run() == first == run(in_place=True)
 
 
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
@@ -327,17 +315,14 @@ def test_wrong_matches_make_no_point_that_misses_its_observations():
     assert max(reprojection_errors_px(structure)) <= 4.0
 
 
-def test_of_two_placed_images_every_match_is_kept_because_there_are_no_longer_tracks():
-    seed, graph = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
-    assert triangulate(seed, graph).num_points3D() == 120
-    assert bundle_adjust(seed, graph).num_points == 120
-
-
-def test_matches_that_only_two_images_share_are_left_out_unless_asked_for():
+def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_more_are_placed():
     seed, graph = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
     assert triangulate(seed, graph).num_points3D() == 0
     both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
     assert both.num_points3D() == 120
+    seed, graph = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
+    assert triangulate(seed, graph).num_points3D() == 120
+    assert bundle_adjust(seed, graph).num_points == 120
 
 
 def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_its_images():
@@ -350,15 +335,6 @@ def test_tracks_of_a_model_with_other_keypoints_are_refused():
     seed, _ = seeded(original, keypoints={0: np.ones((5, 2))}, batches=[])
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
-
-
-def test_a_source_without_colours_leaves_colours_as_they_are_and_costs_no_copy():
-    original, _ = ring_model()
-    structure = triangulate(seeded(original)[0], original)
-    for point in original.points3D.values():
-        point.color = np.zeros(3, dtype=np.uint8)
-    assert color_points(structure, original) is structure
-    assert all(point.color.any() for point in structure.points3D.values())
 
 
 def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
@@ -382,7 +358,7 @@ def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_share
         np.testing.assert_array_equal(point.color, [15, 20, 32])
 
 
-def test_colours_come_only_from_images_with_the_same_keypoints():
+def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_there_are_any():
     original, _ = ring_model()
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
@@ -390,6 +366,10 @@ def test_colours_come_only_from_images_with_the_same_keypoints():
         structure = color_points(triangulate(*seed_and_graph), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
+    for point in original.points3D.values():
+        point.color = np.zeros(3, dtype=np.uint8)
+    assert color_points(structure, original) is structure  # which costs no copy
+    assert all(point.color.any() for point in structure.points3D.values())
 
 
 # --- filters --------------------------------------------------------------------------------------------
@@ -431,14 +411,6 @@ def test_a_point_is_removed_that_is(xyz, image_ids, why):
     assert kept.num_points3D() == 120
 
 
-def test_a_point_far_away_stays_if_the_angle_asked_for_is_smaller_than_its_own():
-    # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
-    seed, point_id = with_one_more_point([-4000.0, 0.0, 0.0], [15, 75])
-    for angle_deg, stays in ((0.10, True), (0.14, False)):
-        kept = filter_points(seed, StructureOptions(min_triangulation_angle_deg=angle_deg))
-        assert kept.exists_point3D(point_id) == stays
-
-
 @pytest.mark.parametrize(("offset_px", "length"), [(3.9, 4), (4.1, 3)])
 def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offset_px, length):
     seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45, 65], offset_px)
@@ -461,12 +433,20 @@ def test_point_errors_are_those_of_the_observations_that_are_left():
     np.testing.assert_allclose([p.error for p in kept.points3D.values()], mean_px, rtol=1e-12)
 
 
-def test_tracks_shorter_than_asked_for_are_removed():
-    seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45])
-    assert filter_points(seed, StructureOptions(min_track_length=3)).exists_point3D(point_id)
-    kept = filter_points(seed, StructureOptions(min_track_length=4))
-    assert not kept.exists_point3D(point_id)
-    assert kept.num_points3D() == 120
+@pytest.mark.parametrize(
+    ("xyz", "image_ids", "option", "loose", "strict"),
+    [
+        # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
+        ([-4000.0, 0.0, 0.0], [15, 75], "min_triangulation_angle_deg", 0.10, 0.14),
+        ([0.3, 0.2, 0.1], [5, 25, 45], "min_track_length", 3, 4),
+    ],
+)
+def test_a_point_stays_if_what_is_asked_for_is_less_than_it_has(xyz, image_ids, option, loose, strict):
+    seed, point_id = with_one_more_point(xyz, image_ids)
+    for value in (loose, strict):
+        kept = filter_points(seed, StructureOptions(**{option: value}))
+        assert kept.exists_point3D(point_id) == (value == loose)
+        assert kept.num_points3D() == 120 + (value == loose)
 
 
 # --- bundle adjustment ----------------------------------------------------------------------------------
@@ -508,16 +488,12 @@ def test_adjusted_points_satisfy_the_same_filters():
     assert 1.0 < max(reprojection_errors_px(adjusted.reconstruction)) <= 1.5
 
 
-def test_too_few_iterations_are_reported_as_not_converged():
+def test_too_few_iterations_and_no_points_are_told():
     original, _ = ring_model(noise_px=0.5)
     seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
     adjusted = bundle_adjust(seed, graph, options=AdjustmentOptions(max_iterations=1))
     assert not adjusted.converged
     assert adjusted.iterations == 3
-
-
-def test_adjustment_without_any_point_says_what_to_do():
-    original, _ = ring_model()
     seed, graph = seeded(original, np.zeros((NUM_IMAGES, 3)))
     with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
         bundle_adjust(seed, graph)

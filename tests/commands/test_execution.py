@@ -69,11 +69,11 @@ def assert_same_bits(a, b):
 
 
 def test_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
-    with open_database(workspace / "database.db", model) as database:
-        ours = list(database.iter_matches(1))
-    with open_database(workspace / "database.db", from_posed_cameras(posed_cameras(model))) as database:
-        theirs = list(database.iter_matches(1))
-    for a, b in zip(ours, theirs, strict=True):
+    found = []
+    for one in (model, from_posed_cameras(posed_cameras(model))):
+        with open_database(workspace / "database.db", one) as database:
+            found.append(list(database.iter_matches(1)))
+    for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a.rays_i, b.rays_i)
         np.testing.assert_array_equal(a.rays_j, b.rays_j)
 

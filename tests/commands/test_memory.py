@@ -51,16 +51,13 @@ def test_more_work_never_needs_less_memory(name):
         assert forecast(replace(WORK, **{name: more}), economy).peak_mb >= forecast(WORK, economy).peak_mb
 
 
-def test_the_cheapest_economy_that_fits_is_taken_and_what_is_given_up_already_stays_so():
+def test_the_cheapest_economy_that_fits_is_taken_or_the_number_that_is_enough_is_told():
     for k, economy in enumerate(ECONOMIES):
         limit = forecast(WORK if economy.points else BARE, economy).peak_mb
         chosen = choose_economy(WORK, BARE, limit)
         assert ECONOMIES.index(chosen) <= k
         assert forecast(WORK if chosen.points else BARE, chosen).peak_mb <= limit
-    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]
-
-
-def test_a_limit_below_every_economy_is_refused_with_the_number_that_is_enough():
+    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]  # given up already
     with pytest.raises(InputError, match="raise it to") as refused:
         choose_economy(WORK, BARE, 100.0)
     needed = float(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
@@ -130,21 +127,18 @@ def workspaces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])
-def test_locate_refuses_a_limit_that_cannot_be_kept_and_keeps_the_one_that_it_names(workspaces, kind):
+def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_changes_nothing(
+    workspaces, kind
+):
     with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
         sfm_shapefit.locate(workspaces[kind], max_memory_mb=100)
     needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
     # The counts of the database alone do not know the graph, whose part is a few megabytes here.
-    found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=needed + 30)
-    usual = sfm_shapefit.locate(workspaces[kind])
+    limits = (needed + 30, 9000, 0)
+    found, limited, usual = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in limits)
     assert len(found.placement.cameras) == len(usual.placement.cameras)
     assert found.placement.refined.is_refined
     assert np.isfinite(found.placement.assessment.sigmas).all()
-
-
-@pytest.mark.parametrize("kind", ["plain", "rigs"])
-def test_a_limit_that_is_none_changes_nothing(workspaces, kind):
-    usual, limited = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in (0, 9000))
     np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
     assert limited.warnings == usual.warnings
 

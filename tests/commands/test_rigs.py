@@ -19,16 +19,11 @@ from tests.program import run
 from tests.scenes import RING, copied
 
 
-def drive(num_images, seed=0, **options):
-    return make_rig_drive(
-        SceneOptions(num_images=num_images, num_points=1500, max_pairs_per_image=12, seed=seed, **options)
-    )
-
-
 @pytest.fixture(scope="module")
 def rigs():
     """Twelve frames of two rigs, a fifth of the pairs wrong."""
-    return drive(36, corrupted_pair_fraction=0.2)
+    size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
+    return make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
 
 
 @pytest.fixture(scope="module")
@@ -186,7 +181,8 @@ def test_inspecting_says_how_many_frames_hang_together(workspace):
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "sparse" / "0")
+    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False), rigs)
+    model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
@@ -194,15 +190,10 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
         sfm_shapefit.locate(model, points="never")
 
 
-def write_and_return(rigs, folder):
-    write_workspace(rigs.scene, folder, WorkspaceOptions(database=False), rigs)
-    return folder
-
-
 @pytest.fixture
 def moved_ring(tmp_path):
     """The ring with true centres of five cameras, in a unit of 0.37 m, and the others at the origin."""
-    truth = read_model(RING / "truth") if (RING / "truth").exists() else read_model(RING / "sparse" / "0")
+    truth = read_model(RING / "sparse" / "0")
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]
     for k, image_id in enumerate(truth.image_ids.tolist()):
@@ -290,23 +281,17 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
         (None, "cannot be read; give a text file"),
+        ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
 )
-def test_a_file_of_names_that_fits_nothing_is_refused(tmp_path, text, message):
+def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_path, text, message):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    for frame in model.frames.values():
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     names = tmp_path / "names.txt"
     if text is not None:
         names.write_text(text)
     with pytest.raises(InputError, match=message):
-        sfm_shapefit.locate(RING / "sparse" / "0", fix=str(names))
-
-
-def test_fixed_cameras_without_positions_are_refused(tmp_path):
-    model = pycolmap.Reconstruction(RING / "sparse" / "0")
-    names = tmp_path / "names.txt"
-    names.write_text("\n".join(sorted(image.name for image in model.images.values())[:3]))
-    for frame in model.frames.values():
-        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
-    with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
         sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
 
 
