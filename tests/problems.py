@@ -117,6 +117,28 @@ def shape_error(locations: Floats, truth: Floats) -> float:
     return float(np.linalg.norm(shape(locations) - shape(truth)))
 
 
+def fit_angles(t: Floats, edges: npt.NDArray[np.int64], directions: Floats, steps: int) -> Floats:
+    """Return t (n, d) after Gauss-Newton steps on the sum of |u_e - v_e|^2, by dense algebra.
+
+    Steps are of least norm: translation and scale, which no direction tells, never move.
+    """
+    n, d = t.shape
+    row = np.arange(len(edges))
+    for _ in range(steps):
+        baselines = differences(t, edges)
+        u = normalized(baselines)
+        lengths = np.linalg.norm(baselines, axis=1)
+        slope = (np.eye(d) - u[:, :, None] * u[:, None, :]) / lengths[:, None, None]
+        jacobian = np.zeros((len(edges), d, n, d))
+        jacobian[row, :, edges[:, 0]] = slope
+        jacobian[row, :, edges[:, 1]] = -slope
+        normal = jacobian.reshape(-1, n * d)
+        # Shifts and the scale are free: their singular values are of rounding alone.
+        step = np.linalg.pinv(normal.T @ normal, rcond=1e-11, hermitian=True)
+        t = t - (step @ (normal.T @ (u - directions).ravel())).reshape(n, d)
+    return t
+
+
 def solve_admm(
     graph: ViewGraph,
     tol: float,

@@ -54,28 +54,15 @@ def spread_along(t, adjacency, directions):
     return worst
 
 
-def test_a_complete_graph_is_typical_for_the_p_of_the_definition():
+def test_complete_graphs_are_typical_and_those_apart_or_without_common_neighbors_are_not():
     t = graph_typicality(10, complete(10))
-    assert t.connected
-    assert t.degrees == (9, 9)
-    assert t.codegrees == (8, 8)
+    assert (t.connected, t.degrees, t.codegrees, t.p_high) == (True, (9, 9), (8, 8), 1.0)
     assert t.p_low == pytest.approx(np.sqrt(8 / 20))
-    assert t.p_high == 1.0
     assert t.holds
-
-
-def test_cameras_without_a_common_neighbour_make_a_graph_atypical():
-    ring = np.array([[i, (i + 1) % 8] for i in range(8)])
-    t = graph_typicality(8, ring)
-    assert t.connected
-    assert t.codegrees == (0, 1)
-    assert not t.holds
-
-
-def test_two_components_are_never_typical():
-    apart = np.concatenate([complete(5), complete(5) + 5])
-    assert not graph_typicality(10, apart).connected
-    assert not graph_typicality(10, apart).holds
+    ring = graph_typicality(8, np.array([[i, (i + 1) % 8] for i in range(8)]))
+    assert (ring.connected, ring.codegrees, ring.holds) == (True, (0, 1), False)
+    apart = graph_typicality(10, np.concatenate([complete(5), complete(5) + 5]))
+    assert (apart.connected, apart.holds) == (False, False)
 
 
 @pytest.mark.parametrize("d", [2, 3, 5])
@@ -221,27 +208,20 @@ def test_what_the_theorem_grants_is_recovered_exactly():
 
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
 @settings(max_examples=60, deadline=None)
-def test_stretching_two_sides_of_a_triangle_differently_turns_a_side(seed, d):
-    """Lemma `rigidity1`: unbalanced parallel motions of a triangle induce rotation."""
+def test_stretching_two_sides_differently_turns_a_side(seed, d):
+    """Lemmas `rigidity1` and `rigidity2`: of a triangle, and of a tetrahedron without a common corner."""
     rng = np.random.default_rng(seed)
-    t, v, alpha = rng.standard_normal((3, d)), rng.standard_normal((3, d)), rng.standard_normal()
-    turned, stretch = _motion(t, v, alpha)
-    bound = sine(t[0] - t[1], t[1] - t[2]) * np.linalg.norm(t[0] - t[1])
-    assert turned >= bound * abs(stretch[0, 1] - stretch[0, 2]) * (1 - 1e-9)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
-@settings(max_examples=60, deadline=None)
-def test_stretching_opposite_sides_of_a_tetrahedron_differently_turns_a_side(seed, d):
-    """Lemma `rigidity2`: the same for two sides without a common corner."""
-    rng = np.random.default_rng(seed)
-    t, v, alpha = rng.standard_normal((4, d)), rng.standard_normal((4, d)), rng.standard_normal()
-    turned, stretch = _motion(t, v, alpha)
-    beta = min(
-        sine(t[i] - t[j], t[i] - t[k]) for i, j, k in itertools.permutations(range(4), 3) if {j, k} != {0, 1}
-    )
-    bound = beta / 4.0 * np.linalg.norm(t[0] - t[1])
-    assert turned >= bound * abs(stretch[0, 1] - stretch[2, 3]) * (1 - 1e-9)
+    for corners, other in ((3, (0, 2)), (4, (2, 3))):
+        t, v, alpha = *rng.standard_normal((2, corners, d)), rng.standard_normal()
+        turned, stretch = _motion(t, v, alpha)
+        angles = (
+            sine(t[i] - t[j], t[i] - t[k])
+            for i, j, k in itertools.permutations(range(4), 3)
+            if corners == 4 and {j, k} != {0, 1}
+        )
+        beta = sine(t[0] - t[1], t[1] - t[2]) if corners == 3 else min(angles) / 4.0
+        bound = beta * np.linalg.norm(t[0] - t[1])
+        assert turned >= bound * abs(stretch[0, 1] - stretch[other]) * (1 - 1e-9)
 
 
 def _motion(t, v, alpha):

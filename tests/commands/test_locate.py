@@ -274,12 +274,18 @@ def test_images_that_are_not_in_the_database_or_have_no_rotation_are_named_and_t
         np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
 
 
-# Position errors in metres before bundle adjustment that issue-free runs reach with room to spare.
+# Position errors in metres before bundle adjustment that runs reach with room to spare, where the truth is.
 @pytest.mark.parametrize(
     ("name", "median", "mean"),
-    [("fountain-P11", 0.0025, 0.0026), ("castle-P19", 0.030, 0.095), ("castle-P30", 0.031, 0.036)],
+    [
+        ("fountain-P11", 0.0025, 0.0026),
+        ("castle-P19", 0.030, 0.095),
+        ("castle-P30", 0.031, 0.036),
+        pytest.param("Herz-Jesus-P8", np.inf, np.inf, marks=pytest.mark.slow),
+        pytest.param("Herz-Jesus-P25", np.inf, np.inf, marks=pytest.mark.slow),
+    ],
 )
-def test_real_scenes_are_placed_as_well_as_measured_before(name, median, mean):
+def test_real_scenes_are_placed_as_well_as_measured_before_and_no_camera_is_blamed(name, median, mean):
     scene = real_scene(name)
     found = sfm_shapefit.locate(scene / "sparse" / "0")
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
@@ -287,3 +293,4 @@ def test_real_scenes_are_placed_as_well_as_measured_before(name, median, mean):
     assert errors.position.median <= median
     assert errors.position.mean <= mean
     assert found.certified.gap <= 1e-8
+    assert all(row.placed and not row.reason for row in found.cameras)

@@ -117,13 +117,12 @@ def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept(
     assert few.num_tracks < tracks.num_tracks
 
 
-def test_no_matches_give_no_tracks_and_an_unchanged_graph():
-    tracks = Tracks(
-        offsets=np.zeros(1, dtype=np.int64), cameras=np.zeros(0, dtype=np.int64), rays=np.zeros((0, 3))
-    )
-    _, _, batch = scene()
-    assert build_tracks([], estimate_directions(batch), 2.0).num_tracks == 0
-    assert len(covering_set(tracks, 6)) == 0
+def test_two_views_and_no_matches_are_no_track():
+    _, _, batch = scene(cameras=2)
+    directions = estimate_directions(batch)
+    none = build_tracks([], directions, 2.0)
+    assert build_tracks([batch], directions, 2.0).num_tracks == none.num_tracks == 0
+    assert len(covering_set(none, 6)) == 0
 
 
 def test_a_covering_set_shows_every_camera_enough_points_or_all_there_are():
@@ -157,16 +156,9 @@ def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
     assert covering_set(tracks, 6, per_camera=1).tolist() == [1]  # shows all; the wider one, only three
 
 
-def test_two_views_are_no_track():
-    _, _, batch = scene(cameras=2)
-    assert tracks_of(batch).num_tracks == 0
-
-
 def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     centers, points, batch = scene()
     directions = estimate_directions(batch)
-    from sfm_shapefit.viewgraph import ViewGraph
-
     graph = ViewGraph(6, batch.pairs, directions.directions, names=[f"{k}.jpg" for k in range(6)])
     joint = join_points(graph, directions.covariance, tracks_of(batch), np.full(6, PIXEL), noise_px=2.0)
     assert joint.num_points == NUM_POINTS

@@ -1,6 +1,5 @@
 """Sparse linear algebra of graph Laplacians, against scipy's matrices and its splu."""
 
-import json
 import tracemalloc
 
 import numpy as np
@@ -107,22 +106,16 @@ def splu_solution(laplacian: csc_array, block: int, rhs: Array) -> Array:
 
 
 @pytest.mark.parametrize("block", [1, 2, 3])
-def test_assembly_by_slots_equals_the_product_of_incidence_matrices(block):
+def test_assembly_by_slots_equals_the_product_of_incidence_matrices_into_given_memory_too(block):
     n, edges, _ = family("er")
-    w = weights_of(edges, block, 1)
-    matrix = assemble(laplacian_pattern(n, edges), w)
+    pattern, w = laplacian_pattern(n, edges), weights_of(edges, block, 1)
+    matrix = assemble(pattern, w)
     difference = np.abs((csc_array(matrix) - reference_laplacian(n, edges, w)).toarray()).max()
     assert difference <= 50 * EPS * np.abs(matrix.data).max()
-
-
-def test_assembly_into_given_memory_forgets_the_old_weights():
-    n, edges, _ = family("er")
-    pattern = laplacian_pattern(n, edges)
-    first = assemble(pattern, random_weights(len(edges), 1))
-    w = random_weights(len(edges), 2)
-    again = assemble(pattern, w, out=first.data)
-    assert again.data is first.data or np.shares_memory(again.data, first.data)
-    np.testing.assert_array_equal(again.toarray(), assemble(pattern, w).toarray())
+    other = assemble(pattern, weights_of(edges, block, 2))
+    again = assemble(pattern, w, out=other.data)
+    assert np.shares_memory(again.data, other.data)
+    np.testing.assert_array_equal(again.toarray(), matrix.toarray())
 
 
 @pytest.mark.parametrize(
@@ -263,18 +256,13 @@ def test_a_pendant_camera_makes_the_projected_laplacian_singular_and_is_named():
     factorize(analyze(n, edges[:-1]), projectors[:-1])  # without it, all is well
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -1e3])
-def test_a_bad_weight_is_refused(bad):
-    n, edges, _ = family("er")
-    w = random_weights(len(edges), 1)
-    w[7] = bad
-    with pytest.raises(UnsolvableError, match="weights are not positive"):
-        factorize(analyze(n, edges), w)
-
-
-def test_weights_and_right_hand_sides_of_the_wrong_shape_are_refused():
+def test_bad_weights_and_arrays_of_the_wrong_shape_are_refused():
     n, edges, _ = family("er")
     factor = factorize(analyze(n, edges), random_weights(len(edges), 1))
+    for bad in (np.nan, np.inf, -1e3):
+        weights = np.where(np.arange(len(edges)) == 7, bad, random_weights(len(edges), 1))
+        with pytest.raises(UnsolvableError, match="weights are not positive"):
+            factor.refactor(weights)
     with pytest.raises(ValueError, match="weights have shape"):
         factor.refactor(np.ones(3))
     with pytest.raises(ValueError, match="rhs has shape"):
@@ -544,35 +532,22 @@ def test_the_projected_laplacian_is_solved_with_the_scalar_factor():
 
 
 CHILD = """
-import hashlib, json, sys, time
+import hashlib
 import numpy as np
-from sfm_shapefit.solver.program import differences
 from tests.graph_families import geo, random_weights
 from sfm_shapefit.laplacian.cholesky import analyze, factorize
 edges, t = geo(2000, 20.0, 1)
-begin = time.process_time()
 plan = analyze(2000, edges, "minimum-degree")
-factor = factorize(plan, random_weights(len(edges), 1), np.dtype(sys.argv[1]))
-answer = hashlib.sha256(factor.solve(t - t.mean(axis=0)).tobytes()).hexdigest()
-print(json.dumps({"seconds": time.process_time() - begin, "answer": answer}))
+for dtype in (np.float32, np.float64):
+    factor = factorize(plan, random_weights(len(edges), 1), dtype)
+    print(hashlib.sha256(factor.solve(t - t.mean(axis=0)).tobytes()).hexdigest())
 """
 
 
-def run_child(dtype: str, blas_threads: int, **environment: str) -> dict:
-    done = run_python("-c", CHILD, dtype, OPENBLAS_NUM_THREADS=str(blas_threads), **environment)
-    return json.loads(done.stdout)
-
-
-@pytest.mark.slow
-def test_compiled_code_is_cached_and_the_cache_does_not_change_a_bit(tmp_path):
-    compiling, cached = (run_child("float64", 1, NUMBA_CACHE_DIR=str(tmp_path)) for _ in range(2))
-    assert compiling["answer"] == cached["answer"]
-    assert cached["seconds"] < 0.2 * compiling["seconds"]
-
-
-@pytest.mark.parametrize("dtype", ["float32", "float64"])
-def test_blas_threads_do_not_change_a_bit(dtype):
-    assert run_child(dtype, 1)["answer"] == run_child(dtype, 2)["answer"]
+def test_blas_threads_do_not_change_a_bit():
+    one, two = (run_python("-c", CHILD, OPENBLAS_NUM_THREADS=str(threads)).stdout for threads in (1, 2))
+    assert one == two
+    assert len(set(one.split())) == 2
 
 
 def test_blas_threads_are_restored_after_nested_limits():

@@ -34,11 +34,8 @@ def commands(out):
     }
 
 
-def test_the_schema_is_one():
+def test_the_schema_is_one_and_the_shipped_one_is_that_which_is_generated():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-
-
-def test_the_shipped_schema_is_the_one_that_is_generated():
     assert schema_text() == PATH.read_text("utf-8"), "run python -m sfm_shapefit.results.schema"
 
 

@@ -51,15 +51,12 @@ def test_a_pair_has_one_column_per_dimension(tmp_path, dimension, axes):
     assert len(header) == len(cells)
 
 
-def test_bytes_that_are_no_utf8_come_back_from_the_json(tmp_path):
+def test_bytes_that_are_no_utf8_come_back_from_the_json_and_are_escaped_in_a_table(tmp_path):
     text = dumps({"path": NOT_UTF8, "name": "é"})
     write_json({"path": NOT_UTF8, "name": "é"}, tmp_path / "out.json")
     assert (tmp_path / "out.json").read_bytes() == text.encode("utf-8") + b"\n"
     assert "é" in text
     assert os.fsencode(json.loads(text)["path"]) == b"mod\xe8le"
-
-
-def test_bytes_that_are_no_utf8_are_escaped_in_a_table(tmp_path):
     write_rows([CameraRow(name=NOT_UTF8)], CameraRow, 3, tmp_path / "cameras.csv")
     assert lines_of(tmp_path / "cameras.csv")[1][0] == r"mod\udce8le"
 

@@ -201,14 +201,11 @@ def turned_courtyard():
     return with_turned_cameras(model, turns).reconstruction
 
 
-def located(model, **options):
-    found = sfm_shapefit.locate(model, COURTYARD / "database.db", **options)
-    return found, sfm_shapefit.evaluate(found.reconstruction, COURTYARD / "truth")
-
-
-def test_refined_rotations_are_closer_to_the_truth_and_so_are_the_cameras(turned_courtyard):
-    _, plain = located(turned_courtyard)
-    found, refined = located(turned_courtyard, refine_rotations=True)
+def test_refined_rotations_are_closer_to_the_truth_and_others_stay_to_the_bit(turned_courtyard):
+    database, truth = COURTYARD / "database.db", COURTYARD / "truth"
+    usual = sfm_shapefit.locate(turned_courtyard, database)
+    found = sfm_shapefit.locate(turned_courtyard, database, refine_rotations=True)
+    plain, refined = (sfm_shapefit.evaluate(one.reconstruction, truth) for one in (usual, found))
     assert refined.rotation_deg.median < 0.25 * plain.rotation_deg.median
     assert refined.position.median < 0.5 * plain.position.median
     assert refined.rotation_deg.max <= plain.rotation_deg.max
@@ -217,22 +214,14 @@ def test_refined_rotations_are_closer_to_the_truth_and_so_are_the_cameras(turned
     assert told["num_updated"] == np.count_nonzero(found.turned_deg) > 15
     assert 0.1 < told["median_change_deg"] < 1.0
     assert told["max_change_deg"] == found.turned_deg.max()
-
-
-def test_without_being_asked_no_rotation_changes(turned_courtyard):
-    found, _ = located(turned_courtyard)
-    assert found.turned_deg is None
-    assert found.summary()["rotation_refinement"] is None
-    for image_id, image in found.reconstruction.images.items():
-        given = turned_courtyard.image(image_id).cam_from_world().rotation.quat
-        np.testing.assert_array_equal(image.cam_from_world().rotation.quat, given)
-
-
-def test_a_kept_rotation_is_the_inputs_to_the_bit(turned_courtyard):
-    found, _ = located(turned_courtyard, refine_rotations=True)
+    assert usual.turned_deg is None
+    assert usual.summary()["rotation_refinement"] is None
     for image_id, turned in zip(found.model.image_ids.tolist(), found.turned_deg > 0.0, strict=True):
-        given = turned_courtyard.image(image_id).cam_from_world().rotation.quat
-        ours = found.reconstruction.image(image_id).cam_from_world().rotation.quat
+        given, kept, ours = (
+            one.image(image_id).cam_from_world().rotation.quat
+            for one in (turned_courtyard, usual.reconstruction, found.reconstruction)
+        )
+        np.testing.assert_array_equal(kept, given)
         assert np.array_equal(ours, given) is not bool(turned)
 
 

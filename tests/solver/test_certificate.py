@@ -320,13 +320,18 @@ def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
-def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
-    graph = draw_family("seq", 300, 36, q=0.1)
-    result = solve_hybrid(graph, 1e-8, 2000)
+def test_the_hybrid_leaves_a_collapsing_chain_to_newton_whose_steps_are_counted_on_and_can_be_cancelled():
+    graph, seen = draw_family("seq", 300, 36, q=0.1), []
+    result = solve_hybrid(graph, 1e-8, 2000, on_iteration=seen.append)
     assert result.stop is HybridStop.NEWTON
     assert result.factorizations > 0
     assert result.certificate.gap <= 1e-8
     assert solve_hybrid(graph, 1e-8, 2000, Resources(memory_bytes=300_000)).stop is HybridStop.TOO_LARGE
+    assert len(seen) == result.iterations + result.factorizations
+    assert [info.iteration for info in seen[: result.iterations + 1]] == list(range(1, result.iterations + 2))
+    last = result.iterations + 2
+    cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < last)
+    assert (cancelled.stop, cancelled.factorizations) == (HybridStop.CANCELLED, 2)
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
@@ -363,17 +368,6 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
     assert_feasible(graph, within)
     monkeypatch.setattr(certificate, "_restore_exactly", None)  # out of reach, it comes to no exact repair
     assert certify_within(0.3 * whole.gap) is None
-
-
-def test_newton_steps_are_counted_on_and_can_be_cancelled():
-    graph, seen = draw_family("seq", 300, 36, q=0.1), []
-    result = solve_hybrid(graph, 1e-8, 2000, on_iteration=seen.append)
-    assert result.stop is HybridStop.NEWTON
-    assert len(seen) == result.iterations + result.factorizations
-    assert [info.iteration for info in seen[: result.iterations + 1]] == list(range(1, result.iterations + 2))
-    last = result.iterations + 2
-    cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < last)
-    assert (cancelled.stop, cancelled.factorizations) == (HybridStop.CANCELLED, 2)
 
 
 @pytest.mark.parametrize("cheap", [True, False])

@@ -71,7 +71,10 @@ def test_rendered_scenes_have_workspaces_too(rendered_scene_of, workspace_of):
     scene = rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small)
     assert rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small) is scene
     folder = workspace_of(scene, WorkspaceOptions(database=False))
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "sparse"]
     assert len(list((folder / "images").iterdir())) == 2
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    assert (model.num_reg_images(), model.num_points3D()) == (2, 0)
 
 
 def test_graphs_have_the_corruption_asked_for(random_graph, graph_of, street_graph):

@@ -14,14 +14,13 @@ from sfm_shapefit.synthetic import (
     RenderedScene,
     RenderOptions,
     SceneOptions,
-    WorkspaceOptions,
     draw_image,
     make_rendered_scene,
     make_scene,
     project_distorted,
     surface_points,
 )
-from sfm_shapefit.synthetic.rendered_workspace import judge_matches, write_rendered_workspace
+from sfm_shapefit.synthetic.rendered_workspace import judge_matches
 from sfm_shapefit.synthetic.surfaces import Surfaces
 from tests.program import run
 from tests.scenes import BUNDLED
@@ -258,15 +257,7 @@ def test_the_bundled_photographed_scene_is_what_its_command_makes(tmp_path):
     assert one.compute_num_observations() == pytest.approx(two.compute_num_observations(), rel=0.05)
 
 
-def test_without_a_database_there_are_images_and_poses_only(tmp_path):
-    tiny = replace(SMALL, shape="ring", num_images=2, image_width=64, image_height=48, focal_length_px=60.0)
-    write_rendered_workspace(make_rendered_scene(tiny), tmp_path / "out", WorkspaceOptions(database=False))
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["images", "sparse"]
-    model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
-    assert (model.num_reg_images(), model.num_points3D()) == (2, 0)
-
-
-def test_synth_draws_images_on_request_and_says_how_many_pairs_are_wrong(tmp_path):
+def test_synth_draws_images_on_request_and_refuses_options_of_drawing_without_it(tmp_path):
     flags = (
         "--shape facade --num-images 3 --image-width 240 --image-height 180 --focal-length-px 200 --images"
     )
@@ -274,9 +265,6 @@ def test_synth_draws_images_on_request_and_says_how_many_pairs_are_wrong(tmp_pat
     assert "of which 0 wrong" in done.output
     assert len(list((tmp_path / "out/images").iterdir())) == 3
     assert (tmp_path / "out/database.db").exists()
-
-
-def test_synth_refuses_options_of_drawing_without_images(tmp_path):
-    done = run("synth", tmp_path / "out", "--gray-noise", "1", code=3)
+    done = run("synth", tmp_path / "none", "--gray-noise", "1", code=3)
     assert "need --images" in done.output
-    assert not (tmp_path / "out").exists()
+    assert not (tmp_path / "none").exists()
