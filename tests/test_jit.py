@@ -45,10 +45,7 @@ def test_a_kernel_that_closes_over_a_value_is_refused():
     """Its key in the cache on disk would hold that value: for another kernel, one of this process only."""
     factor = 2
     with pytest.raises(TypeError, match="closes over a value"):
-
-        @kernel()
-        def scale(x):
-            return factor * x
+        kernel()(lambda x: factor * x)
 
 
 RUN_COMMANDS = """

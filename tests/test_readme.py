@@ -1,19 +1,15 @@
 """What README and docs say runs as it stands: commands one after the other, Python blocks, and every link."""
 
 import ast
-import os
 import re
 import shlex
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pycolmap
 import pytest
 
 from sfm_shapefit.cli import app
-from tests.program import run, run_python
+from tests.program import run, run_python, viewing
 from tests.scenes import COURTYARD, RING, ROOT
 
 README = ROOT / "README.md"
@@ -56,26 +52,6 @@ def test_every_python_example_of_the_docs_runs(page, number):
     assert done.stdout
 
 
-def viewed(arguments: list[str], folder: Path) -> None:
-    """Start the viewer, wait until it serves, and end it as a user does."""
-    pytest.importorskip("viser")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sfm_shapefit.cli", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert re.match(r"http://127\.0\.0\.1:\d+ ", process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
-    finally:
-        process.kill()
-        process.communicate()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in PAGES if commands_of(page)], ids=lambda page: page.name)
 def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
@@ -92,7 +68,9 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
     for command in commands_of(page):
         arguments = shlex.split(command)
         if arguments[0] == "view":
-            viewed(arguments, tmp_path)
+            pytest.importorskip("viser")
+            with viewing(*arguments[1:], cwd=tmp_path) as address:
+                assert re.match(r"http://127\.0\.0\.1:\d+", address)
             continue
         result = run(*arguments)
         assert result.exit_code == 0, f"{command}\n{result.output}"
@@ -103,22 +81,14 @@ def test_every_command_of_the_program_stands_in_the_readme():
     assert shown == {info.name for info in app.registered_commands if not info.hidden}
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_file_that_a_page_points_to_exists(page):
-    text = page.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
-        assert (page.parent / target).exists(), target
-    for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text):
-        assert (ROOT / script).exists(), script
-
-
-def test_every_page_of_the_docs_is_pointed_to():
-    targets = {
-        (page.parent / target).resolve()
-        for page in PAGES
-        for target in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text(encoding="utf-8"))
-    }
-    assert set(PAGES[1:]) <= targets
+def test_every_file_that_a_page_points_to_exists_and_every_page_is_pointed_to():
+    pointed_to = set()
+    for page, text in TEXTS.items():
+        targets = {(page.parent / target).resolve() for target in re.findall(r"\]\((?!http)([^)]+)\)", text)}
+        scripts = {ROOT / script for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text)}
+        assert [path for path in targets | scripts if not path.exists()] == [], page
+        pointed_to |= targets
+    assert set(PAGES[1:]) <= pointed_to
 
 
 def strings_of(tree: ast.AST) -> list[str]:

@@ -16,7 +16,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.graph_text import read_graph
 from tests.program import run, run_python
-from tests.scenes import RING, ROOT, copied
+from tests.scenes import RING, ROOT, copied, edit_database
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
 FORBIDDEN_IMPORTS = {
@@ -108,10 +108,8 @@ COMPUTED = {
 @pytest.mark.parametrize("kind", COMPUTED)
 def test_a_table_whose_rows_are_computed_is_refused(tmp_path, kind):
     scene = copied(RING, tmp_path)
-    with sqlite3.connect(scene / "database.db") as connection:
-        connection.execute("ALTER TABLE images RENAME TO real")
-        connection.execute(COMPUTED[kind].format("images"))
-    connection.close()
+    rename = "ALTER TABLE images RENAME TO real"
+    edit_database(scene / "database.db", rename, COMPUTED[kind].format("images"))
     with (
         pytest.raises(InputError, match="is not a COLMAP database: its images"),
         open_database(scene / "database.db", read_model(scene / "sparse" / "0")),

@@ -18,7 +18,7 @@ from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, wor
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from tests.scenes import fingerprint, real_scene
+from tests.scenes import edit_database, fingerprint, real_scene
 
 EPS = np.finfo(np.float64).eps
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
@@ -561,19 +561,6 @@ def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=Non
     )
 
 
-def edited(path: Path, *statements) -> Path:
-    """Run SQL on a database that a test owns."""
-    connection = sqlite3.connect(path)
-    for statement in statements:
-        if callable(statement):
-            statement(connection)
-        else:
-            connection.execute(*statement) if isinstance(statement, tuple) else connection.execute(statement)
-    connection.commit()
-    connection.close()
-    return path
-
-
 def read_all(path: Path, model):
     """Read everything a database offers."""
     with open_database(path, model) as database:
@@ -647,7 +634,7 @@ def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
         add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
         add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
 
-    with open_database(edited(path, change), model) as database:
+    with open_database(edit_database(path, change), model) as database:
         batch = next(database.iter_matches(3))
     assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
     assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
@@ -662,7 +649,7 @@ def test_only_configurations_with_verified_matches_or_poses_are_used(path, model
         for config, (a, b) in enumerate(pairs):
             add_pair(connection, a, b, [(0, 0), (1, 1)], config=config, pose=pose)
 
-    matches, poses = read_all(edited(path, change), model)
+    matches, poses = read_all(edit_database(path, change), model)
     config_of = {(a - 1, b - 1): config for config, (a, b) in enumerate(pairs)}
     assert [config_of[pair] for pair in matches] == [2, 3, 4, 5, 6, 8, 9]
     assert poses.configs.tolist() == [2, 3, 4, 6, 9]
@@ -687,7 +674,7 @@ def test_poses_that_mean_none_are_left_out(path, model):
         for (qvec, tvec), (a, b) in zip([*absent, (one, step)], pairs, strict=False):
             add_pair(connection, a, b, [(0, 0)], qvec=qvec, tvec=tvec)
 
-    matches, poses = read_all(edited(path, change), model)
+    matches, poses = read_all(edit_database(path, change), model)
     assert len(matches) == len(absent) + 1
     assert len(poses.pairs) == 1
     np.testing.assert_array_equal(poses.translations, [[1.0, 0.0, 0.0]])
@@ -695,7 +682,7 @@ def test_poses_that_mean_none_are_left_out(path, model):
 
 def test_an_old_database_without_pose_columns_has_no_relative_poses(path, model):
     drop = "ALTER TABLE two_view_geometries DROP COLUMN "
-    matches, poses = read_all(edited(path, drop + "qvec", drop + "tvec", "DROP TABLE cameras"), model)
+    matches, poses = read_all(edit_database(path, drop + "qvec", drop + "tvec", "DROP TABLE cameras"), model)
     assert len(matches) == 15
     assert poses.pairs.shape == (0, 2)
     assert poses.rotations.shape == (0, 3, 3)
@@ -720,13 +707,13 @@ def assert_poses_point_to_the_first_camera(poses, model):
 
 
 def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
-    edited(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
+    edit_database(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
     with open_database(path, model) as database:
         assert database.unmatched_names == (model.names[1],)
         assert database.keypoints(1).shape == (0, 2)
         assert not any(1 in pair for pair in as_sets(database.iter_matches(1)))
         assert database.num_pairs == 10
-    edited(path, "UPDATE images SET name = 'other/' || name")
+    edit_database(path, "UPDATE images SET name = 'other/' || name")
     first = model.names[0]
     message = rf"has 0 of the model's 6 images: the model's {first} .*database's other/.*not in the model"
     with pytest.raises(InputError, match=message), open_database(path, model):
@@ -769,14 +756,14 @@ BROKEN_ROWS = {
 def test_a_broken_row_is_named(path, model, case):
     statement, message = BROKEN_ROWS[case]
     with pytest.raises(InputError, match=message) as caught:
-        read_all(edited(path, statement), model)
+        read_all(edit_database(path, statement), model)
     assert str(path) in str(caught.value)
 
 
 def test_files_that_are_no_database_are_refused(model, tmp_path):
     (tmp_path / "empty").touch()
     (tmp_path / "garbage").write_bytes(bytes(range(256)) * 40)
-    edited(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
+    edit_database(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
     for name, message in (
         ("missing", "does not exist"),
         (".", "is a folder"),
@@ -809,7 +796,7 @@ def test_a_locked_database_is_refused_in_seconds(path, model):
 
 @pytest.mark.parametrize("journal_mode", ["delete", "wal", "persist", "truncate"])
 def test_reading_changes_no_byte_and_leaves_no_file(path, model, journal_mode):
-    edited(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
+    edit_database(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
     before = fingerprint(path.parent)
     assert len(read_all(path, model)[0]) == 15
     assert fingerprint(path.parent) == before

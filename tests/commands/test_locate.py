@@ -2,8 +2,6 @@
 
 import csv
 import json
-import sqlite3
-from contextlib import closing
 
 import numpy as np
 import pycolmap
@@ -17,7 +15,7 @@ from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
-from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
+from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint, real_scene
 
 
 @pytest.fixture(scope="module")
@@ -198,10 +196,9 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
 def ring_with_pairs(folder, wanted):
     """A copy of the ring whose database keeps the two-view geometries of the pairs that are wanted."""
     scene = copied(RING, folder)
-    with closing(sqlite3.connect(scene / "database.db")) as connection, connection:
-        for (pair_id,) in connection.execute("SELECT pair_id FROM two_view_geometries").fetchall():
-            if not wanted(*divmod(pair_id, 2147483647)):
-                connection.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id,))
+    pairs = [(i, j) for j in range(2, 9) for i in range(1, j) if not wanted(i, j)]
+    ids = ", ".join(str(2147483647 * i + j) for i, j in pairs)
+    edit_database(scene / "database.db", f"DELETE FROM two_view_geometries WHERE pair_id IN ({ids})")
     return scene / "sparse" / "0"
 
 

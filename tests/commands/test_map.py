@@ -1,8 +1,6 @@
 """`map`: from a database alone to models, one for each component, with rotations the matches agree with."""
 
 import json
-import sqlite3
-from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +15,7 @@ from sfm_shapefit.commands.stages.averaging import averaged
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from tests.program import run
-from tests.scenes import COURTYARD, RING, copied, fingerprint
+from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
 PAIR = 2147483647
 FAST = {"points": "never", "refine_rotations": False}
@@ -25,11 +23,7 @@ FAST = {"points": "never", "refine_rotations": False}
 
 def changed(scene, folder, *statements):
     """A copy of a scene's database after some SQL."""
-    path = copied(scene, folder) / "database.db"
-    with closing(sqlite3.connect(path)) as connection, connection:
-        for statement in statements:
-            connection.execute(statement)
-    return path
+    return edit_database(copied(scene, folder) / "database.db", *statements)
 
 
 def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):

@@ -187,17 +187,12 @@ def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
     assert worst_error(placed.locations, problem.locations) < 0.01
 
 
-def test_without_a_filter_nothing_is_dropped():
+def test_without_a_filter_nothing_is_dropped_and_large_graphs_are_refused_by_l_inf(monkeypatch):
     _, graph = corrupted()
     assert place(graph, PlacementOptions(objective="shapefit")).dropped.tolist() == []
-
-
-def test_large_graphs_are_refused_by_l_inf():
-    _, graph = corrupted()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linf, "_MOST_PAIRS", 10)
-        with pytest.raises(UnsolvableError, match="at most 10 pairs"):
-            linf.locate_linf(graph)
+    monkeypatch.setattr(linf, "_MOST_PAIRS", 10)
+    with pytest.raises(UnsolvableError, match="at most 10 pairs"):
+        linf.locate_linf(graph)
 
 
 @pytest.mark.slow

@@ -1,6 +1,5 @@
 """Directions from matches and known rotations, on pairs whose true direction is known."""
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -105,23 +104,28 @@ def test_wrong_matches_inside_the_list_do_not_move_the_direction(wrong, count, m
     assert errors.max() < max_deg
 
 
-def test_two_motions_in_one_list_give_the_direction_of_the_larger_one():
+def test_two_motions_in_one_list_give_the_direction_of_the_larger_one_or_none_if_alike():
     larger, smaller = make_pair(4, count=140), make_pair(5, count=60, baseline=(0.0, 1.0, 0.3))
-    mixed = tuple(np.concatenate([larger[k], smaller[k]]) for k in (0, 1))
-    found = estimate([mixed])
+    found = estimate([tuple(np.concatenate([larger[k], smaller[k]]) for k in (0, 1))])
     assert found.status == [DirectionStatus.USABLE]
     assert angle_between_deg(found.directions[0], larger[2]) < 0.01  # soft weights keep a trace of the rest
+    pairs = []
+    for seed in range(20):
+        one = make_pair(seed, count=100, noise_px=0.5)
+        other = make_pair(seed + 50, count=80, noise_px=0.5, baseline=(0.0, 1.0, 0.3))
+        pairs.append(tuple(np.concatenate([one[k], other[k]]) for k in (0, 1)))
+    assert set(estimate(pairs).status) == {DirectionStatus.TWO_MOTIONS}
+    lenient = estimate(pairs, DirectionOptions(max_rival_share=1.0))
+    assert set(lenient.status) == {DirectionStatus.USABLE}
+    assert all(60 < rivals <= 80 for rivals in lenient.num_rivals)
 
 
-def test_identical_rays_and_empty_lists_give_no_direction():
+def test_identical_rays_empty_lists_and_random_matches_give_no_direction():
     rays = make_pair(6)[0]
     found = estimate([(rays, rays), (rays[:0], rays[:0]), (rays[:4], rays[:4])])
     few = DirectionStatus.TOO_FEW_MATCHES
     assert found.status == [DirectionStatus.NO_PARALLAX, few, few]
     assert np.isnan(found.directions).all()
-
-
-def test_random_matches_are_recognised_by_their_inlier_ratio():
     pairs = []
     for seed in range(20):
         rays_i, rays_j, _ = make_pair(seed, count=60)
@@ -170,18 +174,6 @@ def test_little_parallax_does_not_pull_the_direction_towards_the_view():
     pairs = [make_pair(seed, noise_px=0.7, count=80, baseline=(0.06, 0.0, 0.02)) for seed in range(200)]
     along_view_deg = np.degrees(np.arcsin(estimate(pairs).directions[:, 2]) - np.arcsin(pairs[0][2][2]))
     assert abs(along_view_deg.mean()) < 4.0 * along_view_deg.std() / np.sqrt(len(pairs))
-
-
-def test_two_motions_of_one_size_are_no_direction():
-    pairs = []
-    for seed in range(20):
-        one = make_pair(seed, count=100, noise_px=0.5)
-        other = make_pair(seed + 50, count=80, noise_px=0.5, baseline=(0.0, 1.0, 0.3))
-        pairs.append(tuple(np.concatenate([one[k], other[k]]) for k in (0, 1)))
-    assert set(estimate(pairs).status) == {DirectionStatus.TWO_MOTIONS}
-    lenient = estimate(pairs, DirectionOptions(max_rival_share=1.0))
-    assert set(lenient.status) == {DirectionStatus.USABLE}
-    assert all(60 < rivals <= 80 for rivals in lenient.num_rivals)
 
 
 def make_facade(seed, shifted):
@@ -293,19 +285,15 @@ def directions_with(sigmas_deg, ratios, directions=None, edges=None) -> PairDire
     )
 
 
-def test_weights_fall_with_uncertainty_and_with_contradicting_matches():
+def test_weights_fall_with_uncertainty_and_contradicting_matches_and_without_a_direction_there_is_none():
     weights = directions_with([0.0, 0.0, 0.0, 0.15, 90.0], [1.0, 1.0, 0.5, 1.0, 1.0]).weights()
     # Relative to the median, 1 / sqrt(1 + 3^2) = 0.316: 1, 1, 1/4, 0.316, and 5e-4 raised to the floor.
     expected = [np.sqrt(10.0), np.sqrt(10.0), np.sqrt(10.0) / 4.0, 1.0, 0.02]
     np.testing.assert_allclose(weights, expected, rtol=1e-12)
-
-
-def test_pairs_without_a_direction_have_no_weight_and_unknown_uncertainty_counts_as_none():
-    found = directions_with([0.0, np.nan, 0.1], [1.0, 1.0, 1.0])
-    found = dataclasses.replace(found, status=[*found.status[:2], DirectionStatus.FEW_INLIERS])
+    found = directions_with([0.0, np.nan, 0.1], [1.0, 1.0, 1.0])  # an unknown uncertainty counts as none
+    found = replace(found, status=[*found.status[:2], DirectionStatus.FEW_INLIERS])
     np.testing.assert_array_equal(found.weights(), [1.0, 1.0, np.nan])
-    nothing = dataclasses.replace(found, status=[DirectionStatus.NO_PARALLAX] * 3)
-    assert np.isnan(nothing.weights()).all()
+    assert np.isnan(replace(found, status=[DirectionStatus.NO_PARALLAX] * 3).weights()).all()
 
 
 def test_weights_make_the_locations_of_uneven_pairs_better():
@@ -339,7 +327,7 @@ def test_more_hypotheses_survive_more_wrong_matches():
     pairs = [make_pair(seed, count=150, noise_px=0.3, wrong=0.75) for seed in range(20)]
 
     def failures(num_hypotheses):
-        found = estimate(pairs, dataclasses.replace(options, num_hypotheses=num_hypotheses))
+        found = estimate(pairs, replace(options, num_hypotheses=num_hypotheses))
         return np.sum(~(errors_deg(found, pairs) < 5.0))
 
     assert failures(400) < failures(5)

@@ -50,22 +50,16 @@ def test_the_input_gauge_is_recovered_without_turning_the_axes_in_spite_of_a_few
     assert input_gauge(wild_answer, wild_input).similarity.scale == pytest.approx(7.0, rel=1e-6)
 
 
-@pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6)])
-def test_without_input_centres_the_scale_is_unit_and_said_so(centers):
+@pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6), -cameras(10)])
+def test_without_input_centers_or_with_contradicting_ones_the_scale_is_unit(centers):
     t = cameras(10)
     gauge = input_gauge(t, centers)
     placed = gauge.similarity.apply(t)
     assert gauge.scale == "unit"
-    assert "coincide" in gauge.statement
+    assert ("coincide" in gauge.statement) == (np.ptp(centers) == 0.0)
+    assert gauge.similarity.scale > 0.0
     np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-12)
     assert np.median(np.linalg.norm(placed, axis=1)) == pytest.approx(1.0, rel=1e-12)
-
-
-def test_centres_that_contradict_the_answer_do_not_turn_it_inside_out():
-    t = cameras(11)
-    gauge = input_gauge(t, -t)
-    assert gauge.scale == "unit"
-    assert gauge.similarity.scale > 0.0
 
 
 def test_a_known_distance_becomes_true():
@@ -130,12 +124,11 @@ def test_priors_on_a_line_keep_the_axes_and_say_so():
         (np.full((12, 3), 4.0), None, "coincide"),
     ],
 )
-def test_too_few_priors_and_those_at_one_place_are_refused(positions, rows, message):
+def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_warned_about(
+    positions, rows, message
+):
     with pytest.raises(InputError, match=message):
         prior_gauge(cameras(5), priors_of(positions, rows=rows))
-
-
-def test_priors_that_have_nothing_to_do_with_the_cameras_are_warned_about():
     assert "rough; check them" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
 
 

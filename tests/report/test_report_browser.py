@@ -117,17 +117,13 @@ def test_tables_sort_filter_and_turn_pages(driver, report):
     ]
 
 
-def test_layers_can_be_switched(driver, report):
+def test_layers_and_the_theme_can_be_switched_and_the_plots_follow(driver, report):
     box = driver.find_element("css selector", "[data-layer=contradicts]")
     driver.execute_script("arguments[0].click()", box)
-    shown = (
-        "return document.getElementById('scene').data.filter((t) => t.kind === 'pair').map((t) => t.visible)"
-    )
+    scene = "return document.getElementById('scene')"
+    shown = f"{scene}.data.filter((t) => t.kind === 'pair').map((t) => t.visible)"
     assert driver.execute_script(shown) == [True, False, True, False]
-
-
-def test_the_theme_can_be_switched_and_the_plots_follow(driver, report):
-    paper = "return document.getElementById('scene').layout.paper_bgcolor"
+    paper = f"{scene}.layout.paper_bgcolor"
     light = driver.execute_script(paper)
     driver.execute_script("document.getElementById('theme').click()")
     assert driver.execute_script(paper) != light

@@ -68,13 +68,14 @@ def test_cameras_stand_by_trust_and_contradicting_pairs_first(page):
     assert (np.diff(unpacked(data["pairs"]["residual"])[:count]) <= 0).all()
 
 
-def test_the_page_is_small_and_quickly_made():
+def test_the_page_is_small_and_quickly_made_and_the_same_for_the_same_scene():
     drawing, facts = make_drawing(1000, 20_000, 20_000)
-    report_html(drawing, facts)  # reads plotly.js, once per process
+    first = report_html(drawing, facts)  # reads plotly.js, once per process
     start = time.process_time()
     page = report_html(drawing, facts)
     assert time.process_time() - start < 2.0  # the requirement; 0.1 s here
     assert len(page.encode()) < 8_000_000
+    assert page == first
 
 
 def test_of_many_pairs_the_worst_are_listed_and_the_page_says_so():
@@ -127,10 +128,6 @@ def test_a_model_in_memory_is_titled_by_its_database():
         assert page_data(drawing, {**facts, "inputs": {**facts["inputs"], **inputs}})["title"] == title
 
 
-def test_same_scene_same_page():
-    assert report_html(*make_drawing()) == report_html(*make_drawing())
-
-
 def test_the_words_say_what_is_placed_and_what_to_look_at():
     drawing, facts = make_drawing()
     text = " ".join(summary_sentences(drawing, facts))
@@ -166,21 +163,17 @@ def test_nothing_known_nothing_claimed():
     json.dumps(data, allow_nan=False)
 
 
-def test_residuals_at_the_optimum_are_angles_to_its_baselines():
-    drawing, _ = make_drawing()
-    used = drawing.pairs.classes != PairClass.NO_DIRECTION
+def test_residuals_at_the_optimum_are_angles_and_the_histogram_counts_the_same_pairs_in_each_state():
+    pairs = make_drawing()[0].pairs
+    used = pairs.classes != PairClass.NO_DIRECTION
     # The made optimum is the truth plus 1 cm per axis and end, on baselines of 2 m: 2 degrees are 5 sigma.
-    assert np.nanmax(drawing.pairs.certified_deg[used]) < 2.0
-    assert np.isnan(drawing.pairs.certified_deg[~used]).all()
-
-
-def test_the_histogram_counts_the_same_pairs_before_and_after():
-    drawing, _ = make_drawing()
-    histogram = residual_histogram(drawing.pairs)
+    assert np.nanmax(pairs.certified_deg[used]) < 2.0
+    assert np.isnan(pairs.certified_deg[~used]).all()
+    histogram = residual_histogram(pairs)
     totals = {state: int(counts.sum()) for state, counts in histogram.counts.items()}
     assert list(totals) == ["input", "optimum", "output"]
     assert len(set(totals.values())) == 1
-    assert histogram.medians_deg["output"] == pytest.approx(np.nanmedian(drawing.pairs.residuals_deg))
+    assert histogram.medians_deg["output"] == pytest.approx(np.nanmedian(pairs.residuals_deg))
 
 
 def test_the_matrix_shows_the_worst_of_each_cell_or_shares():
@@ -213,7 +206,7 @@ def test_frusta_stand_before_their_cameras_with_the_pictures_shape():
     np.testing.assert_allclose(width, 2 * 0.6 * drawing.frustum_depth)
 
 
-def test_up_is_where_level_cameras_have_it():
+def test_up_is_where_level_cameras_have_it_and_a_long_name_keeps_both_its_ends():
     rotations = make_drawing()[0].cameras.poses.rotations  # they look inwards all around, y down
     axes = view_axes(rotations)
     np.testing.assert_allclose(axes[2], [0, -1, 0], atol=0.05)
@@ -221,10 +214,5 @@ def test_up_is_where_level_cameras_have_it():
     assert np.linalg.det(axes) == pytest.approx(1.0)
     downwards = np.array([[[1.0, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1.0], [1, 0, 0], [0, 1, 0]]])
     np.testing.assert_allclose(view_axes(downwards)[2], [0, -1, 0], atol=1e-6)  # they look along +y
-
-
-def test_a_long_name_keeps_both_its_ends():
     text = shorten("a" * 300 + "end.jpg")
-    assert text.startswith("aaa")
-    assert text.endswith("end.jpg")
-    assert len(text) < 180
+    assert (text[:3], text[-7:], len(text) < 180) == ("aaa", "end.jpg", True)

@@ -5,14 +5,13 @@ import json
 import math
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from sfm_shapefit.results.tables import CameraRow, PairRow, dumps, write_json, write_rows
-from tests.scenes import RING, ROOT
+from tests.program import run_python
+from tests.scenes import RING
 
 SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]
 NOT_UTF8 = os.fsdecode(b"mod\xe8le")
@@ -67,15 +66,9 @@ def test_a_model_whose_path_is_no_utf8_is_located_and_reported(tmp_path, as_json
         scene = Path(shutil.copytree(RING, tmp_path / NOT_UTF8))
     except OSError:
         pytest.skip("this file system takes names in UTF-8 only")
-    command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", scene / "sparse" / "0", tmp_path / "out"]
-    done = subprocess.run(
-        command + ["--json"] * as_json,
-        capture_output=True,
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"},
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
+    command = ("-m", "sfm_shapefit.cli", "locate", scene / "sparse" / "0", tmp_path / "out")
+    done = run_python(*command, *["--json"] * as_json, PYTHONIOENCODING="utf-8:strict")
+    assert (done.returncode, done.stderr) == (0, "")
     written = json.loads((tmp_path / "out" / "locate.json").read_text(encoding="utf-8"))
     assert os.fsencode(written["inputs"]["model"]) == os.fsencode(scene / "sparse" / "0")
     if as_json:

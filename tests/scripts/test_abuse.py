@@ -3,8 +3,6 @@
 import gc
 import os
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,21 +10,17 @@ import pytest
 
 from abuse import determinism, verdicts
 from abuse.fuzz import make_base
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.write import write_result
+from tests.program import run_python
 from tests.scenes import COURTYARD, FACADE, RING, ROOT
 
 SCRIPTS = ROOT / "scripts"
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
+ENVIRONMENT = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
 
 
-def reliability(*arguments, timeout=280):
-    return subprocess.run(
-        [sys.executable, str(SCRIPTS / "benchmark.py"), "reliability", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=timeout,
-        env=ENVIRONMENT,
-    )
+def reliability(*arguments):
+    return run_python(SCRIPTS / "benchmark.py", "reliability", *arguments, **ENVIRONMENT)
 
 
 # --- hostile input -------------------------------------------------------------------------------------
@@ -67,13 +61,8 @@ for sin in (traceback, crash, outside, network, shell, memory, chatter, loop, go
 
 def test_the_sandbox_sees_every_sin(tmp_path):
     (tmp_path / "work").mkdir()
-    done = subprocess.run(
-        [sys.executable, "-c", SINS, str(tmp_path / "work")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=ENVIRONMENT,
-    )
+    done = run_python("-c", SINS, tmp_path / "work", **ENVIRONMENT)
+    assert done.returncode == 0, done.stderr
     seen = dict(line.split(": ", 1) for line in done.stdout.splitlines())
     words = {
         "traceback": "a traceback",
@@ -145,9 +134,6 @@ GROWTH_BYTES = 8_000_000
 
 @pytest.mark.slow
 def test_30_calls_in_one_process_leave_memory_files_and_answers_as_they_were(tmp_path):
-    from sfm_shapefit.commands.locate import locate
-    from sfm_shapefit.commands.write import write_result
-
     base = make_base(tmp_path / "base")
     sources = [(base / "sparse" / "0", base / "database.db", "auto"), (base / "old", None, "tracks")]
     answers, sizes, descriptors = {}, [], set()

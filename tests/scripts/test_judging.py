@@ -138,15 +138,11 @@ def test_only_a_real_graph_of_cameras_alone_is_held_to_the_limit_of_time():
 # --- scale -----------------------------------------------------------------------------------------
 
 
-def test_close_is_where_the_objective_stays():
+def test_close_is_where_the_objective_stays_and_an_exponent_is_the_slope_of_the_logarithms():
     assert scale.find_settled([3.0, 1.0, 2.0, 1.0, 1.0], 1.5) == 4
     assert scale.find_settled([1.0, 1.0], 1.5) == 1
-    assert scale.find_settled([1.0, 2.0], 1.5) is None
-    assert scale.find_settled([1.0, math.nan], 1.5) is None
-    assert scale.find_settled([], 1.5) is None
-
-
-def test_an_exponent_is_the_slope_of_the_logarithms():
+    for objectives in ([1.0, 2.0], [1.0, math.nan], []):
+        assert scale.find_settled(objectives, 1.5) is None
     sizes = [1e3, 1e4, 1e5]
     assert scale.exponent(sizes, [2e-4 * n**1.3 for n in sizes]) == pytest.approx(1.3)
     assert math.isnan(scale.exponent([1e3], [1.0]))
@@ -344,12 +340,9 @@ def located(size, cpu_s, **changes):
     return endtoend.Located(**{**values, **changes}, stages={"solve": used})
 
 
-def test_the_exponent_of_a_stage_is_that_of_its_processor_time():
+def test_stages_have_an_exponent_the_forecast_of_memory_a_factor_and_the_largest_limits():
     assert "| 1.50 |" in show(endtoend.BENCHMARK, located(100, 2.0), located(400, 16.0))
     assert "| - |" in show(endtoend.BENCHMARK, located(100, 0.2), located(400, 1.6))  # too short to tell
-
-
-def test_the_forecast_of_memory_may_be_off_by_its_factor_either_way_and_the_largest_has_limits():
     assert verdict(endtoend.checks(located(100, 1.0))) == "met"
     assert "forecast, factor 1.60" in verdict(endtoend.checks(located(100, 1.0, forecast_mb=62.5)))
     largest = endtoend.checks(located(endtoend.LARGEST, 1.0))

@@ -98,11 +98,14 @@ def test_a_peer_is_beaten_by_error_or_by_time():
 
 
 def test_a_peer_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
-    monkeypatch.setattr(on_graphs, "find_spec", lambda _package: None)
+    for module in (on_graphs, on_scenes):
+        monkeypatch.setattr(module, "find_spec", lambda _package: None)
     peer = next(one for one in on_graphs.CONTENDERS if one.package == "gtsam")
     found = on_graphs.answer(peer, SMALL, 1)
     assert found.note == "skipped: gtsam is not installed"
     assert math.isnan(found.error)
+    row = on_scenes.answer("pytheia LUD", Path(), None, "no directions", 1)
+    assert row.note == "skipped: pytheia is not installed"
 
 
 def test_our_contenders_place_a_bare_graph():
@@ -145,16 +148,7 @@ def test_ours_must_not_be_worse_than_the_best_peer_beyond_what_the_truth_can_tel
     median, mean = checks(rows(errors(1.06, 2.0), errors(1.0, 2.0)))
     assert not median.met
     assert mean.met
-
-
-def test_without_peers_there_is_no_limit():
     assert checks(rows(errors(1.0, 1.0), None)) == []
-
-
-def test_a_peer_of_scenes_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
-    monkeypatch.setattr(on_scenes, "find_spec", lambda _package: None)
-    row = on_scenes.answer("pytheia LUD", Path(), None, "no directions", 1)
-    assert row.note == "skipped: pytheia is not installed"
 
 
 def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):

@@ -130,7 +130,7 @@ def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
     assert gap == pytest.approx(1e-5 + (0.2 * excess[rounds - 1] if hopeless > 1.0 else 0.0), rel=1e-2)
 
 
-def test_no_spoilt_dual_proves_more_than_the_optimum():
+def test_no_spoilt_dual_proves_more_than_the_optimum_and_wrong_locations_still_prove_a_bound():
     graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
     optimum = objective(graph, t)
@@ -147,10 +147,13 @@ def test_no_spoilt_dual_proves_more_than_the_optimum():
     assert certify(graph, t, -y).dual_bound == 0.0  # the zero dual is the floor
     one_wrong = y.copy()
     one_wrong[7] = 1e6
-    certificate = certify(graph, t, one_wrong)
-    assert_feasible(graph, certificate)
+    elsewhere = t + 0.3 * rng.normal(size=t.shape)
+    noisy = y + 1e-4 * rng.normal(size=y.shape)
     # Clipped, a single pair of 3600 that is wrong by its whole ball moves the bound little.
-    assert 0.9 * optimum <= certificate.dual_bound <= optimum
+    for locations, dual, share in ((t, one_wrong, 0.9), (elsewhere, noisy, 0.5)):
+        certificate = certify(graph, locations, dual)
+        assert_feasible(graph, certificate)
+        assert share * optimum <= certificate.dual_bound <= optimum
 
 
 @pytest.mark.parametrize("size", [1e155, 1e300])
@@ -169,15 +172,6 @@ def test_a_violation_that_is_not_a_number_is_the_largest(row):
     total = np.ones((2, 3))
     total[row, 1] = np.nan
     assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
-
-
-def test_the_metric_of_wrong_locations_still_proves_a_bound():
-    graph = draw_family("geo", 300, 24)
-    t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
-    elsewhere = t + 0.3 * np.random.default_rng(2).normal(size=t.shape)
-    certificate = certify(graph, elsewhere, y + 1e-4 * np.random.default_rng(3).normal(size=y.shape))
-    assert_feasible(graph, certificate)
-    assert 0.5 * objective(graph, t) <= certificate.dual_bound <= objective(graph, t)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 12])
