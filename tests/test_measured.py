@@ -30,7 +30,7 @@ def test_pairs_are_the_edges_among_cameras():
     assert MEASURED.cameras_per_group.tolist() == [2, 2, 1, 0, 0]
 
 
-def test_a_part_renumbers_everything_alike():
+def test_a_part_renumbers_everything_alike_and_without_the_fixed_group_has_none():
     part, nodes = MEASURED.part(np.array([1, 2, 5]))
     assert nodes.tolist() == [1, 2, 4, 6]
     assert part.graph.names == ("n1", "n2", "n4", "n6")
@@ -44,11 +44,7 @@ def test_a_part_renumbers_everything_alike():
     assert part.groups.group_of.tolist() == [0, 0, 1, 2]
     np.testing.assert_array_equal(part.groups.offsets, MEASURED.groups.offsets[nodes])
     assert part.fixed_group == 1
-
-
-def test_a_part_without_the_fixed_group_has_none():
-    part, _ = MEASURED.part(np.array([0, 1]))
-    assert part.fixed_group is None
+    assert MEASURED.part(np.array([0, 1]))[0].fixed_group is None
 
 
 def test_without_points_all_cameras_keep_their_numbers():

@@ -1,14 +1,12 @@
 """Interrupts and lack of memory end a command in one sentence."""
 
 import signal
-import subprocess
-import sys
 
 import pytest
 
 from sfm_shapefit.cli import console
 from tests.program import run_python
-from tests.scenes import RING, ROOT
+from tests.scenes import RING
 
 
 def failing(error):
@@ -51,12 +49,9 @@ def test_lack_of_memory_is_one_sentence(capsys, error):
 
 
 def test_an_address_space_too_small_for_the_libraries_is_refused_at_once(tmp_path):
-    command = (
-        f"ulimit -v 500000; exec {sys.executable} -m sfm_shapefit.cli locate {RING}/sparse/0 {tmp_path}/out"
-    )
-    done = subprocess.run(
-        ["bash", "-c", command], capture_output=True, text=True, check=False, cwd=ROOT, timeout=60
-    )
+    limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_AS, (512_000_000,) * 2); "
+    start = "os.execv(sys.executable, [sys.executable, '-m', 'sfm_shapefit.cli', *sys.argv[1:]])"
+    done = run_python("-c", limit + start, "locate", RING / "sparse/0", tmp_path / "out")
     assert done.returncode == 3
     assert "512 MB of address space" in done.stderr
     assert done.stderr.count("\n") == 1

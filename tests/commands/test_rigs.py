@@ -44,20 +44,14 @@ def centres(reconstruction):
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
 
 
-def test_a_written_drive_has_its_rigs_and_its_true_poses(rigs, workspace):
-    truth = pycolmap.Reconstruction(workspace / "truth")
-    assert truth.num_rigs() == 2
-    assert truth.num_frames() == 12
-    assert truth.num_cameras() == 6
+def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(rigs, workspace):
+    model = read_model(workspace / "truth")
+    truth = model.reconstruction
+    assert (truth.num_rigs(), truth.num_frames(), truth.num_cameras()) == (2, 12, 6)
     np.testing.assert_allclose(centres(truth)[1], rigs.scene.centers, atol=1e-12)
     assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
     with pycolmap.Database.open(workspace / "database.db") as database:
-        assert database.num_rigs() == 2
-        assert database.num_frames() == 12
-
-
-def test_offsets_of_frames_are_read_in_world_axes(rigs, workspace):
-    model = read_model(workspace / "truth")
+        assert (database.num_rigs(), database.num_frames()) == (2, 12)
     first = rigs.sensor_of_image == 0
     expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
     np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
@@ -111,7 +105,7 @@ def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wro
     assert_rigs_equal(found.reconstruction, found.model.reconstruction)
 
 
-def test_images_stand_where_their_frames_and_sensors_put_them(found):
+def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_moved_together(found, tmp_path):
     for image in found.reconstruction.images.values():
         frame = found.reconstruction.frame(image.frame_id)
         rig = found.reconstruction.rig(frame.rig_id)
@@ -120,9 +114,6 @@ def test_images_stand_where_their_frames_and_sensors_put_them(found):
         if not rig.is_ref_sensor(sensor):
             pose = rig.sensor_from_rig(sensor) * pose
         np.testing.assert_allclose(image.cam_from_world().matrix(), pose.matrix(), atol=1e-12)
-
-
-def test_tables_say_what_moved_together(found, tmp_path):
     write_result(found, tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     inner = facts["rigid_groups"].pop("num_inner_pairs")

@@ -125,22 +125,29 @@ def test_two_views_and_no_matches_are_no_track():
     assert len(covering_set(none, 6)) == 0
 
 
+def random_tracks(rng, lengths, num_cameras):
+    cameras = np.concatenate([rng.choice(num_cameras, size=size, replace=False) for size in lengths])
+    rays = normalized(rng.standard_normal((len(cameras), 3)))
+    return Tracks(offsets=np.concatenate([[0], np.cumsum(lengths)]), cameras=cameras, rays=rays)
+
+
 def test_a_covering_set_shows_every_camera_enough_points_or_all_there_are():
     rng = np.random.default_rng(5)
-    lengths = rng.integers(3, 7, size=300)
-    cameras = np.concatenate([rng.choice(20, size=size, replace=False) for size in lengths])
-    cameras[cameras == 19] = 18  # camera 19 sees nothing
-    tracks = Tracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]),
-        cameras=cameras,
-        rays=normalized(rng.standard_normal((len(cameras), 3))),
-    )
+    tracks = random_tracks(rng, rng.integers(3, 7, size=300), 20)
+    tracks.cameras[tracks.cameras == 19] = 18  # camera 19 sees nothing
     chosen = covering_set(tracks, 20, per_camera=8)
     seen = np.bincount(tracks.subset(chosen).cameras, minlength=20)
     assert (seen[:19] >= 8).all()
     assert seen[19] == 0
     assert len(chosen) < 120  # and no more than it needs
     assert (np.diff(chosen) > 0).all()
+
+
+@pytest.mark.parametrize(("num_cameras", "least"), [(8, 60), (30, 26), (200, 20)])
+def test_small_scenes_take_more_points_per_camera(num_cameras, least):
+    tracks = random_tracks(np.random.default_rng(0), [4] * 60 * num_cameras, num_cameras)
+    seen = np.bincount(tracks.subset(covering_set(tracks, num_cameras)).cameras, minlength=num_cameras)
+    assert seen.min() >= least
 
 
 def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
@@ -226,18 +233,3 @@ def test_a_camera_that_the_points_do_not_determine_is_left_out():
     joint = join_points(graph, covariance, without, np.full(len(centers), 1e-3))
     placement = place(joint)
     np.testing.assert_array_equal(placement.cameras, np.arange(len(centers) - 1))
-
-
-@pytest.mark.parametrize("num_cameras", [8, 30, 200])
-def test_small_scenes_take_more_points_per_camera(num_cameras):
-    rng = np.random.default_rng(0)
-    cameras = np.concatenate(
-        [rng.choice(num_cameras, size=4, replace=False) for _ in range(60 * num_cameras)]
-    )
-    tracks = Tracks(
-        offsets=4 * np.arange(60 * num_cameras + 1),
-        cameras=cameras,
-        rays=normalized(rng.standard_normal((len(cameras), 3))),
-    )
-    seen = np.bincount(tracks.subset(covering_set(tracks, num_cameras)).cameras, minlength=num_cameras)
-    assert seen.min() >= {8: 60, 30: 26, 200: 20}[num_cameras]
