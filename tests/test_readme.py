@@ -76,9 +76,14 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
         assert result.exit_code == 0, f"{command}\n{result.output}"
 
 
-def test_every_command_of_the_program_stands_in_the_readme():
+def test_the_readme_has_every_command_leads_with_a_light_picture_and_is_read_in_five_minutes():
     shown = {command.split()[0] for command in commands_of(README)}
     assert shown == {info.name for info in app.registered_commands if not info.hidden}
+    text = TEXTS[README]
+    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
+    assert (ROOT / picture).stat().st_size < 300_000
+    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up
 
 
 def test_every_file_that_a_page_points_to_exists_and_every_page_is_pointed_to():
@@ -108,11 +113,3 @@ def test_what_the_table_of_reasons_says_the_program_says():
     for row in table.splitlines()[2:]:
         sentence = re.sub(r"\b(N%?|X|\d+%)(?= |$)", "*", row.split("|")[1].strip())
         assert any(sentence in text for text in said), sentence
-
-
-def test_the_readme_leads_with_a_light_picture_and_is_read_in_five_minutes():
-    text = README.read_text(encoding="utf-8")
-    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
-    assert (ROOT / picture).stat().st_size < 300_000
-    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
-    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up

@@ -185,7 +185,7 @@ def test_no_command_waits_for_a_pipe(tmp_path, impatient, what):
     assert sorted(tmp_path.iterdir()) == [pipe]
 
 
-def test_every_dependency_has_a_lower_and_an_upper_bound():
+def test_every_dependency_has_bounds_and_the_lock_file_of_ci_pins_every_package_and_names_no_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     numbered_by_year = ("pymetis", "distributed")  # which says nothing about compatibility
     extras = {name: lines for name, lines in project["optional-dependencies"].items() if name != "dev"}
@@ -193,13 +193,10 @@ def test_every_dependency_has_a_lower_and_an_upper_bound():
         assert ">=" in line, line
         assert "<" in line or line.startswith(numbered_by_year), line
 
-
-def test_the_lock_file_of_ci_pins_every_package_and_names_no_place():
     lines = (ROOT / "requirements" / "ci.lock").read_text().splitlines()
     pins = [line for line in lines if line and not line.startswith("#")]
     assert all(line.count("==") == 1 and "/" not in line and ":" not in line for line in pins)
     pinned = {line.split("==")[0].strip().lower().replace("_", "-") for line in pins}
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
     names = {
         line.split(">")[0].split("=")[0].split("[")[0].strip().lower().replace("_", "-") for line in wanted

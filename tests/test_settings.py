@@ -109,19 +109,15 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
         merge_options(None, SolverOptions, {"colour": 3})
 
 
-def test_completion_shows_public_names_only():
-    public = {name for name in dir(sfm_shapefit) if not name.startswith("_")}
-    assert public == set(sfm_shapefit.__all__)
-    assert all(getattr(sfm_shapefit, name) is not None for name in public)
-
-
-def test_what_follows_the_first_two_arguments_is_given_by_name():
-    more = {"certify": 3}
-    functions = [getattr(sfm_shapefit, name) for name in sfm_shapefit.__all__]
-    for function in (one for one in functions if inspect.isfunction(one)):
-        kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
-        by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
-        assert by_position <= more.get(function.__name__, 2), function.__name__
+def test_completion_shows_public_names_only_and_after_two_arguments_all_are_given_by_name():
+    public = {name: getattr(sfm_shapefit, name) for name in dir(sfm_shapefit) if not name.startswith("_")}
+    assert set(public) == set(sfm_shapefit.__all__)
+    assert all(value is not None for value in public.values())
+    for name, function in public.items():
+        if inspect.isfunction(function):
+            kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
+            by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
+            assert by_position <= {"certify": 3}.get(name, 2), name
 
 
 @pytest.fixture(scope="module")

@@ -102,12 +102,17 @@ def test_collinear_cameras_are_counted_and_grant_nothing_and_too_few_or_coincide
         recovery_conditions(t[[0, 1, 0]], complete(3))
 
 
-def test_distance_constants_are_those_of_the_two_theorems():
+def test_distance_constants_and_the_granted_share_are_those_of_the_theorems():
     t = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0.3, 0.4, 1]])
     lengths = [np.linalg.norm(t[i] - t[j]) for i, j in complete(4)]
     found = recovery_conditions(t, complete(4))
     assert found.distance_ratio == pytest.approx(min(lengths) / max(lengths))
     assert found.distance_bound == pytest.approx(max(lengths) / np.mean(lengths))
+    found = recovery_conditions(np.eye(6), complete(6))  # all distances equal, all angles 60 degrees
+    assert found.beta == pytest.approx(np.sqrt(3.0) / 2.0)
+    assert found.distance_ratio == pytest.approx(1.0)
+    assert found.granted == pytest.approx(found.beta * found.spread[0] ** 2 / (3 * 256 * 64 * 32))
+    assert (found.guarantees_recovery(0), found.guarantees_recovery(1)) == (True, False)
 
 
 def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
@@ -119,6 +124,10 @@ def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
     assert exact <= sampled + 1e-12
     # The sum is 1-Lipschitz in the angle of h, of which 400 draws miss the best by about pi / 400.
     assert sampled - exact < 0.02
+    adjacency = ~np.eye(3, dtype=bool)
+    adjacency[0, 1] = adjacency[1, 0] = False
+    line = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])  # a collinear common neighbor counts in full
+    assert well_distributed(line, adjacency) == (1.0, 1.0)
 
 
 def test_the_bracket_of_other_dimensions_holds_the_exact_value_of_space():
@@ -139,13 +148,6 @@ def test_in_ten_dimensions_the_bracket_holds_what_sampling_finds():
     assert 0.0 < low <= high <= sampled
 
 
-def test_a_collinear_common_neighbour_counts_in_full():
-    t = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])
-    adjacency = ~np.eye(3, dtype=bool)
-    adjacency[0, 1] = adjacency[1, 0] = False
-    assert well_distributed(t, adjacency) == (1.0, 1.0)
-
-
 def test_all_constants_are_the_same_for_any_scale_place_and_number_of_threads():
     problem = random_graph_problem(40, 0.7, 3, seed=7)
     one = recovery_conditions(problem.locations, problem.edges)
@@ -154,18 +156,6 @@ def test_all_constants_are_the_same_for_any_scale_place_and_number_of_threads():
         assert getattr(other, name) == pytest.approx(getattr(one, name), rel=1e-9)
     assert other.spread == pytest.approx(one.spread, rel=1e-9)
     assert recovery_conditions(problem.locations, problem.edges, threads=2) == one
-
-
-def test_the_granted_share_is_that_of_the_theorem():
-    n = 6
-    simplex = np.eye(n)  # all distances equal, all angles 60 degrees
-    found = recovery_conditions(simplex, complete(n))
-    assert found.beta == pytest.approx(np.sqrt(3.0) / 2.0)
-    assert found.distance_ratio == pytest.approx(1.0)
-    expected = found.beta * found.spread[0] ** 2 / (3 * 256 * 64 * 32)
-    assert found.granted == pytest.approx(expected)
-    assert found.guarantees_recovery(0)
-    assert not found.guarantees_recovery(1)
 
 
 def test_space_grants_by_its_own_theorem_what_is_recovered_exactly_but_nothing_to_an_atypical_graph():

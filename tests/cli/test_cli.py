@@ -56,24 +56,21 @@ def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_version_and_both_flags_of_help_are_there():
+def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_help(tmp_path):
     assert run("--version").stdout == f"sfm-shapefit {sfm_shapefit.__version__}\n"
     listed = run("-h").stdout
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
+    assert "solve" not in listed
     assert run("view", "-h").stdout.startswith("Usage:")
-
-
-def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
-    graph = BUNDLED / "graph40.txt"
     flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
-    options = json.loads(run("solve", graph, tmp_path / "out", *flags).stdout)["options"]
+    done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
+    options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
     text = run("place", "--help").stdout
     assert "--method" not in text
     assert "--factor-memory " not in text
     assert run("solve", "--help").stdout == text.replace(" place ", " solve ", 1)
-    assert "solve" not in run("--help").stdout
 
 
 def test_help_lists_every_option_as_a_flag_with_its_sentence_in_the_groups_of_the_stages():
@@ -120,20 +117,19 @@ def test_a_flag_that_leaves_no_direction_is_refused(tmp_path):
     assert "none of the" in run_refused("locate", COURTYARD / "truth", tmp_path / "out", *few, code=4)
 
 
-def test_a_config_file_sets_options_and_flags_win(tmp_path):
-    config = tmp_path / "options.toml"
-    config.write_text('scale = "unit"\nmin_inliers = 20\n')
-    result = run("locate", FACADE_MODEL, tmp_path / "a", "--json", "--config", config, "--min-inliers", "16")
-    facts = json.loads(result.stdout)
-    assert (facts["options"]["scale"], facts["options"]["min_inliers"]) == ("unit", 16)
-    assert facts["scale"].startswith("unit")
-
-
 @pytest.mark.parametrize("text", ["scale = ", "colour = 3", "min_inliers = 'many'", "scale = 'metric'"])
 def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
     run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_config_file_sets_options_and_flags_win(tmp_path):
+    (tmp_path / "options.toml").write_text('scale = "unit"\nmin_inliers = 20\n')
+    flags = ("--json", "--config", tmp_path / "options.toml", "--min-inliers", "16")
+    facts = json.loads(run("locate", FACADE_MODEL, tmp_path / "a", *flags).stdout)
+    assert (facts["options"]["scale"], facts["options"]["min_inliers"]) == ("unit", 16)
+    assert facts["scale"].startswith("unit")
 
 
 def test_quiet_prints_nothing_and_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):

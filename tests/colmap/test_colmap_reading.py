@@ -25,9 +25,6 @@ MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
 
 
-# --- scenes ------------------------------------------------------------------------------------------
-
-
 def synthesize(seed: int, *database: pycolmap.Database, **settings: object) -> pycolmap.Reconstruction:
     """Make a scene without noise, and its database if one is given."""
     pycolmap.set_random_seed(seed)
@@ -107,9 +104,6 @@ def write_tiny(folder: Path, records: dict[str, list]) -> Path:
     return folder
 
 
-# --- models that are sound -----------------------------------------------------------------------------
-
-
 def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_path):
     text, legacy = tmp_path / "text", tmp_path / "legacy"
     text.mkdir()
@@ -145,23 +139,22 @@ def test_the_tiny_model_of_these_tests_is_sound_and_needs_no_points(tmp_path):
     assert list(track_matches(model, 1)) == []
 
 
-def test_binary_files_win_over_text_files_in_the_same_folder(scene, folder):
+def test_binary_files_win_over_text_files_and_poses_in_frames_over_those_in_images(tmp_path):
     for name in ("cameras", "images", "points3D"):
-        (folder / f"{name}.txt").write_text("not a model")
-    assert read_model(folder).num_images == scene.num_images()
-
-
-def test_poses_in_frames_win_over_those_in_images(tmp_path):
+        (tmp_path / f"{name}.txt").write_text("not a model")
     records = tiny_model()
     records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
-    model = read_model(write_tiny(tmp_path / "m", records))
+    model = read_model(write_tiny(tmp_path, records))
     np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
 
 
-def test_images_without_a_pose_are_left_out(scene):
+def test_images_without_a_pose_are_left_out_and_arrays_are_read_only(scene):
     copy = pycolmap.Reconstruction(scene)
     copy.deregister_frame(copy.image(3).frame_id)
-    assert 3 not in read_model(copy).image_ids
+    model = read_model(copy)
+    assert 3 not in model.image_ids
+    with pytest.raises(ValueError, match="read-only"):
+        model.rotations[0, 0, 0] = 2.0
 
 
 def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
@@ -175,14 +168,6 @@ def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothin
     copy.write_binary(tmp_path / "again")
     assert fingerprint(folder) == before == fingerprint(tmp_path / "again")
     assert capfd.readouterr() == ("", "")
-
-
-def test_arrays_of_a_model_are_read_only(model):
-    with pytest.raises(ValueError, match="read-only"):
-        model.rotations[0, 0, 0] = 2.0
-
-
-# --- models that are bad -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", MODEL_FILES)
@@ -409,9 +394,6 @@ def test_a_rig_of_two_cameras_is_read_with_the_poses_of_its_images(tmp_path):
     assert errors.position.max == pytest.approx(0.0, abs=1e-9)
 
 
-# --- rays and tracks ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("camera_model", CAMERA_MODELS)
 def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
     reconstruction = pycolmap.Reconstruction()
@@ -504,8 +486,6 @@ def test_track_matches_carry_the_rays_of_their_keypoints(scene, model):
             # exact projections; undistorting the pixel iterates to about 1e-10
             assert angle_between_deg(rays[rows], truth).max() < 1e-6
 
-
-# --- databases ---------------------------------------------------------------------------------------
 
 SCHEMA = """
 CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, model INTEGER, params BLOB);
@@ -720,8 +700,6 @@ def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_i
         pass
 
 
-# --- databases that are bad --------------------------------------------------------------------------
-
 GEOMETRY, KEYPOINTS = "UPDATE two_view_geometries SET ", "UPDATE keypoints SET "
 FIRST = f" WHERE pair_id = {pair_id(1, 2)}"
 BROKEN_ROWS = {
@@ -789,9 +767,6 @@ def test_a_locked_database_is_refused_in_seconds(path, model):
     with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
         pass
     writer.close()
-
-
-# --- databases are never changed ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("journal_mode", ["delete", "wal", "persist", "truncate"])
@@ -870,9 +845,6 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
     (model / "database.db").unlink()
     assert find_database(Path(".")) == model.parent / "database.db"
     assert find_database(Path("../../sparse/0")) == model.parent / "database.db"
-
-
-# --- a real scene ------------------------------------------------------------------------------------
 
 
 def test_a_real_scene_is_read_in_well_under_ten_seconds():

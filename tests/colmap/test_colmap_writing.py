@@ -30,9 +30,6 @@ NUM_IMAGES = 8
 RADIUS = 6.0
 
 
-# --- a small scene: cameras on a ring, looking at a ball of points --------------------------------------
-
-
 def looking_at_origin(center):
     """cam_from_world of a camera at `center`, z axis towards the origin."""
     forward = -center / np.linalg.norm(center)
@@ -135,9 +132,6 @@ def centers_of(reconstruction):
     return np.array([reconstruction.image(i).projection_center() for i in sorted(reconstruction.images)])
 
 
-# --- the seed -------------------------------------------------------------------------------------------
-
-
 def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tmp_path):
     original, _ = ring_model()
     moved = 3.0 * ring_centers() + [100.0, -7.0, 0.5]
@@ -213,9 +207,6 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
         np.testing.assert_array_equal([p.xy for p in seed.image(image_id).points2D], own)
 
 
-# --- triangulation --------------------------------------------------------------------------------------
-
-
 @SOURCES
 def test_exact_data_give_every_point_back_with_its_colour(source):
     original, points = ring_model()
@@ -230,24 +221,20 @@ def test_exact_data_give_every_point_back_with_its_colour(source):
         assert point.error == pytest.approx(0.0, abs=1e-6)
 
 
-def test_points_follow_the_new_positions_and_not_the_old_ones():
+def test_points_follow_the_new_positions_and_those_of_the_models_own_tracks_keep_their_ids():
     original, points = ring_model()
+    for point_id in (3, 50):
+        original.delete_point3D(point_id)
     seed, graph = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
     for tracks in (graph, original):
         structure = triangulate(seed, tracks)
-        xyz = {p.track.elements[0].point2D_idx: p.xyz for p in structure.points3D.values()}
-        found = np.array([xyz[k] for k in range(len(points))])
-        np.testing.assert_allclose(found, 2.0 * points + [1.0, 2.0, 3.0], rtol=0.0, atol=2e-9)
-
-
-def test_the_models_own_tracks_keep_the_ids_of_their_points():
-    original, _ = ring_model(noise_px=0.3)
-    for point_id in (3, 50):
-        original.delete_point3D(point_id)
-    structure = triangulate(seeded(original)[0], original)
+        assert structure.num_points3D() == 120 if tracks is graph else 118
+        for point_id, point in structure.points3D.items():
+            (keypoint,) = {element.point2D_idx for element in point.track.elements}
+            assert tracks is graph or keypoint == point_id - 1
+            expected = 2.0 * points[keypoint] + [1.0, 2.0, 3.0]
+            np.testing.assert_allclose(point.xyz, expected, rtol=0.0, atol=2e-9)
     assert set(structure.point3D_ids()) == set(original.point3D_ids())
-    for point_id, point in structure.points3D.items():
-        assert {e.point2D_idx for e in point.track.elements} == {point_id - 1}
 
 
 class Copying(ThreadPoolExecutor):
@@ -325,13 +312,10 @@ def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_
     assert bundle_adjust(seed, graph).num_points == 120
 
 
-def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_its_images():
-    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
-        seeded(ring_model()[0], batches=[batch_of(np.array([[0, 3]]), 121)])
-
-
-def test_tracks_of_a_model_with_other_keypoints_are_refused():
+def test_matches_and_tracks_of_other_keypoints_are_refused():
     original, _ = ring_model()
+    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
+        seeded(original, batches=[batch_of(np.array([[0, 3]]), 121)])
     seed, _ = seeded(original, keypoints={0: np.ones((5, 2))}, batches=[])
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
@@ -370,9 +354,6 @@ def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_the
         point.color = np.zeros(3, dtype=np.uint8)
     assert color_points(structure, original) is structure  # which costs no copy
     assert all(point.color.any() for point in structure.points3D.values())
-
-
-# --- filters --------------------------------------------------------------------------------------------
 
 
 def with_one_more_point(xyz, image_ids, offset_px=0.0):
@@ -447,9 +428,6 @@ def test_a_point_stays_if_what_is_asked_for_is_less_than_it_has(xyz, image_ids, 
         kept = filter_points(seed, StructureOptions(**{option: value}))
         assert kept.exists_point3D(point_id) == (value == loose)
         assert kept.num_points3D() == 120 + (value == loose)
-
-
-# --- bundle adjustment ----------------------------------------------------------------------------------
 
 
 @SOURCES
@@ -538,9 +516,6 @@ def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name,
     error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
     # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
     assert error_m.mean() <= 1.15 * to_reach_m
-
-
-# --- the files ------------------------------------------------------------------------------------------
 
 
 def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):

@@ -75,30 +75,25 @@ LOOP_WORK = Workload(
 )
 
 
-def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it():
+def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_nothing_is_refined():
     graph = loop_graph()
     plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
     split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
     with_priors = LocateOptions(solver="admm", refine_with_priors=True)
-    assert describe_work(LOOP_WORK, plain, split).factor_entries > 0
-    assert not describe_work(LOOP_WORK, plain, split).needs_factor
     for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
         work = describe_work(LOOP_WORK, measured, options)
         assert work.needs_factor
         peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
         assert peaks[0] == peaks[1]  # so that it is never chosen
-
-
-def test_where_the_factor_is_given_up_nothing_is_refined_as_is_stated():
-    measured = MeasuredGraph(loop_graph())
-    options = LocateOptions(solver="admm")
-    full = describe_work(LOOP_WORK, measured, options)
+    full = describe_work(LOOP_WORK, plain, split)
+    assert full.factor_entries > 0
+    assert not full.needs_factor
     least = forecast(full, ECONOMIES[-1]).peak_mb
     assert forecast(full, ECONOMIES[-2]).peak_mb > least
-    limited = replace(options, max_memory_mb=int(np.ceil(least)))
-    economy, kept, changed = keep_within_memory(LOOP_WORK, measured, limited, ECONOMIES[0])
+    limited = replace(split, max_memory_mb=int(np.ceil(least)))
+    economy, kept, changed = keep_within_memory(LOOP_WORK, plain, limited, ECONOMIES[0])
     assert economy is ECONOMIES[-1]
-    assert kept is measured
+    assert kept is plain
     assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
     assert "neither refined" in economy.statement
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.baselines import linf
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.formats.g2o import g2o_text
 from sfm_shapefit.formats.graph_text import graph_text, read_graph
@@ -102,13 +103,25 @@ def test_a_bare_graph_written_as_1dsfm_has_the_same_directions(tmp_path):
     assert again.num_edges < first.num_edges  # those that contradict are gone
 
 
-def test_reversed_directions_give_the_same_scene(tmp_path):
-    graph = read_graph(BUNDLED / "graph40.txt")
-    turned = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
-    (tmp_path / "prob.txt").write_text(graph_text(turned))
-    solve(BUNDLED / "graph40.txt", tmp_path / "a")
-    solve(tmp_path / "prob.txt", tmp_path / "b", "--reverse")
-    assert centers_of(tmp_path / "a") == centers_of(tmp_path / "b")
+def test_neither_order_nor_orientation_of_lines_matters_and_reversed_directions_give_the_same_scene(tmp_path):
+    graph, rng = read_graph(BUNDLED / "graph40.txt"), np.random.default_rng(5)
+    order, flip = rng.permutation(graph.num_edges), rng.random((graph.num_edges, 1)) < 0.5
+    edges = np.where(flip, graph.edges[:, ::-1], graph.edges)[order]
+    v = np.where(flip, -graph.directions, graph.directions)[order]
+    weights = graph.weights[order]
+    for name, sign in (("shuffled", 1.0), ("turned", -1.0)):
+        text = graph_text(ViewGraph(graph.num_nodes, edges, sign * v, weights, graph.names))
+        (tmp_path / f"{name}.txt").write_text(text)
+    plain, shuffled, turned = (
+        place_graph_file(path, reverse=reverse).placement.locations
+        for path, reverse in (
+            (BUNDLED / "graph40.txt", False),
+            (tmp_path / "shuffled.txt", False),
+            (tmp_path / "turned.txt", True),
+        )
+    )
+    assert np.abs(shuffled - plain).max() <= 1e-12 * np.ptp(plain, axis=0).max()
+    np.testing.assert_array_equal(turned, shuffled)
 
 
 @pytest.mark.parametrize(

@@ -84,11 +84,18 @@ def test_tracks_do_not_depend_on_the_order_of_pairs_or_on_batches():
 
 def test_a_track_that_meets_an_image_twice_is_dropped():
     _, _, batch = scene()
-    keypoints, rays_j = batch.keypoints.copy(), batch.rays_j.copy()
-    row = 7  # keypoint 7 of image 0 now matches keypoint 8 of image 1, at the ray that fits its direction
-    keypoints[row, 1] = 8
-    tracks = tracks_of(dataclasses.replace(batch, keypoints=keypoints, rays_j=rays_j))
-    assert tracks.num_tracks == NUM_POINTS - 2
+    keypoints = batch.keypoints.copy()
+    keypoints[7, 1] = 8  # of image 0 it now matches keypoint 8 of image 1, at the ray that fits its direction
+    assert tracks_of(dataclasses.replace(batch, keypoints=keypoints)).num_tracks == NUM_POINTS - 2
+
+
+def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept():
+    _, _, batch = scene()
+    tracks, again = (tracks_of(batch, max_matches=len(batch.keypoints) // 2) for _ in range(2))
+    np.testing.assert_array_equal(again.rays, tracks.rays)
+    kept = sum(length * (length - 1) // 2 for length in tracks.lengths().tolist())
+    assert 0 < kept < len(batch.keypoints)
+    assert tracks_of(batch, max_matches=len(batch.keypoints) // 50).num_tracks < tracks.num_tracks
 
 
 def test_matches_that_contradict_their_direction_join_no_track():
@@ -103,18 +110,6 @@ def test_matches_that_contradict_their_direction_join_no_track():
         off = normalized(met - centers) - tracks.rays[rows]
         assert np.linalg.norm(off, axis=1).max() < 20 * PIXEL
     assert len(points) == NUM_POINTS
-
-
-def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept():
-    _, _, batch = scene()
-    tracks = tracks_of(batch, max_matches=len(batch.keypoints) // 2)
-    assert tracks.num_tracks > 0
-    kept = sum(length * (length - 1) // 2 for length in tracks.lengths().tolist())
-    assert kept < len(batch.keypoints)
-    again = tracks_of(batch, max_matches=len(batch.keypoints) // 2)
-    np.testing.assert_array_equal(again.rays, tracks.rays)
-    few = tracks_of(batch, max_matches=len(batch.keypoints) // 50)
-    assert few.num_tracks < tracks.num_tracks
 
 
 def test_two_views_and_no_matches_are_no_track():

@@ -102,14 +102,6 @@ def test_malformed_files_are_refused_by_line(tmp_path, text, words):
     assert "g.txt" in str(raised.value)
 
 
-def test_missing_and_binary_files_are_refused(tmp_path):
-    with pytest.raises(InputError, match="not a readable"):
-        read_graph(tmp_path / "nowhere.txt")
-    (tmp_path / "binary").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="not a readable"):
-        read_graph(tmp_path / "binary")
-
-
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_solve_places_a_bare_graph(tmp_path, d):
     truth = graph_file(tmp_path / "g.txt", d=d, pendant=True)
@@ -132,7 +124,11 @@ def test_solve_places_a_bare_graph(tmp_path, d):
     assert np.linalg.norm(shapes[0] - shapes[1]) < 0.02  # 0.001 rad of noise on 50 directions
 
 
-def test_a_graph_that_determines_nothing_exits_with_4(tmp_path):
-    write(tmp_path / "g.txt", "0 1 1 0 0\n1 2 0 1 0\n")
-    run("solve", tmp_path / "g.txt", tmp_path / "out", code=4)
+def test_missing_and_binary_files_are_refused_and_a_graph_that_determines_nothing_exits_with_4(tmp_path):
+    with pytest.raises(InputError, match="not a readable"):
+        read_graph(tmp_path / "nowhere.txt")
+    (tmp_path / "binary").write_bytes(bytes(range(256)))
+    with pytest.raises(InputError, match="not a readable"):
+        read_graph(tmp_path / "binary")
+    run("solve", write(tmp_path / "g.txt", "0 1 1 0 0\n1 2 0 1 0\n"), tmp_path / "out", code=4)
     assert not (tmp_path / "out").exists()

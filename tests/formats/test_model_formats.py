@@ -360,16 +360,12 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
     run("convert", source, tmp_path / "t.xyz", code=3)
 
 
-def test_a_foreign_model_becomes_a_colmap_model(tmp_path):
+def test_a_foreign_model_becomes_a_colmap_model_and_a_scene_survives_the_way(tmp_path, courtyard):
     sfm_shapefit.convert(opensfm_file(tmp_path), tmp_path / "model")
     model = read_model(tmp_path / "model")
     np.testing.assert_allclose(model.centers, CENTERS, atol=1e-14)
     assert model.reconstruction.num_points3D() == 1
-
-
-def test_a_scene_survives_the_way_through_pycolmap(courtyard):
     back = posed_model_of(reconstruction_of(courtyard, "test"))
-    assert back.names == courtyard.names
-    assert back.cameras == courtyard.cameras
+    assert (back.names, back.cameras) == (courtyard.names, courtyard.cameras)
     np.testing.assert_allclose(back.rotations, courtyard.rotations, atol=1e-15)
     np.testing.assert_allclose(back.centers, courtyard.centers, atol=1e-13)

@@ -86,20 +86,16 @@ def test_what_is_written_is_what_was_read(tmp_path):
     assert known.all()
 
 
-def test_cameras_without_rotation_have_no_directions(tmp_path):
+def test_cameras_without_rotation_have_no_directions_and_the_format_is_told_from_bare_graphs(tmp_path):
     folder, _, _ = write_scene(tmp_path, num_rotations=4)
     found = read_onedsfm(folder)
     graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
     assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
-
-
-def test_the_format_is_told_from_bare_graphs(tmp_path):
-    folder = folder_with(tmp_path, EGs=GOOD, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
+    folder_with(folder, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
     assert is_onedsfm(folder)
     assert is_onedsfm(folder / "EGs.txt")
-    assert not is_onedsfm(folder / "graph.txt")
-    assert not is_onedsfm(folder / "wide.txt")  # a direction in 12 dimensions
-    assert not is_onedsfm(folder / "nowhere.txt")
+    for name in ("graph.txt", "wide.txt", "nowhere.txt"):  # the second has directions in 12 dimensions
+        assert not is_onedsfm(folder / name)
 
 
 @pytest.mark.parametrize(

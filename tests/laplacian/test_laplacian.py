@@ -215,25 +215,17 @@ def test_single_precision_loses_digits_only_and_refinement_regains_them():
     assert_same_up_to_constants(x, exact, 1e-12)
 
 
-def test_refactoring_in_place_gives_the_bits_of_a_fresh_factor():
-    n, edges, _ = family("comm")
+def test_refactoring_in_place_gives_the_bits_of_a_fresh_factor_and_grounding_changes_no_difference():
+    n, edges, _ = family("geo")
     plan = analyze(n, edges)
-    rhs = balanced_rhs((n, 3), 0)
-    used = factorize(plan, random_weights(len(edges), 1))
-    used.refactor(random_weights(len(edges), 2))
-    fresh = factorize(plan, random_weights(len(edges), 2))
+    w, rhs = random_weights(len(edges), 2), balanced_rhs((n, 3), 0)
+    used, fresh = factorize(plan, random_weights(len(edges), 1)), factorize(plan, w)
+    used.refactor(w)
     np.testing.assert_array_equal(used.panels, fresh.panels)
     np.testing.assert_array_equal(used.solve(rhs), fresh.solve(rhs))
-
-
-def test_grounding_does_not_change_differences():
-    n, edges, _ = family("geo")
-    w, rhs = random_weights(len(edges), 1), balanced_rhs((n, 3), 0)
-    plan = analyze(n, edges)
     light, heavy = (factorize(plan, w, ground=g).solve(rhs) for g in (0.01, 1e3))
     assert_same_up_to_constants(light, heavy, 1e-9)
-    last = plan.permutation[-1]
-    np.testing.assert_allclose(light[last], 0.0, atol=1e-9 * np.abs(light).max())
+    np.testing.assert_allclose(light[plan.permutation[-1]], 0.0, atol=1e-9 * np.abs(light).max())
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -444,15 +436,21 @@ def test_approximate_cholesky_needs_few_iterations(name):
     assert_same_up_to_constants(result.x, splu_solution(csc_array(matrix), 1, rhs), 1e-6)
 
 
-def test_approximate_cholesky_of_a_tree_is_exact():
+def test_approximate_cholesky_of_a_tree_is_exact_and_elsewhere_the_seed_decides_the_sample():
     rng = np.random.default_rng(0)
     n = 300
     edges = np.stack([np.arange(1, n), rng.integers(np.arange(1, n))], axis=1)
     w = random_weights(n - 1, 1)
     rhs = balanced_rhs((n, 2), 2)
     x = approximate_cholesky(adjacency(n, edges), w, seed=0).solve(rhs)
-    # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbour.
+    # Fractions are float32, but on a tree each is exactly 1: a leaf has one neighbor.
     assert_same_up_to_constants(x, splu_solution(reference_laplacian(n, edges, w), 1, rhs), 1e-10)
+    n, edges, _ = family("er")
+    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
+    first, again, other = (approximate_cholesky(graph, w, seed) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(first.fractions, again.fractions)
+    np.testing.assert_array_equal(first.permutation, again.permutation)
+    assert not np.array_equal(first.rows, other.rows)
 
 
 def test_the_sampled_laplacian_is_right_on_average():
@@ -479,15 +477,6 @@ def test_the_sampled_laplacian_is_right_on_average():
     exact = reference_laplacian(5, repeated, weights).toarray()
     # Entries have a standard deviation below 1: 4 sigma of the mean is 4 / sqrt(4000) = 0.063.
     np.testing.assert_allclose(mean, exact, atol=0.065)
-
-
-def test_the_seed_decides_the_sample():
-    n, edges, _ = family("er")
-    w, graph = random_weights(len(edges), 1), adjacency(n, edges)
-    first, again, other = (approximate_cholesky(graph, w, seed) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(first.fractions, again.fractions)
-    np.testing.assert_array_equal(first.permutation, again.permutation)
-    assert not np.array_equal(first.rows, other.rows)
 
 
 def test_jacobi_is_enough_on_random_graphs_and_not_on_sequences_where_a_limit_is_reported():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import SolverOptions, UnsolvableError
+from sfm_shapefit import UnsolvableError
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.judgement.conditioning import direction_spread
 from sfm_shapefit.measured import Evidence, MeasuredGraph
@@ -111,7 +111,7 @@ def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
 
 
 @pytest.mark.parametrize("method", ["auto", "admm"])
-def test_the_plan_is_what_a_placement_does(method):
+def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(method):
     problem = random_graph_problem(30, seed=5, sigma=0.01)
     graph = problem.view_graph
     options = PlacementOptions(solver=method, tol=1e-4)
@@ -119,21 +119,16 @@ def test_the_plan_is_what_a_placement_does(method):
     assert plan.solver == done.certified.method
     assert done.certified.method_reason.startswith(plan.solver_reason)
     assert plan.second_start == (done.refined.lud is not None)
-    assert isinstance(options, SolverOptions)
-
-
-def test_the_plan_says_what_becomes_of_the_starts():
-    t = np.random.default_rng(6).standard_normal((5, 3))
-    graph = exact_graph(t, all_pairs(5))
     said = {
         "better is kept, refined": PlacementOptions(),
         "better is kept, unrefined": PlacementOptions(refine=False),
         "as it is, as asked": PlacementOptions(objective="shapefit"),
         "kept, as asked, refined": PlacementOptions(objective="lud"),
     }
-    for words, options in said.items():
-        assert words in diagnose(graph, options).plan.finish
-    assert "no second start" in diagnose(exact_graph(t[:2], [(0, 1)])).plan.finish
+    for words, asked in said.items():
+        assert words in diagnose(graph, asked).plan.finish
+    pair = exact_graph(problem.locations[:2], [(0, 1)])
+    assert "no second start" in diagnose(pair).plan.finish
 
 
 def test_theory_is_given_in_words_or_left_out_with_the_reason():
@@ -185,24 +180,18 @@ def test_json_has_the_same_content_and_theory():
     assert never["theory"] is None
 
 
-def test_a_bare_graph_is_diagnosed_too(tmp_path):
-    t = np.random.default_rng(8).standard_normal((6, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
-    result = run("inspect", tmp_path / "graph.txt", "--theory")
-    assert result.exit_code == 0
+def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_path):
+    t, graph = np.random.default_rng(8).standard_normal((6, 3)), tmp_path / "graph.txt"
+    graph.write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
+    result = run("inspect", graph, "--theory", code=0)
     assert "5: pendant" in result.stdout
     assert "no centres" in result.stdout
-    run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db", code=3)
+    run("inspect", graph, "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)
-    run("inspect", tmp_path / "graph.txt", "--min-inlier-ratio", "7", code=2)
-
-
-def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):
-    t = np.random.default_rng(9).standard_normal((5, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [(k, (k + 1) % 5) for k in range(5)])))
-    result = run("inspect", tmp_path / "graph.txt", "--json")
-    assert result.exit_code == 4
+    run("inspect", graph, "--min-inlier-ratio", "7", code=2)
+    graph.write_text(graph_text(exact_graph(t[:5], [(k, (k + 1) % 5) for k in range(5)])))
+    result = run("inspect", graph, "--json", code=4)
     facts = json.loads(result.stdout)["diagnosis"]
     assert "tie no three cameras" in facts["obstacle"]
     assert facts["obstacle"] in result.stderr

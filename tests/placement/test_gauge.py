@@ -83,12 +83,17 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
     assert "no posed image x.jpg" in run_refused("locate", RING_MODEL, tmp_path / "none", *unknown)
 
 
-def test_exact_priors_give_back_scale_axes_and_origin():
+def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_stay():
     t = cameras(3)
     truth = 5.0 * t @ TURN.T + [100.0, -20.0, 3.0]
     gauge = prior_gauge(t, priors_of(truth, rows=[0, 2, 3, 7, 9]))
     np.testing.assert_allclose(gauge.apply(t), truth, atol=1e-9)
     np.testing.assert_allclose(gauge.axes, TURN, atol=1e-12)
+    line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
+    gauge = prior_gauge(line, priors_of(3.0 * line + 1.0))
+    assert gauge.axes is None
+    assert "lie on a line" in gauge.warning
+    assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
 
 
 def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
@@ -106,14 +111,6 @@ def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
     agreeing = int(gauge.statement.split("; ")[1].split(" of ")[0])
     assert 44 <= agreeing <= 50  # of the 48 right ones; a wrong one may be near by chance
     assert gauge.warning == ""
-
-
-def test_priors_on_a_line_keep_the_axes_and_say_so():
-    t = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
-    gauge = prior_gauge(t, priors_of(3.0 * t + 1.0))
-    assert gauge.axes is None
-    assert "lie on a line" in gauge.warning
-    assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -86,21 +86,19 @@ def test_thresholds_decide_which_pairs_are_drawn():
     np.testing.assert_array_equal(drawn.contradicts, drawing.pairs.residuals_deg[drawn.rows] > 4.0)
 
 
-def test_the_inputs_centres_are_brought_into_the_outputs_units():
+def test_the_inputs_centers_are_brought_into_the_outputs_units_and_a_ray_picks_a_camera():
     drawing, _ = make_drawing()
-    poses = replace(drawing.cameras.poses, centers=100.0 * drawing.cameras.centers + 7.0)
-    other = replace(drawing, cameras=replace(drawing.cameras, poses=poses), input_is_aligned=False)
-    placed = drawing.cameras.placed
-    np.testing.assert_allclose(input_centers(other)[placed], drawing.cameras.centers[placed], atol=1e-6)
-    same = replace(poses, centers=np.zeros_like(poses.centers))
-    assert input_centers(replace(other, cameras=replace(other.cameras, poses=same))) is None
-
-
-def test_a_ray_picks_the_camera_that_it_meets():
-    drawing, _ = make_drawing()
-    eye = drawing.cameras.centers[drawing.cameras.placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
-    for camera in np.flatnonzero(drawing.cameras.placed)[:5].tolist():
-        assert camera_at(drawing, eye, 7.0 * (drawing.cameras.centers[camera] - eye)) == camera
+    cameras, placed = drawing.cameras, drawing.cameras.placed
+    for centers, seen in ((100.0 * cameras.centers + 7.0, True), (np.zeros_like(cameras.centers), False)):
+        poses = replace(cameras.poses, centers=centers)
+        other = replace(drawing, cameras=replace(cameras, poses=poses), input_is_aligned=False)
+        found = input_centers(other)
+        assert (found is not None) == seen
+        if seen:
+            np.testing.assert_allclose(found[placed], cameras.centers[placed], atol=1e-6)
+    eye = cameras.centers[placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
+    for camera in np.flatnonzero(placed)[:5].tolist():
+        assert camera_at(drawing, eye, 7.0 * (cameras.centers[camera] - eye)) == camera
     assert camera_at(drawing, eye, np.array([0.0, 1.0, 0.0])) is None  # away from all
 
 

@@ -23,9 +23,6 @@ def reliability(*arguments):
     return run_python(SCRIPTS / "benchmark.py", "reliability", *arguments, **ENVIRONMENT)
 
 
-# --- hostile input -------------------------------------------------------------------------------------
-
-
 def test_300_damaged_inputs_end_in_a_correct_result_or_one_sentence():
     done = reliability("fuzz", "--cases", 300, "--seed", 7)
     assert done.returncode == 0, done.stdout + done.stderr
@@ -90,16 +87,10 @@ def test_the_verdict_sees_a_changed_input_and_another_answer(tmp_path):
     assert verdicts.differs([], [(1.0, 0.0, 0.0)])
 
 
-# --- faults --------------------------------------------------------------------------------------------
-
-
 def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
     done = reliability("faults", "--moments", 3, "--cold", 0, "--rivals", 2)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("held") == 12
-
-
-# --- determinism ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", [RING, FACADE, COURTYARD], ids=lambda scene: scene.name)
@@ -123,8 +114,6 @@ def test_hash_seed_and_threads_do_not_change_a_byte(tmp_path, monkeypatch):
 def test_no_variant_of_a_run_changes_a_byte(tmp_path):
     assert list(determinism.differing_files(COURTYARD, tmp_path)) == []
 
-
-# --- many calls ----------------------------------------------------------------------------------------
 
 WARM_UP = 10
 """Calls in which caches and allocators fill."""

@@ -15,8 +15,6 @@ from harness.driver import Benchmark, Kept
 from harness.graphs import relative_error
 from harness.metrics import Check, Quantity, number, ratio, times, verdict
 
-# --- limits, ratios, numbers -----------------------------------------------------------------------
-
 
 @pytest.mark.parametrize(
     ("value", "better", "met"),
@@ -62,9 +60,6 @@ def test_numbers_have_three_significant_digits():
     assert " ".join(map(number, values)) == expected
 
 
-# --- tables ----------------------------------------------------------------------------------------
-
-
 def test_a_table_has_a_line_per_row_and_the_processor_is_named_by_its_model(tmp_path):
     assert record.table(["a", "b"], [["1", "2|3"]]) == "| a | b |\n| --- | --- |\n| 1 | 2/3 |\n"
     with pytest.raises(ValueError, match="row '1' has 1 cells, the header has 2"):
@@ -74,9 +69,6 @@ def test_a_table_has_a_line_per_row_and_the_processor_is_named_by_its_model(tmp_
     assert record.cpu_model(tmp_path / "missing")
 
 
-# --- bare graphs -----------------------------------------------------------------------------------
-
-
 def test_the_error_knows_the_gauge():
     rng = np.random.default_rng(5)
     t = rng.standard_normal((9, 3))
@@ -84,16 +76,10 @@ def test_the_error_knows_the_gauge():
     assert relative_error(-t, t) == pytest.approx(2.0)
 
 
-# --- fresh processes -------------------------------------------------------------------------------
-
-
-def test_a_fresh_process_has_the_threads_that_were_asked_for_and_this_one_keeps_its_own():
+def test_a_fresh_process_has_the_threads_that_were_asked_for_and_its_failure_is_one_sentence():
     before = dict(os.environ)
     assert process.call(os.getenv, "OPENBLAS_NUM_THREADS", environment=process.thread_environment(3)) == "3"
     assert dict(os.environ) == before
-
-
-def test_a_failure_in_a_fresh_process_is_one_sentence():
     with pytest.raises(RuntimeError, match=r"^ValueError: .*literal"):
         process.call(int, "x")
     with pytest.raises(RuntimeError, match="ended with code 7 and no answer"):
@@ -107,9 +93,6 @@ def test_a_process_that_takes_too_long_is_ended():
     assert time.perf_counter() - start < 20.0
     with pytest.raises(TimeoutError, match="no answer within 1 s of CPU time"):
         process.call(sum, itertools.repeat(0), cpu_limit_s=1)
-
-
-# --- the driver ------------------------------------------------------------------------------------
 
 
 def fail():

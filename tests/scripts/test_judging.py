@@ -29,9 +29,6 @@ def row_of(text, heading, name):
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-# --- real scenes -----------------------------------------------------------------------------------
-
-
 def errors(mean=0.03, missing=0):
     return real.Errors(median=0.02, mean=mean, max=0.08, num_missing=missing)
 
@@ -74,8 +71,6 @@ def test_bundle_adjustment_must_come_within_15_percent_of_the_better_rival(exces
     assert f"| {excess:.2f} |" in show(real.BENCHMARK, one)
     assert real.adjusted_checks(measured_castle()) == []  # not asked for
 
-
-# --- solver ----------------------------------------------------------------------------------------
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
 
@@ -135,9 +130,6 @@ def test_only_a_real_graph_of_cameras_alone_is_held_to_the_limit_of_time():
     assert verdicts(measured(250, 0.05)) == {"gap": True, "factorizations": True}
 
 
-# --- scale -----------------------------------------------------------------------------------------
-
-
 def test_close_is_where_the_objective_stays_and_an_exponent_is_the_slope_of_the_logarithms():
     assert scale.find_settled([3.0, 1.0, 2.0, 1.0, 1.0], 1.5) == 4
     assert scale.find_settled([1.0, 1.0], 1.5) == 1
@@ -191,12 +183,10 @@ def test_rigid_pieces_and_single_pairs_are_told_apart_and_limits_are_judged(monk
     assert verdict(scale.checks(free)) == "no target"
 
 
-# --- graphs ----------------------------------------------------------------------------------------
-
 CHAIN = graphs.QUICK["seqv-60"]
 
 
-def test_the_oracle_is_where_the_sum_of_squares_is_stationary():
+def test_the_oracle_is_where_the_sum_of_squares_is_stationary_and_one_right_direction_does_not_stop_it():
     one = graphs.draw_graph(CHAIN, 0)
     t = graphs.oracle(one)
     right = one.right > 0.0
@@ -212,14 +202,9 @@ def test_the_oracle_is_where_the_sum_of_squares_is_stationary():
         # At a minimum both ways lead up; elsewhere the linear part, of either sign, is the larger one.
         assert cost(t + shift) > cost(t) < cost(t - shift)
     assert relative_error(t, one.truth) > 1e-4  # and it has left the truth
-
-
-def test_a_node_with_one_right_direction_does_not_stop_the_oracle():
-    one = graphs.draw_graph(CHAIN, 1)
-    ends = np.flatnonzero((one.graph.edges == 7).any(axis=1))
-    right = one.right.copy()
-    right[ends[1:]] = 0.0
-    t = graphs.oracle(dataclasses.replace(one, right=right))
+    single = one.right.copy()
+    single[np.flatnonzero((one.graph.edges == 7).any(axis=1))[1:]] = 0.0
+    t = graphs.oracle(dataclasses.replace(one, right=single))
     np.testing.assert_array_equal(t[7], one.truth[7])
 
 
@@ -242,15 +227,9 @@ def test_medians_are_checked_and_the_worst_mean_over_median():
     assert missed(worse, worse) == ["/ oracle", "error", "placed against LUD", "seconds"]
 
 
-# --- coherent --------------------------------------------------------------------------------------
-
-
-def test_a_method_breaks_where_it_stays_broken():
+def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_missed_limits():
     assert coherent.breaking_share({0.0: 0.01, 0.1: 0.3, 0.2: 0.1, 0.3: 0.5, 0.4: 1.0}) == 0.3
     assert coherent.breaking_share({0.0: 0.01, 0.5: coherent.BROKEN}) is None
-
-
-def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_missed_limits():
     values = {"shapefit": 0.01, "lud": 0.01, "placed_false": 1.4, "contradicting": 0.0}
     right = coherent.Trial(placed=0.01, warned=True, **values)
     wrong = coherent.Trial(placed=1.0, warned=False, **values)
@@ -261,16 +240,13 @@ def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_mis
     assert "| small | never | never | 0.4 |" in show(coherent.BENCHMARK, clean, corrupted)
 
 
-# --- trust and weights -----------------------------------------------------------------------------
-
-
 def test_the_area_under_the_curve_counts_pairs_in_order_and_ties_half():
     bad = np.array([True, False, False, True])
     assert trust.area_under_curve(np.array([0.1, 0.5, 0.9, 0.5]), bad) == pytest.approx(3.5 / 4)
     assert trust.area_under_curve(np.array([0.9, 0.5, 0.1, 0.95]), bad) == 0.0
 
 
-def test_errors_are_taken_after_shift_and_scale():
+def test_errors_are_taken_after_shift_and_scale_and_those_of_rotations_after_the_best_common_turn():
     rng = np.random.default_rng(0)
     truth, sigmas = rng.standard_normal((20, 3)), np.ones((20, 3))
     np.testing.assert_allclose(trust.error_ratios(3.0 * truth + 1.0, truth, sigmas), 0.0, atol=1e-12)
@@ -278,16 +254,13 @@ def test_errors_are_taken_after_shift_and_scale():
     moved = truth.copy()
     moved[4] += 100.0  # a camera that nothing holds neither counts nor disturbs the others
     np.testing.assert_allclose(trust.error_ratios(moved, truth, sigmas), 0.0, atol=1e-12)
-
-
-def test_rotation_errors_are_taken_after_the_best_common_turn():
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     theirs = np.tile(np.eye(3), (5, 1, 1))
     ours = theirs @ turn
     ours[2] = np.diag([-1.0, -1.0, 1.0]) @ ours[2]
     model = SimpleNamespace(names=("a", "b", "c", "d", "e"), rotations=ours)
-    truth = SimpleNamespace(names=("e", "d", "c", "b"), rotations=theirs[:4])
-    errors = trust.rotation_errors_deg(model, truth)
+    reference = SimpleNamespace(names=("e", "d", "c", "b"), rotations=theirs[:4])
+    errors = trust.rotation_errors_deg(model, reference)
     np.testing.assert_allclose(errors, [np.nan, 0.0, 180.0, 0.0, 0.0], atol=1e-5)
 
 
@@ -304,9 +277,6 @@ def test_gains_are_those_of_the_mean_errors_and_judged_over_all_sets():
     missed = "\n".join(weights.tables([harmed]))
     assert "all sets, geometric mean: 0.667, **missed**: gain 0.667 < 1.00." in missed
     assert "Gain of ShapeFit, real sets: none is there." in missed
-
-
-# --- rigs, onedsfm, endtoend -----------------------------------------------------------------------
 
 
 def test_scale_and_errors_are_those_of_the_model(tmp_path):

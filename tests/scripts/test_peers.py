@@ -18,8 +18,6 @@ from tests.scenes import RING, fingerprint, real_scene
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
 
-# --- pycolmap --------------------------------------------------------------------------------------
-
 
 def test_tracks_need_three_images_and_one_place_in_each():
     image_of = np.array([0, 0, 0, 1, 1, 1, 2, 2, 2])
@@ -59,9 +57,6 @@ def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie():
     assert len(errors.names) == 106
     assert errors.position.median == pytest.approx(0.0114, rel=0.2)
     assert errors.position.mean == pytest.approx(0.0351, rel=0.2)
-
-
-# --- bare graphs -----------------------------------------------------------------------------------
 
 
 def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it():
@@ -124,9 +119,6 @@ def test_peers_that_are_installed_point_the_right_way(package):
         if contender.package == package:
             locations, _ = contender.prepare(view_graph(problem))()
             assert relative_error(locations, problem.locations) < 0.1  # a wrong sign gives 2
-
-
-# --- real scenes -----------------------------------------------------------------------------------
 
 
 def errors(median, mean, missing=0):

@@ -178,7 +178,10 @@ def test_the_callback_sees_bounds_that_hold_changes_no_bit_and_can_cancel(solver
     assert 0.0 < certify(graph, t, y).gap < 0.2  # a bound even where the limit ends it
 
 
-def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step(monkeypatch):
+def test_graphs_begun_in_single_precision_are_recovered_to_rounding_even_where_it_takes_no_step(monkeypatch):
+    graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
+    t, _ = solved(graph, tol=1e-13)
+    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
     graph, truth = draw_graph(67, n=24, q=0.1)
     monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
     monkeypatch.setitem(dense._REFINEMENTS, 4, 0)  # without refinement, no step fulfils its equations
@@ -192,12 +195,6 @@ def test_one_refinement_suffices_for_steps_by_a_factor_in_double_precision(monke
     _, _, count = solve_newton_dense(graph, 1e-8, 100)
     monkeypatch.undo()
     assert count == solve_newton_dense(graph, 1e-8, 100)[2]
-
-
-def test_larger_noiseless_graphs_are_recovered_to_rounding_too():
-    graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
-    t, _ = solved(graph, tol=1e-13)
-    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])

@@ -222,8 +222,15 @@ def test_what_cannot_be_certified_is_refused():
         solve_groups(inner, groups)
 
 
-def test_what_is_not_certified_is_not_called_converged(monkeypatch):
+def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_and_cancelled(monkeypatch):
     graph, groups, _ = rig_problem(6, noise=0.02)
+    seen = []
+    whole = solve_groups(graph, groups, on_iteration=seen.append)
+    assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
+    assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
+    assert {info.limit for info in seen} == {100}
+    cancelled = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
+    assert (cancelled.status, cancelled.iterations) == (Status.CANCELLED, 2)
     early = solve_groups(graph, groups, SolverOptions(max_iterations=2))
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
@@ -248,17 +255,6 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
         solve_groups(graph, groups, SolverOptions(solver="admm"))
     with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
         ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)
-
-
-def test_iterations_over_groups_are_reported_and_may_be_cancelled():
-    graph, groups, _ = rig_problem(6, noise=0.02)
-    seen = []
-    whole = solve_groups(graph, groups, on_iteration=seen.append)
-    assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
-    assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
-    assert {info.limit for info in seen} == {100}
-    early = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
-    assert (early.status, early.iterations) == (Status.CANCELLED, 2)
 
 
 def test_a_group_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
