@@ -152,7 +152,7 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
     assert abs(fit.scale - 1.0) < 1e-3
 
 
-def test_what_rigs_rule_out_is_said(workspace):
+def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
     model = workspace / "sparse" / "0"
     for source, option, sentence in (
         (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
@@ -164,8 +164,6 @@ def test_what_rigs_rule_out_is_said(workspace):
         with pytest.raises(InputError, match=sentence):
             sfm_shapefit.locate(source, **option)
 
-
-def test_inspecting_says_how_many_frames_hang_together(workspace):
     seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
     assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")

@@ -232,20 +232,16 @@ def test_few_near_points_among_many_far_ones_give_the_direction_and_its_covarian
     assert np.median(errors_deg(found, pairs)[usable]) < error_deg
 
 
-def test_support_says_what_the_pair_has():
+def test_support_says_what_the_pair_has_and_neither_batches_nor_threads_change_a_bit():
     found = estimate([make_pair(8, count=100, noise_px=0.5, wrong=0.3)])
     assert found.num_matches[0] == 100
     assert 60 <= found.num_inliers[0] <= 80  # 70 are right; a few wrong ones fall on their epipolar line
     # A Sampson error of 0.5 px noise has median 0.6745 * 0.5 px, and 70 of them give it to 15 %.
     assert found.median_residual_px[0] == pytest.approx(0.6745 * 0.5, rel=0.45)
     assert 5.0 < found.parallax_deg[0] < 15.0  # baseline 1.02 seen from 4 to 8
-
-
-def test_neither_batches_nor_threads_change_a_bit():
     pairs = [make_pair(seed, noise_px=0.5, wrong=0.2) for seed in range(7)]
     whole, threaded = estimate(pairs), estimate(pairs, threads=2)
-    one_by_one = concatenate([estimate([pair]) for pair in pairs])
-    for other in (threaded, one_by_one):
+    for other in (threaded, concatenate([estimate([pair]) for pair in pairs])):
         for name in ("directions", "covariance", "num_inliers", "median_residual_px", "parallax_deg"):
             np.testing.assert_array_equal(getattr(whole, name), getattr(other, name))
         assert whole.status == other.status

@@ -12,7 +12,7 @@ from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.judgement.evidence import make_evidence
+from tests.problems import make_evidence
 from tests.scenes import COURTYARD, real_scene
 
 WRONG_OF_LEGO = {f"train_r_{k}.png" for k in (4, 15, 22, 25, 74)}

@@ -9,8 +9,7 @@ from sfm_shapefit.judgement.verdicts import Verdict, assess
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.judgement.evidence import make_evidence
-from tests.problems import all_pairs, fit_angles
+from tests.problems import all_pairs, fit_angles, make_evidence
 
 SIGMA = 0.01  # rad, per axis
 

@@ -6,32 +6,25 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import UnsolvableError
+from sfm_shapefit import UnsolvableError, synthetic
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.judgement.conditioning import direction_spread
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.placement.diagnosis import diagnose, theory_of
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.synthetic import (
-    box_graph_problem,
-    community_graph_problem,
-    expander_graph_problem,
-    random_graph_problem,
-    trajectory_graph_problem,
-)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, fingerprint
 
 FAMILIES = {
-    "random": lambda **how: random_graph_problem(60, **how),
-    "sparse": lambda **how: random_graph_problem(100, 0.2, **how),
-    "expander": lambda **how: expander_graph_problem(150, 30, **how),
-    "box": lambda **how: box_graph_problem(150, **how),
-    "trajectory": lambda **how: trajectory_graph_problem(150, **how),
-    "community": lambda **how: community_graph_problem(200, **how),
+    "random": lambda **how: synthetic.random_graph_problem(60, **how),
+    "sparse": lambda **how: synthetic.random_graph_problem(100, 0.2, **how),
+    "expander": lambda **how: synthetic.expander_graph_problem(150, 30, **how),
+    "box": lambda **how: synthetic.box_graph_problem(150, **how),
+    "trajectory": lambda **how: synthetic.trajectory_graph_problem(150, **how),
+    "community": lambda **how: synthetic.community_graph_problem(200, **how),
 }
 
 
@@ -112,7 +105,7 @@ def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
 
 @pytest.mark.parametrize("method", ["auto", "admm"])
 def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(method):
-    problem = random_graph_problem(30, seed=5, sigma=0.01)
+    problem = synthetic.random_graph_problem(30, seed=5, sigma=0.01)
     graph = problem.view_graph
     options = PlacementOptions(solver=method, tol=1e-4)
     plan, done = diagnose(graph, options).plan, place(graph, options)
@@ -132,7 +125,7 @@ def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(m
 
 
 def test_theory_is_given_in_words_or_left_out_with_the_reason():
-    problem = random_graph_problem(12, 1.0, seed=7)
+    problem = synthetic.random_graph_problem(12, 1.0, seed=7)
     graph = problem.view_graph
     found = theory_of(graph, problem.locations)
     assert "less than one pair of 12 cameras" in found.statement

@@ -142,7 +142,7 @@ def write_table(path, model, positions, lines=(), sep=" "):
     return path
 
 
-def test_a_table_is_read_by_name_with_either_separator_and_standard_deviations(ring, tmp_path):
+def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(ring, tmp_path):
     path = tmp_path / "priors.txt"
     for sep in (" ", ","):
         write_table(path, ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep)
@@ -152,9 +152,6 @@ def test_a_table_is_read_by_name_with_either_separator_and_standard_deviations(r
     path.write_text(f"name,x,y,z,sx,sy,sz\n{ring.names[0]},1,2,3,0.5,0.25,2\n")
     np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
 
-
-def test_latitudes_and_longitudes_become_metres_east_north_up(ring, tmp_path):
-    path = tmp_path / "gps.csv"
     names = ring.names[:3]
     path.write_text(
         f"name,lat,lon,alt\n{names[0]},48.0,11.0,500\n{names[1]},48.0,11.001,500\n{names[2]},48.001,11.0,510\n"

@@ -8,26 +8,17 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from sfm_shapefit import synthetic
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.synthetic import (
-    GraphProblem,
-    box_graph_problem,
-    community_graph_problem,
-    corridor_graph_problem,
-    lawn_graph_problem,
-    random_graph_problem,
-    ring_graph_problem,
-    trajectory_graph_problem,
-)
 from tests.problems import fit_angles, shape_error
 
 NOISE = {"sigma": 0.01, "q": 0.2, "seed": 0}
 Floats = npt.NDArray[np.float64]
 
 
-def oracle(problem: GraphProblem) -> Floats:
+def oracle(problem: synthetic.GraphProblem) -> Floats:
     """Return (n, d) least squares in angles over the right directions, from the truth."""
     right = ~problem.corrupted
     t = problem.locations - problem.locations.mean(axis=0)
@@ -35,15 +26,15 @@ def oracle(problem: GraphProblem) -> Floats:
 
 
 USUAL = {
-    "er2": lambda: random_graph_problem(60, 0.5, **NOISE),
-    "geo": lambda: box_graph_problem(120, 30.0, **NOISE),
-    "comm": lambda: community_graph_problem(120, 40.0, **NOISE),
+    "er2": lambda: synthetic.random_graph_problem(60, 0.5, **NOISE),
+    "geo": lambda: synthetic.box_graph_problem(120, 30.0, **NOISE),
+    "comm": lambda: synthetic.community_graph_problem(120, 40.0, **NOISE),
 }
 CHAINS = {
-    "seq": lambda: trajectory_graph_problem(120, 24.0, **NOISE),
-    "seqv": lambda: trajectory_graph_problem(120, 24.0, speed_ratio=4.0, **NOISE),
-    "ring": lambda: ring_graph_problem(120, 20.0, **NOISE),
-    "corridor": lambda: corridor_graph_problem(120, 20.0, **NOISE),
+    "seq": lambda: synthetic.trajectory_graph_problem(120, 24.0, **NOISE),
+    "seqv": lambda: synthetic.trajectory_graph_problem(120, 24.0, speed_ratio=4.0, **NOISE),
+    "ring": lambda: synthetic.ring_graph_problem(120, 20.0, **NOISE),
+    "corridor": lambda: synthetic.corridor_graph_problem(120, 20.0, **NOISE),
 }
 
 
@@ -73,18 +64,18 @@ def test_chains_on_which_shapefit_collapses_are_placed(family):
 
 
 def test_strips_flown_back_and_forth_with_a_third_of_wrong_directions_and_the_plane_are_placed():
-    problem = lawn_graph_problem(200, 20.0, sigma=0.01, q=0.3, seed=0)
+    problem = synthetic.lawn_graph_problem(200, 20.0, sigma=0.01, q=0.3, seed=0)
     placement = place(problem.view_graph)
     best = shape_error(oracle(problem), problem.locations)
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best
     assert shape_error(placement.certified.locations, problem.locations) > 5.0 * best
-    plane = random_graph_problem(60, 0.5, d=2, sigma=0.01, q=0.1, seed=1)
+    plane = synthetic.random_graph_problem(60, 0.5, d=2, sigma=0.01, q=0.1, seed=1)
     error = shape_error(place(plane.view_graph).locations, plane.locations)
     assert error <= 1.15 * shape_error(oracle(plane), plane.locations)  # fewer equations per unknown
 
 
 def test_the_oracle_is_a_least_squares_fit():
-    problem = random_graph_problem(12, 1.0, sigma=0.02, q=0.2, seed=3)
+    problem = synthetic.random_graph_problem(12, 1.0, sigma=0.02, q=0.2, seed=3)
     best = oracle(problem)
     right = ~problem.corrupted
 

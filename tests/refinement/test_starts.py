@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit import synthetic
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
@@ -13,12 +14,6 @@ from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refin
 from sfm_shapefit.results import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.synthetic import (
-    box_graph_problem,
-    random_graph_problem,
-    street_problem,
-    trajectory_graph_problem,
-)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import shape_error
 
@@ -31,12 +26,12 @@ def finished(problem, **options):
 @pytest.fixture(scope="module")
 def chain():
     """A video of 200 cameras on which ShapeFit collapses."""
-    return trajectory_graph_problem(200, 36.0, sigma=0.01, q=0.2, seed=1, speed_ratio=4.0)
+    return synthetic.trajectory_graph_problem(200, 36.0, sigma=0.01, q=0.2, seed=1, speed_ratio=4.0)
 
 
 @pytest.fixture(scope="module")
 def expander():
-    return random_graph_problem(40, 0.6, sigma=0.02, q=0.2, seed=1)
+    return synthetic.random_graph_problem(40, 0.6, sigma=0.02, q=0.2, seed=1)
 
 
 def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
@@ -128,7 +123,7 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
 
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noise_free_answers_are_exact_and_not_made_worse(d):
-    problem = random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
+    problem = synthetic.random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
     graph = problem.view_graph
     certified = solve(graph)
     found = refine_starts(MeasuredGraph(graph), certified, PlacementOptions())
@@ -141,7 +136,7 @@ def test_noise_free_answers_are_exact_and_not_made_worse(d):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_the_smallest_graphs_are_finished(n, d):
-    problem = random_graph_problem(n, 1.0, d=d, sigma=1e-3, seed=2)
+    problem = synthetic.random_graph_problem(n, 1.0, d=d, sigma=1e-3, seed=2)
     found = finished(problem)
     assert np.isfinite(found.locations).all()
     assert shape_error(found.locations, problem.locations) < 0.02
@@ -155,7 +150,7 @@ def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
         found = finished(expander)  # without a factor, and as good
         assert found.is_refined
         np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
-    found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
+    found = finished(synthetic.box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
     assert not found.is_refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
@@ -179,7 +174,7 @@ def test_disagreement_is_blind_to_scale_sees_stretched_lengths_and_is_finite_at_
 
 
 def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
-    street = street_problem(60, 10, seed=3)
+    street = synthetic.street_problem(60, 10, seed=3)
     n = street.num_cameras
     graph = ViewGraph(len(street.locations), street.edges, street.directions)
     joint = place(MeasuredGraph(graph, covariance=street.covariance, num_points=graph.num_nodes - n))

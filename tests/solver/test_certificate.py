@@ -258,16 +258,21 @@ def test_a_graph_in_two_pieces_is_refused():
         certify(twice, np.concatenate([t, t]), dual)
 
 
-def test_a_solver_without_fill_serves_as_well():
+def test_a_solver_without_fill_serves_as_well_and_takes_other_weights_as_if_it_were_new():
     graph = draw_family("geo", 600, 24)
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
-    iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
-    resources = Resources(factor=iterative)
-    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, resources)
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    used, new = IterativeSolver(neighbors), IterativeSolver(neighbors)
+    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, Resources(factor=used))
     assert_feasible(graph, certificate)
     # The rounds stop at a tenth of the violation, not at the same point of it.
     assert certificate.gap <= 3.0 * direct.gap
+    weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
+    for solver in (used, new):
+        solver.refactor(weights)
+    c = scale_functional(graph)
+    assert np.array_equal(used.solve(c), new.solve(c))
 
 
 def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
@@ -280,18 +285,6 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
     assert np.shares_memory(in_place.dual, split.dual)
     assert np.array_equal(in_place.dual, aside.dual)
     assert in_place.dual_bound == aside.dual_bound
-
-
-def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
-    graph = draw_family("geo", 300, 16)
-    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-    weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
-    used, new = IterativeSolver(neighbors), IterativeSolver(neighbors)
-    used.refactor(graph.weights)
-    for solver in (used, new):
-        solver.refactor(weights)
-    c = scale_functional(graph)
-    assert np.array_equal(used.solve(c), new.solve(c))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.01])

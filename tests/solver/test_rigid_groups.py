@@ -150,18 +150,14 @@ def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
     np.testing.assert_allclose(result.locations, centered(locations), atol=1e-6)
 
 
-def test_groups_of_one_node_are_the_plain_program_and_s_stays_zero():
+def test_groups_of_one_node_are_the_plain_program_and_larger_ones_raise_the_optimum():
     graph, _, _ = rig_problem(3, noise=0.01)
     result = solve_groups(graph, separate(graph.num_nodes, 3))
     plain = solve(graph)
     assert result.objective == pytest.approx(plain.objective, abs=2e-8)
     np.testing.assert_allclose(result.locations, plain.locations, atol=1e-6)
-
-
-def test_admitting_fewer_locations_raises_the_optimum():
     graph, groups, _ = rig_problem(4, noise=0.05)
-    between = outer(graph, groups)[0]
-    assert solve_groups(graph, groups).dual_bound > solve(between).objective + 1e-4
+    assert solve_groups(graph, groups).dual_bound > solve(outer(graph, groups)[0]).objective + 1e-4
 
 
 def test_the_dual_balances_over_each_group_and_for_the_scale():
@@ -257,22 +253,17 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
         ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)
 
 
-def test_a_group_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
+def test_a_group_that_one_pair_holds_hangs_free_two_pairs_hold_it_and_without_offsets_nothing_is_tied():
     graph, groups, _ = rig_problem(9, frames=6, share=1.0)
     ends = groups.group_of[graph.edges]
     to_last = np.flatnonzero((ends == 5).any(axis=1) & (ends[:, 0] != ends[:, 1]))
     sizes = np.bincount(groups.group_of)
     for count, expected in ((1, 5), (2, 6)):
         # Pairs of different sensors: in three dimensions two directions fix a group whose scale is known.
-        dropped = np.delete(to_last, [0, 7][:count])
-        kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
+        kept = np.setdiff1d(np.arange(graph.num_edges), np.delete(to_last, [0, 7][:count]))
         assert len(largest_tied(graph.edges[kept], groups, sizes)) == expected
-
-
-def test_without_offsets_nothing_is_tied_for_the_scale_is_open():
-    graph, groups, _ = rig_problem(10)
     flat = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(groups.offsets))
-    assert len(largest_tied(graph.edges, flat, np.bincount(flat.group_of))) == 1
+    assert len(largest_tied(graph.edges, flat, sizes)) == 1
     with pytest.raises(UnsolvableError, match="nothing determines the scale"):
         place(MeasuredGraph(graph, groups=flat))
 
@@ -301,17 +292,13 @@ def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_on
     assert len(largest_tied(edges, groups, sizes, t)) == 1
 
 
-def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():
+def test_lud_over_groups_stays_with_them_near_the_truth_and_over_single_nodes_is_lud():
     graph, groups, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
-    between = outer(graph, groups)[0]
-    locations = lud_over_groups(between, groups)
+    locations = lud_over_groups(outer(graph, groups)[0], groups)
     x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
     errors = np.linalg.norm(locations / x[-1] - centered(t), axis=1)
     assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centered(t), axis=1))
-
-
-def test_lud_over_single_nodes_has_the_optimum_of_lud():
     graph, _, _ = rig_problem(14, noise=0.05)
 
     def value(t):

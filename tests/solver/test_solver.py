@@ -84,20 +84,18 @@ def test_the_conic_solver_loosens_its_tolerance_rather_than_giving_up(seed):
     assert conic.objective == pytest.approx(solve(graph).objective, abs=1e-6)
 
 
-def test_a_bound_whose_equality_does_not_hold_is_not_called_converged(monkeypatch):
-    monkeypatch.setattr(solving, "_LARGEST_RESIDUAL", 0.0)
-    assert solve(problem(16, sigma=0.05)[0]).status is Status.INACCURATE
-
-
-def test_certify_refuses_what_it_cannot_judge():
+def test_a_bound_whose_equality_does_not_hold_is_not_called_converged_and_certify_refuses(monkeypatch):
     graph, _ = problem(12)
     result = solve(graph)
-    with pytest.raises(InputError, match="shapes"):
-        certify(graph, result.locations[1:], result.dual)
-    with pytest.raises(InputError, match="finite"):
-        certify(graph, result.locations * np.nan, result.dual)
-    with pytest.raises(InputError, match="point against"):
-        certify(graph, -result.locations, result.dual)
+    for locations, message in (
+        (result.locations[1:], "shapes"),
+        (result.locations * np.nan, "finite"),
+        (-result.locations, "point against"),
+    ):
+        with pytest.raises(InputError, match=message):
+            certify(graph, locations, result.dual)
+    monkeypatch.setattr(solving, "_LARGEST_RESIDUAL", 0.0)
+    assert solve(problem(16, sigma=0.05)[0]).status is Status.INACCURATE
 
 
 @pytest.mark.parametrize("method", ["newton", "admm", "conic"])

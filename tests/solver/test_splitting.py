@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sfm_shapefit import synthetic
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.solver.certificate import certify
 from sfm_shapefit.solver.conic import solve_conic
@@ -30,12 +31,6 @@ from sfm_shapefit.solver.splitting.linear import (
 )
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.solver.splitting.split_then_newton import solve_hybrid
-from sfm_shapefit.synthetic import (
-    box_graph_problem,
-    community_graph_problem,
-    expander_graph_problem,
-    trajectory_graph_problem,
-)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.graph_families import comm, er, geo, seq
 from tests.problems import shape, solve_admm
@@ -300,7 +295,7 @@ def test_new_penalties_keep_the_split_point_and_the_dual():
 
 
 def test_edges_that_are_sorted_already_are_shared_with_the_graph_and_others_come_back_in_its_order():
-    problem = community_graph_problem(200, 12.0, sigma=0.01, q=0.1, seed=3)
+    problem = synthetic.community_graph_problem(200, 12.0, sigma=0.01, q=0.1, seed=3)
     graph = problem.view_graph
     data = edge_data(graph, -np.inf)
     ascending = np.lexsort(graph.edges.T[::-1])
@@ -317,17 +312,17 @@ def test_expanders_and_huge_graphs_with_wide_levels_are_not_ordered_and_others_a
         problem = make(6000, degree, sigma=0.0, q=0.0, seed=1)
         return predict_factor(problem.view_graph).tree
 
-    assert tree(expander_graph_problem, 20.0) is None
-    assert tree(box_graph_problem, 20.0) is not None
-    assert tree(community_graph_problem, 30.0) is not None
+    assert tree(synthetic.expander_graph_problem, 20.0) is None
+    assert tree(synthetic.box_graph_problem, 20.0) is not None
+    assert tree(synthetic.community_graph_problem, 30.0) is not None
     monkeypatch.setattr(linear, "_HUGE", 3000)
     monkeypatch.setattr(linear, "_FLOPS_PER_EDGE", 300)  # so that a box of 6000 counts as too much work
-    assert tree(box_graph_problem, 40.0) is None
-    assert tree(trajectory_graph_problem, 20.0) is not None
+    assert tree(synthetic.box_graph_problem, 40.0) is None
+    assert tree(synthetic.trajectory_graph_problem, 20.0) is not None
 
 
 def test_slow_communities_are_freed_by_smaller_penalties_late():
-    problem = community_graph_problem(3000, 67.0, sigma=0.01, q=0.2, seed=1)
+    problem = synthetic.community_graph_problem(3000, 67.0, sigma=0.01, q=0.2, seed=1)
     graph = problem.view_graph
     factor, objectives = laplacian_factor(graph), []
     solve_admm(graph, 1e-9, 300, Resources(factor=factor), lambda info: objectives.append(info.objective))
@@ -413,7 +408,7 @@ def test_the_steps_that_are_left_follow_from_how_the_steps_shrink(steps, left):
     assert engine._steps_left(state) == pytest.approx(left, rel=1e-9)
 
 
-@pytest.mark.parametrize("family", [box_graph_problem, expander_graph_problem])
+@pytest.mark.parametrize("family", [synthetic.box_graph_problem, synthetic.expander_graph_problem])
 def test_a_whole_solve_is_the_same_to_the_bit_for_any_number_of_threads(family):
     problem = family(6000, 20.0, sigma=0.01, q=0.1, seed=1)
     graph = problem.view_graph
