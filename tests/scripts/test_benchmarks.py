@@ -40,7 +40,7 @@ def test_the_readme_names_every_benchmark_script_and_section():
     ] == []
 
 
-def call_here(function, *args, environment=None, timeout_s=None):
+def call_here(function, *args, **_limits):
     """Do what `harness.process.call` does, in this process: what goes to and fro must be picklable."""
     function, args = pickle.loads(pickle.dumps((function, args)))
     return pickle.loads(pickle.dumps(function(*args)))
