@@ -22,12 +22,16 @@ MEASURED = MeasuredGraph(
 )
 
 
-def test_pairs_are_the_edges_among_cameras():
+def test_pairs_are_the_edges_among_cameras_and_a_bare_graph_has_cameras_only():
     assert MEASURED.num_cameras == 5
     assert MEASURED.is_pair.tolist() == [True] * 4 + [False] * 2
     assert MEASURED.pairs.tolist() == [0, 1, 2, 3]
     assert MEASURED.classes.tolist() == [0, 0, 0, 0, 1, 1]
     assert MEASURED.cameras_per_group.tolist() == [2, 2, 1, 0, 0]
+    bare = MeasuredGraph(MEASURED.graph)
+    assert bare.num_cameras == 7
+    assert not bare.classes.any()
+    assert bare.part(np.array([0]))[0].covariance is None
 
 
 def test_a_part_renumbers_everything_alike_and_without_the_fixed_group_has_none():
@@ -57,10 +61,3 @@ def test_without_points_all_cameras_keep_their_numbers():
     assert bare.groups.num_groups == 3
     assert bare.fixed_group == 2
     assert bare.without_points() is bare
-
-
-def test_a_bare_graph_has_cameras_only():
-    measured = MeasuredGraph(MEASURED.graph)
-    assert measured.num_cameras == 7
-    assert not measured.classes.any()
-    assert measured.part(np.array([0]))[0].covariance is None

@@ -125,10 +125,17 @@ def located():
     return sfm_shapefit.locate(RING / "sparse" / "0", min_trust=0.0)
 
 
-def test_an_option_by_name_reaches_the_run(located):
+def test_an_option_by_name_reaches_the_run_rows_are_made_once_and_errors_have_a_summary(located):
     assert located.options == LocateOptions(min_trust=0.0)
     with pytest.raises(TypeError, match="did you mean min_trust"):
         sfm_shapefit.locate(RING / "sparse" / "0", mintrust=0.0)
+    assert located.cameras is located.cameras
+    assert located.pairs is located.pairs
+    assert located.summary() == located.summary()
+    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
+    assert errors.summary()["num_common"] == 8
+    assert "8 cameras in common" in repr(errors)
+    assert not errors.degenerate
 
 
 def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(located):
@@ -146,13 +153,3 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert "&lt;script&gt;" in table
     assert "<script>" not in table
     assert "num images</th><td>8<" in table
-
-
-def test_rows_are_made_once_and_errors_of_evaluate_have_a_summary(located):
-    assert located.cameras is located.cameras
-    assert located.pairs is located.pairs
-    assert located.summary() == located.summary()
-    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
-    assert errors.summary()["num_common"] == 8
-    assert "8 cameras in common" in repr(errors)
-    assert not errors.degenerate

@@ -59,7 +59,7 @@ def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations
     assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
 
 
-def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
+def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed_and_elsewhere_there_are_none(capfd):
     """A stage that ends before its limit, as a solve does, shows the steps that it took."""
     code = (
         "from sfm_shapefit.cli.console import show_progress\n"
@@ -84,9 +84,6 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
     os.close(master)
     assert process.wait() == 0
     assert re.findall(rb"(\d+)/(\d+)", shown)[-1] == (b"7", b"7")
-
-
-def test_nothing_is_shown_where_there_is_no_terminal(capfd):
     with show_progress(enabled=True) as progress:
         assert progress is None
     assert capfd.readouterr().err == ""

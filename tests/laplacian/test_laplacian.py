@@ -529,6 +529,26 @@ def test_blas_threads_do_not_change_a_bit():
     assert len(set(one.split())) == 2
 
 
+PRODUCT = """
+import hashlib, time
+from sfm_shapefit.laplacian.operators import LaplacianOperator, Workers, adjacency
+from tests.graph_families import geo, random_weights
+edges, t = geo(2000, 20.0, 1)
+begin = time.process_time()
+operator = LaplacianOperator(adjacency(2000, edges), random_weights(len(edges), 1), Workers(1))
+print(hashlib.sha256(operator(t).tobytes()).hexdigest(), time.process_time() - begin)
+"""
+
+
+@pytest.mark.slow
+def test_compiled_code_is_cached_and_the_cache_does_not_change_a_bit(tmp_path):
+    compiling, cached = (
+        run_python("-c", PRODUCT, NUMBA_CACHE_DIR=str(tmp_path)).stdout.split() for _ in range(2)
+    )
+    assert compiling[0] == cached[0]
+    assert float(cached[1]) < 0.5 * float(compiling[1])  # 0.24 s, and 1.0 s
+
+
 def test_blas_threads_are_restored_after_nested_limits():
     def threads() -> list[int]:  # of scipy's BLAS; other packages of the process may have their own
         blas = [library for library in threadpool_info() if library["user_api"] == "blas"]

@@ -19,9 +19,7 @@ from tests.problems import all_pairs
 def two_pieces():
     """Five cameras 0-4 after three cameras 4-6 hinged at 4; the small piece's edges come first."""
     t = np.random.default_rng(0).standard_normal((7, 3))
-    small = [(4, 5), (4, 6), (5, 6)]
-    large = all_pairs(5)
-    edges = np.array(small + large)
+    edges = np.array([(4, 5), (4, 6), (5, 6), *all_pairs(5)])
     return t, edges, normalized(differences(t, edges))
 
 
@@ -110,10 +108,6 @@ def test_a_loose_camera_is_named():
     t[11] = 2.0 * t[1] - t[0] + [0.0, 0.0, 1e-3]  # behind camera 1 as seen from camera 0: it may slide
     edges = np.array([*all_pairs(11), (0, 11), (1, 11)])
     noise = 1e-3 * np.random.default_rng(4).standard_normal((len(edges), 3))
-    graph = ViewGraph(
-        12,
-        edges,
-        normalized(normalized(differences(t, edges)) + noise),
-        names=[f"image{k}" for k in range(12)],
-    )
+    v = normalized(normalized(differences(t, edges)) + noise)
+    graph = ViewGraph(12, edges, v, names=[f"image{k}" for k in range(12)])
     assert any("above all image11" in warning for warning in quality_warnings(place(graph)))

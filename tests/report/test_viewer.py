@@ -40,18 +40,19 @@ def test_locate_writes_the_pictures_that_are_asked_for_and_a_folder_is_read_back
     assert len(drawing.points.positions) > 0
 
 
-def test_a_bare_graph_has_its_report_too_which_can_be_made_again(tmp_path):
+def test_a_bare_graph_has_its_report_too_and_a_report_can_be_made_again(located, tmp_path):
     result = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--scene", code=0)
-    report = tmp_path / "out" / "report.html"
-    assert all(name in result.stdout for name in (report.name, "scene.glb", "scene.ply"))
-    before = report.read_text(encoding="utf-8")
-    assert "40 nodes" in before
+    assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
     drawing, _ = read_output(tmp_path / "out")
     assert np.isfinite(drawing.cameras.centers).all()
-    report.unlink()
-    run("report", tmp_path / "out", code=0)
-    texts = (before, report.read_text(encoding="utf-8"))
-    assert len({re.search(r'"summary":(\[.*?\])', text).group(1) for text in texts}) == 1
+    for folder, words in ((tmp_path / "out", "40 nodes"), (located, "9 images")):
+        report = folder / "report.html"
+        before = report.read_text(encoding="utf-8")
+        assert words in before
+        report.unlink()
+        run("report", folder, code=0)
+        texts = (before, report.read_text(encoding="utf-8"))
+        assert len({re.search(r'"summary":(\[.*?\])', text).group(1) for text in texts}) == 1
 
 
 @pytest.mark.parametrize("command", ["report", "view"])

@@ -295,12 +295,18 @@ def test_scale_and_errors_are_those_of_the_model(tmp_path):
     np.testing.assert_allclose(larger.errors_m, 0.01 * size, rtol=1e-6)
 
 
-def test_what_a_stage_takes_is_added_up_where_it_comes_again():
+def test_stages_are_added_up_and_have_an_exponent_forecasts_a_factor_and_the_largest_limits():
     stages = endtoend.Stages()
     for stage in ("read", "solve", "solve", "read", "end"):
         stages(stage)
     assert list(stages.found) == ["imports", "read", "solve"]
     assert all(used.wall_s >= 0.0 and used.peak_mb > 10.0 for used in stages.found.values())
+    assert "| 1.50 |" in show(endtoend.BENCHMARK, located(100, 2.0), located(400, 16.0))
+    assert "| - |" in show(endtoend.BENCHMARK, located(100, 0.2), located(400, 1.6))  # too short to tell
+    assert verdict(endtoend.checks(located(100, 1.0))) == "met"
+    assert "forecast, factor 1.60" in verdict(endtoend.checks(located(100, 1.0, forecast_mb=62.5)))
+    largest = endtoend.checks(located(endtoend.LARGEST, 1.0))
+    assert [check.name for check in largest] == ["forecast, factor", "s", "MB"]
 
 
 def located(size, cpu_s, **changes):
@@ -308,12 +314,3 @@ def located(size, cpu_s, **changes):
     values = {"name": f"{size} images", "num_images": size, "num_pairs": 30 * size, "num_placed": size}
     values |= {"num_matches": 3000 * size, "median_error": 1e-3, "forecast_mb": 140.0}
     return endtoend.Located(**{**values, **changes}, stages={"solve": used})
-
-
-def test_stages_have_an_exponent_the_forecast_of_memory_a_factor_and_the_largest_limits():
-    assert "| 1.50 |" in show(endtoend.BENCHMARK, located(100, 2.0), located(400, 16.0))
-    assert "| - |" in show(endtoend.BENCHMARK, located(100, 0.2), located(400, 1.6))  # too short to tell
-    assert verdict(endtoend.checks(located(100, 1.0))) == "met"
-    assert "forecast, factor 1.60" in verdict(endtoend.checks(located(100, 1.0, forecast_mb=62.5)))
-    largest = endtoend.checks(located(endtoend.LARGEST, 1.0))
-    assert [check.name for check in largest] == ["forecast, factor", "s", "MB"]
