@@ -132,22 +132,25 @@ def shape_error(locations: Floats, truth: Floats) -> float:
 def fit_angles(t: Floats, edges: npt.NDArray[np.int64], directions: Floats, steps: int) -> Floats:
     """Return t (n, d) after Gauss-Newton steps on the sum of |u_e - v_e|^2, by dense algebra.
 
-    Steps are of least norm: translation and scale, which no direction tells, never move.
+    Translation and scale, which no direction tells, do not move.
     """
     n, d = t.shape
-    row = np.arange(len(edges))
+    i, j = edges.T
     for _ in range(steps):
-        baselines = differences(t, edges)
-        u = normalized(baselines)
-        lengths = np.linalg.norm(baselines, axis=1)
-        slope = (np.eye(d) - u[:, :, None] * u[:, None, :]) / lengths[:, None, None]
-        jacobian = np.zeros((len(edges), d, n, d))
-        jacobian[row, :, edges[:, 0]] = slope
-        jacobian[row, :, edges[:, 1]] = -slope
-        normal = jacobian.reshape(-1, n * d)
-        # Shifts and the scale are free: their singular values are of rounding alone.
-        step = np.linalg.pinv(normal.T @ normal, rcond=1e-11, hermitian=True)
-        t = t - (step @ (normal.T @ (u - directions).ravel())).reshape(n, d)
+        u = normalized(t[i] - t[j])
+        lengths = np.linalg.norm(t[i] - t[j], axis=1)
+        across = np.eye(d) - u[:, :, None] * u[:, None, :]
+        blocks, normal, pull = across / lengths[:, None, None] ** 2, np.zeros((n, n, d, d)), np.zeros((n, d))
+        for first, second, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+            np.add.at(normal, (first, second), sign * blocks)
+        off = np.einsum("eab,eb->ea", across, u - directions) / lengths[:, None]
+        np.add.at(pull, i, off)
+        np.subtract.at(pull, j, off)
+        # Nothing pulls at the shifts and the scale, which are held so that the rest can be solved for.
+        free = np.column_stack([np.tile(np.eye(d), (n, 1)), (t - t.mean(axis=0)).ravel()])
+        free /= np.linalg.norm(free, axis=0)
+        matrix = normal.swapaxes(1, 2).reshape(n * d, n * d)
+        t = t - np.linalg.solve(matrix + matrix.max() * free @ free.T, pull.ravel()).reshape(n, d)
     return t
 
 
