@@ -104,12 +104,6 @@ def test_reordering_changes_every_file_of_the_input(tmp_path):
         assert (copy / file).read_bytes() != (RING / file).read_bytes()
 
 
-def test_hash_seed_and_threads_do_not_change_a_byte(tmp_path, monkeypatch):
-    name = "hash seed 4242, two threads"
-    monkeypatch.setattr(determinism, "VARIANTS", {name: determinism.VARIANTS[name]})
-    assert list(determinism.differing_files(RING, tmp_path)) == []
-
-
 @pytest.mark.slow
 def test_no_variant_of_a_run_changes_a_byte(tmp_path):
     assert list(determinism.differing_files(COURTYARD, tmp_path)) == []
