@@ -106,7 +106,7 @@ def test_too_few_iterations_are_reported_not_hidden_in_the_line_that_a_result_is
     assert result.gap > TOL
     assert np.isfinite(result.locations).all()
     assert not result.converged
-    assert result.status.value in repr(result)
+    assert result.status.name.lower() in repr(result)
     assert len(repr(result)) < 150
 
 
