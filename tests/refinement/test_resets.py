@@ -135,10 +135,15 @@ def test_openness_is_the_error_that_triangulation_makes_at_any_scale_from_either
     for half_angle in (np.pi / 4, 0.1, 1e-3):
         side = np.tan(half_angle)
         t = np.array([[-side, 0.0, 0.0], [side, 0.0, 0.0], [0.0, 0.0, 1.0]])
-        for scale, edges in ((1.0, [[0, 2], [1, 2]]), (1e6, [[0, 2], [2, 1]])):
-            found = openness(scale * t - 5.0, np.array(edges), np.array([2]), np.full(2, 0.01))
-            length = np.hypot(side, 1.0)
-            assert found == pytest.approx([0.01 * length / (np.sqrt(2.0) * np.sin(half_angle))], rel=1e-6)
+        found = openness(t, np.array([[0, 2], [1, 2]]), np.array([2]), np.full(2, 0.01))
+        error = 0.01 * np.hypot(side, 1.0) / (np.sqrt(2.0) * np.sin(half_angle))
+        assert found == pytest.approx([error], rel=1e-6)
+    t = np.random.default_rng(3).standard_normal((6, 3)) + np.array([[0, 0, 0]] * 3 + [[9, 0, 0]] * 3)
+    edges, noise = np.array([(i, j) for i in range(3) for j in range(3, 6)]), np.linspace(0.01, 0.02, 9)
+    found = openness(t, edges, np.array([3, 4, 5]), noise)
+    turned = np.where(np.arange(9)[:, None] % 2, edges, edges[:, ::-1])
+    other = openness(1e6 * t - 5.0, turned, np.array([3, 4, 5]), 2.0 * noise)
+    np.testing.assert_allclose(other, 2.0 * found, rtol=1e-6)
 
 
 def test_parallel_baselines_and_a_group_around_or_on_a_single_node_leave_distances_open():
