@@ -48,7 +48,7 @@ def write_database(
     ):
         ids = {image.name: image.image_id for image in opened.read_all_images()}
         for name in names:
-            keypoints = found[name]["keypoints"][:] + 0.5  # COLMAP's first pixel has its centre at 0.5
+            keypoints = found[name]["keypoints"][:] + 0.5  # COLMAP's first pixel has its center at 0.5
             opened.write_keypoints(ids[name], keypoints.astype(np.float32))
         for name0, name1 in pairs:
             key, is_reversed = pair_key(matched, name0, name1)
@@ -86,7 +86,7 @@ def main(
     pycolmap.verify_matches(database, pairs_file)
 
     found = sfm_shapefit.map_database(database)
-    sfm_shapefit.write_map_result(found, out / "models")
+    sfm_shapefit.write_result(found, out / "models")
     adjusted = pycolmap.Reconstruction(found.models[0].located.reconstruction)
     pycolmap.bundle_adjustment(adjusted)  # refines focal length and distortion too
     (out / "sparse" / "0").mkdir(parents=True)

@@ -34,7 +34,7 @@ def match(images: Path, database: Path, focal_length_px: float | None) -> None:
 
 
 def average_rotations(database: Path) -> pycolmap.Reconstruction:
-    """Return a model whose rotations are averaged over the verified pairs; its centres mean nothing."""
+    """Return a model whose rotations are averaged over the verified pairs; its centers mean nothing."""
     with pycolmap.Database.open(database) as opened:
         cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=15))
     model = pycolmap.Reconstruction()

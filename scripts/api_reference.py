@@ -12,32 +12,13 @@ from pathlib import Path
 
 import pdoc
 
-MODULES = (
-    "sfm_shapefit",
-    "sfm_shapefit.baselines",
-    "sfm_shapefit.colmap.model",
-    "sfm_shapefit.synthetic.rendered_workspace",
-    "sfm_shapefit.colmap.quiet",
-    "sfm_shapefit.synthetic.workspace",
-    "sfm_shapefit.placement.diagnosis",
-    "sfm_shapefit.directions",
-    "sfm_shapefit.errors",
-    "sfm_shapefit.evaluation",
-    "sfm_shapefit.formats",
-    "sfm_shapefit.placement.gauge",
-    "sfm_shapefit.options",
-    "sfm_shapefit.commands",
-    "sfm_shapefit.placement.place",
-    "sfm_shapefit.results.tables",
-    "sfm_shapefit.results",
-    "sfm_shapefit.rigidity",
-    "sfm_shapefit.judgement",
-    "sfm_shapefit.solver",
-    "sfm_shapefit.synthetic",
-    "sfm_shapefit.synthetic.fixtures",
-    "sfm_shapefit.theory",
-    "sfm_shapefit.viewgraph",
+NAMES = (
+    *("baselines", "colmap.model", "synthetic.rendered_workspace", "colmap.quiet", "synthetic.workspace"),
+    *("placement.diagnosis", "directions", "errors", "evaluation", "formats", "placement.gauge", "options"),
+    *("commands", "placement.place", "results.tables", "results", "rigidity", "judgement", "solver"),
+    *("synthetic", "synthetic.fixtures", "theory", "viewgraph"),
 )
+MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))
 
 
 def build(out: Path) -> None:

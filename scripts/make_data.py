@@ -7,8 +7,9 @@ import argparse
 import contextlib
 import shutil
 import sqlite3
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from pathlib import Path
+from typing import NamedTuple
 
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.synthetic import (
@@ -24,8 +25,7 @@ from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BundledScene:
+class BundledScene(NamedTuple):
     """How a bundled scene is made, and what it is for."""
 
     purpose: str
@@ -40,7 +40,7 @@ SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
         " a way that looks right, and 5 % of the matches of every pair are wrong. `sparse/0` knows the"
-        " rotations only: all centres are at the origin and there are no points. `truth` is the exact model.",
+        " rotations only: all centers are at the origin and there are no points. `truth` is the exact model.",
         scene=SceneOptions(
             shape="courtyard",
             num_images=25,
@@ -121,15 +121,11 @@ def write_scene(name: str, folder: Path) -> None:
             make_rendered_scene(bundled.scene, bundled.render), folder, bundled.workspace
         )
         shutil.rmtree(folder / "images")
-        _drop_descriptors(folder / "database.db")
+        # Only matching needs the descriptors, most of the database's size.
+        with contextlib.closing(sqlite3.connect(folder / "database.db", isolation_level=None)) as connection:
+            connection.execute("DELETE FROM descriptors")
+            connection.execute("VACUUM")
     (folder / "SOURCE.md").write_text(source_text(name), encoding="utf-8")
-
-
-def _drop_descriptors(database: Path) -> None:
-    """Remove what only matching needs from a database: most of its size."""
-    with contextlib.closing(sqlite3.connect(database, isolation_level=None)) as connection:
-        connection.execute("DELETE FROM descriptors")
-        connection.execute("VACUUM")
 
 
 def source_text(name: str) -> str:

@@ -27,13 +27,13 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import inspect
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.map import map_database
-    from sfm_shapefit.commands.write import write_map_result, write_result
+    from sfm_shapefit.commands.write import WriteOptions, write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.options import LocateOptions, MapOptions
     from sfm_shapefit.placement.place import Placement, place
     from sfm_shapefit.refinement.options import PlacementOptions
-    from sfm_shapefit.results import LocateResult
     from sfm_shapefit.results.map_result import MapResult
+    from sfm_shapefit.results.result import LocateResult
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
@@ -46,13 +46,13 @@ _HOMES = {
     "commands.inspect": ("inspect",),
     "commands.locate": ("locate",),
     "commands.map": ("map_database",),
-    "commands.write": ("write_map_result", "write_result"),
+    "commands.write": ("WriteOptions", "write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "options": ("LocateOptions", "MapOptions"),
     "placement.place": ("Placement", "place"),
     "refinement.options": ("PlacementOptions",),
-    "results": ("LocateResult",),
     "results.map_result": ("MapResult",),
+    "results.result": ("LocateResult",),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),
@@ -76,6 +76,7 @@ __all__ = [
     "Status",
     "UnsolvableError",
     "ViewGraph",
+    "WriteOptions",
     "certify",
     "convert",
     "evaluate",

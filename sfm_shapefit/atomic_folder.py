@@ -27,9 +27,9 @@ from pathlib import Path
 from sfm_shapefit.errors import InputError
 
 MARKER = "locate.json"
-"""The file by which an output folder of `locate` and `solve` is recognised."""
+"""The file by which an output folder of `locate` and `solve` is recognized."""
 MAP_MARKER = "map.json"
-"""The file by which an output folder of `map` is recognised."""
+"""The file by which an output folder of `map` is recognized."""
 
 
 def check_output(out: Path | str, *, overwrite: bool = False, protect: Sequence[Path | str] = ()) -> None:
@@ -112,8 +112,6 @@ def atomic_folder(
     except OSError as error:
         raise InputError(f"{out} cannot be written ({error.strerror}); choose another place") from error
 
-
-# --- claims ----------------------------------------------------------------------------------------
 
 _PRIVATE_MODE = 0o700
 _CLAIM_ATTEMPTS = 100  # each fails only if somebody removed the folder in the same instant
@@ -236,9 +234,6 @@ def _is_same(path: Path, descriptor: int) -> bool:
         return False
 
 
-# --- what may be written where ---------------------------------------------------------------------
-
-
 def _refuse_protected(folder: Path, protect: Sequence[Path | str]) -> None:
     """Refuse a folder that is, or contains, one of the protected paths, however they are spelled."""
     real = Path(os.path.realpath(folder))
@@ -265,8 +260,6 @@ def _refuse_existing(folder: Path, *, overwrite: bool) -> None:
             "choose another folder"
         )
 
-
-# --- moving ----------------------------------------------------------------------------------------
 
 _AT_FDCWD, _NO_REPLACE, _EXCHANGE = -100, 1, 2  # of Linux's renameat2
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)

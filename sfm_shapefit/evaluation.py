@@ -12,7 +12,7 @@ a camera that the model misses counts as a failure.
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from sfm_shapefit.geometry import (
 )
 
 _ON_A_LINE = (
-    "the camera centres lie on a line, so the alignment's rotation about it is arbitrary; position errors "
+    "the camera centers lie on a line, so the alignment's rotation about it is arbitrary; position errors "
     "across the line are a lower bound"
 )
 
@@ -61,22 +61,22 @@ class CameraPoses(NamedTuple):
 class ErrorSummary:
     """Statistics of one kind of error over the common cameras."""
 
-    median: float
-    mean: float
-    rms: float
-    max: float
+    median: Annotated[float, "Of all errors."]
+    mean: Annotated[float, "Of all errors."]
+    rms: Annotated[float, "Root of the mean square."]
+    max: Annotated[float, "The largest error."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recall:
     """The share of the reference's cameras that are placed to within a threshold."""
 
-    threshold: float
-    """Position error, in the reference's units."""
-    fraction_of_extent: float | None
-    """The threshold as a fraction of the reference's extent; None for one given in the reference's units."""
-    recall: float
-    """In [0, 1]; cameras that the model misses count as failures."""
+    threshold: Annotated[float, "Position error, in the reference's units."]
+    fraction_of_extent: Annotated[
+        float | None,
+        "The threshold as a fraction of the reference's extent; null for one given in the reference's units.",
+    ]
+    recall: Annotated[float, "In [0, 1]; cameras that the model misses count as failures."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -214,7 +214,7 @@ def _check_poses(owner: str, poses: CameraPoses) -> None:
     count = len(names)
     if rotations.shape != (count, 3, 3) or centers.shape != (count, 3):
         raise InputError(
-            f"{owner} has {count} names, rotations of shape {rotations.shape} and centres of shape"
+            f"{owner} has {count} names, rotations of shape {rotations.shape} and centers of shape"
             f" {centers.shape}; give ({count}, 3, 3) and ({count}, 3)"
         )
     if len(set(names)) < count:

@@ -21,6 +21,8 @@ FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 # Where half of the points are good, so is 1 draw of 3 in 8: none in 256 has odds 1e-15.
 _NUM_SAMPLES = 256
 _NUM_REFINED_SAMPLES = 4
+# Reweighting stops earlier once nothing changes.
+_MAX_REWEIGHTINGS = 200
 
 # Rounding of distances, as a share of the largest.
 _ROUNDING = 1e-14
@@ -29,8 +31,7 @@ _ROUNDING = 1e-14
 def normalized(vectors: FloatArray) -> FloatArray:
     """Return the unit vectors along the last axis of `vectors`, shape (..., d); zero vectors give NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
-        units: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return units
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
@@ -79,8 +80,7 @@ class Similarity:
 
     def apply(self, points: FloatArray) -> FloatArray:
         """Map points of shape (n, d)."""
-        mapped: FloatArray = self.scale * points @ self.rotation.T + self.translation
-        return mapped
+        return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
 
 def fit_similarity(
@@ -120,6 +120,12 @@ def median_spread(points: FloatArray) -> float:
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     median, largest = float(np.median(distances)), float(distances.max())
     return median if median > _ROUNDING * largest else largest
+
+
+def distances_in_spreads(points: FloatArray, reference: FloatArray) -> FloatArray:
+    """Return the distances of points (n, d) from the median of others, (n,), in median spreads of these."""
+    distances = np.linalg.norm(points - np.median(reference, axis=0), axis=1)
+    return np.asarray(distances / max(median_spread(reference), np.finfo(np.float64).tiny))
 
 
 def fit_similarity_l1(
@@ -189,7 +195,7 @@ def rotation_angles_deg(rotations: FloatArray) -> FloatArray:
     return np.degrees(angles)
 
 
-def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray:
+def mean_rotation_l1(rotations: FloatArray) -> FloatArray:
     """Return the rotation with the least sum of chordal distances |R_i - R|_F: a robust mean.
 
     Weiszfeld's iteration, started from the chordal mean of the half of the rotations that is closest to
@@ -198,7 +204,6 @@ def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray
 
     Args:
         rotations: (n, d, d), n >= 1.
-        iterations: limit of reweighting steps; it stops earlier once nothing changes.
 
     Source: Hartley, Aftab, Trumpf, "L1 rotation averaging using the Weiszfeld algorithm", CVPR 2011;
     the chordal instead of the geodesic distance.
@@ -213,7 +218,7 @@ def mean_rotation_l1(rotations: FloatArray, iterations: int = 200) -> FloatArray
     center = rotations[min(candidates, key=lambda k: float(distances(rotations[k]).sum()))]
     nearest = np.argsort(distances(center), kind="stable")[: count // 2 + 1]
     best = nearest_rotations(rotations[nearest].sum(axis=0))
-    for _ in range(iterations):
+    for _ in range(_MAX_REWEIGHTINGS):
         weights = floor / np.maximum(distances(best), floor)
         candidate = nearest_rotations(np.einsum("k,kij->ij", weights, rotations))
         if distances(candidate).sum() >= distances(best).sum() * (1.0 - 1e-12):
@@ -227,5 +232,4 @@ def nearest_rotations(matrices: FloatArray) -> FloatArray:
     u, _, vt = np.linalg.svd(matrices)
     flip = np.ones(matrices.shape[:-1])
     flip[..., -1] = np.where(np.linalg.det(u) * np.linalg.det(vt) < 0.0, -1.0, 1.0)
-    rotations: FloatArray = (u * flip[..., None, :]) @ vt
-    return rotations
+    return np.asarray((u * flip[..., None, :]) @ vt)

@@ -4,7 +4,7 @@ Everything that places cameras takes a `MeasuredGraph`, and everything that work
 rigid piece, takes what `MeasuredGraph.part` makes of it.
 """
 
-from dataclasses import KW_ONLY, dataclass, replace
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 
@@ -120,10 +120,6 @@ class MeasuredGraph:
             self.num_cameras, graph.edges[rows], graph.directions[rows], graph.weights[rows], names
         )
         return self._with_rows(bare, rows, cameras)
-
-    def with_evidence(self, evidence: Evidence) -> "MeasuredGraph":
-        """Return the same with other evidence."""
-        return replace(self, evidence=evidence)
 
     def _with_rows(self, graph: ViewGraph, rows: IntArray, nodes: IntArray) -> "MeasuredGraph":
         """Return what is left of the edges `rows` and of the nodes, whose graph is given."""

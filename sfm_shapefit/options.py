@@ -44,7 +44,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     )
     scale: Scale = option(
         "auto",
-        'Scale and origin of the output: "input" takes those of the input\'s centres ("unit" where it '
+        'Scale and origin of the output: "input" takes those of the input\'s centers ("unit" where it '
         'has none); "unit" puts the centroid at 0 and the median distance from it at 1; "prior" maps '
         'onto position priors, axes too; "distance" makes a known distance true; "rig" is the unit of '
         'the sensors\' offsets in their rigs. "auto": a known distance if one is given, else priors if '

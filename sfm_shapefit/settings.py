@@ -111,10 +111,8 @@ def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any])
     return replace(given, **overrides) if overrides else given
 
 
-@cache
-def _hints(settings: Any) -> dict[str, Any]:
-    """Return the types of a settings class's fields by name."""
-    return get_type_hints(settings)
+# The types of a settings class's fields by name.
+_hints = cache(get_type_hints)
 
 
 _KINDS: dict[Any, tuple[type, ...]] = {

@@ -30,9 +30,8 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
     ]
     pairs = [_pair(e, names, centers, rng) for e in range(num_pairs)]
     history = [(k, 0.02 + 0.5 * 0.3**k, 0.02 - 0.2 * 0.3**k) for k in range(1, 12)]
-    drawing = build_drawing(
-        cameras, pairs, history=history, certified=centers + rng.normal(0, 0.01, centers.shape)
-    )
+    drawing = build_drawing(cameras, pairs, certified=centers + rng.normal(0, 0.01, centers.shape))
+    drawing = replace(drawing, history=tuple(history))
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
     poses = Poses(rotations=rotations, centers=centers + rng.normal(0, 0.3, centers.shape), half_sizes=halves)
     points = Points(
@@ -54,7 +53,7 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
 
 
 def _ring(n, rng):
-    """Return centres and cam_from_world rotations of cameras that look inwards, y down."""
+    """Return centers and cam_from_world rotations of cameras that look inwards, y down."""
     angles = np.linspace(0, 2 * np.pi, n, endpoint=False)
     centers = np.stack([8 * np.cos(angles), rng.normal(0, 0.2, n), 8 * np.sin(angles)], axis=1)
     forward = -centers / np.linalg.norm(centers, axis=1, keepdims=True)
@@ -96,7 +95,7 @@ def _facts(names):
         "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
         "residual_level_deg": 0.07,
         "mean_reprojection_error_px": 0.62,
-        "scale": "input: scale and origin of the input's centres",
+        "scale": "input: scale and origin of the input's centers",
         "loose_groups": [{"cameras": list(names[:2]), "cause": "two agreeing pairs or fewer hold it"}],
         "pieces": [
             {

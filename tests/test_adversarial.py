@@ -12,7 +12,8 @@ from sfm_shapefit import LocateOptions
 from sfm_shapefit.geometry import fit_similarity_l1, normalized
 from sfm_shapefit.placement.diagnosis import diagnose
 from sfm_shapefit.placement.place import Placement, place
-from sfm_shapefit.results import camera_rows, graph_warnings, quality_warnings
+from sfm_shapefit.results.rows import camera_rows
+from sfm_shapefit.results.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
@@ -55,7 +56,7 @@ def assert_only_the_bad_camera_is_distrusted(placement, t, noise):
 
 
 @pytest.mark.parametrize("noise", NOISE)
-def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbour(noise):
+def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbor(noise):
     edges = [*OTHERS, (0, BAD)]
     placement = place(ViewGraph(N, edges, measured(CENTERS, edges, noise)))
     rows = camera_rows(placement, placement.locations, 1.0)
@@ -66,7 +67,7 @@ def test_a_pendant_camera_is_left_out_with_the_name_of_its_neighbour(noise):
 
 @pytest.mark.parametrize("noise", NOISE)
 @pytest.mark.parametrize("joined", [False, True], ids=["apart", "joined"])
-def test_twins_at_one_centre_are_placed_at_one_centre(noise, joined):
+def test_twins_at_one_center_are_placed_at_one_center(noise, joined):
     """What a pair of twins measures is noise; it is that of no baseline at all."""
     t = CENTERS.copy()
     t[BAD] = t[BAD - 1]
@@ -112,7 +113,7 @@ def test_a_camera_whose_pairs_are_all_parallel_is_not_trusted(noise):
 
 
 @pytest.mark.parametrize("noise", NOISE)
-def test_a_camera_on_the_line_of_its_two_neighbours_is_not_trusted(noise):
+def test_a_camera_on_the_line_of_its_two_neighbors_is_not_trusted(noise):
     """Rigid by its graph, free to slide by its geometry; without noise its residuals are 0 wherever it is."""
     t = CENTERS.copy()
     t[BAD] = 2.0 * t[1] - t[0]
@@ -131,7 +132,7 @@ def test_cameras_on_one_line_are_none_of_them_trusted(noise):
 
 
 def turned_model(scene, image_id, rotation):
-    """The model of a scene with another rotation of one image, about the same centre."""
+    """The model of a scene with another rotation of one image, about the same center."""
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     image = model.image(image_id)
     center = image.projection_center()
@@ -151,7 +152,7 @@ def test_a_camera_whose_pairs_all_contradict_its_rotation_is_not_placed():
     assert errors.max < 2e-6 * 5.0  # exact data, keypoints stored as float32
 
 
-def test_twin_images_stand_at_one_centre_and_their_pair_has_no_parallax(tmp_path):
+def test_twin_images_stand_at_one_center_and_their_pair_has_no_parallax(tmp_path):
     scene = copied(RING, tmp_path)
     make_twin(scene / "database.db", of=7, twin=8)
     rotation = pycolmap.Reconstruction(scene / "sparse" / "0").image(7).cam_from_world().rotation

@@ -62,6 +62,8 @@ DOORS = {
     "rich": {"cli"},
 }
 
+MOST_PARAMETERS = 6
+
 MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # which imports lazily, from all
 
 
@@ -96,6 +98,17 @@ def test_a_module_imports_only_what_lies_below_it(path):
     own = ROOMS[room_of(path)]
     used = {name.split(".")[1] for name in imports_of(path) if name.startswith("sfm_shapefit.")}
     assert not {room for room in used & set(ROOMS) if ROOMS[room] > own}
+
+
+def test_only_kernels_and_commands_have_many_parameters():
+    many = {}
+    for path in MODULES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef) and room_of(path) != "cli":
+                count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
+                is_kernel = any(ast.unparse(mark).startswith("kernel(") for mark in node.decorator_list)
+                many |= {node.name: count} if count > MOST_PARAMETERS and not is_kernel else {}
+    assert not many
 
 
 @pytest.mark.parametrize("dependency", DOORS)

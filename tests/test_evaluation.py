@@ -82,8 +82,8 @@ def test_one_turned_camera_has_exactly_its_own_rotation_error_and_no_position_er
     assert found.position.max < 1e-10
 
 
-def test_rotations_are_compared_independently_of_the_centres():
-    """All rotations turned in the world by 30 degrees: no error, though the centres were not turned."""
+def test_rotations_are_compared_independently_of_the_centers():
+    """All rotations turned in the world by 30 degrees: no error, though the centers were not turned."""
     reference = scene(3)
     world_turn = turn(np.array([0.0, 1.0, 1.0]), 30.0)
     found = evaluate_poses(replace(reference, rotations=reference.rotations @ world_turn), reference)
@@ -177,7 +177,7 @@ def test_missing_cameras_count_as_failures_and_in_the_extent_and_extra_ones_do_n
 
 
 @pytest.mark.parametrize("side", ["model", "reference", "both"])
-def test_centres_on_a_line_are_flagged_and_explained(side):
+def test_centers_on_a_line_are_flagged_and_explained(side):
     straight = scene(8)
     direction = np.array([1.0, 2.0, -1.0])
     line = replace(straight, centers=np.linspace(0, 30, 20)[:, None] * direction + 5)

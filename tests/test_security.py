@@ -1,4 +1,4 @@
-"""What a stranger's files and a curious neighbour must not be able to do."""
+"""What a stranger's files and a curious neighbor must not be able to do."""
 
 import ast
 import os
@@ -37,7 +37,7 @@ def imported(tree):
             yield node.module
 
 
-def offences(text):
+def offenses(text):
     tree = ast.parse(text)
     for name in imported(tree):
         if name in FORBIDDEN_IMPORTS or name.split(".")[0] in FORBIDDEN_IMPORTS:
@@ -52,12 +52,12 @@ def offences(text):
 
 @pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(ROOT)))
 def test_nothing_is_unpickled_evaluated_executed_or_sent_out(path):
-    assert list(offences(path.read_text(encoding="utf-8"))) == []
+    assert list(offenses(path.read_text(encoding="utf-8"))) == []
 
 
 def test_the_scan_sees_what_it_looks_for():
     text = "import pickle\nfrom urllib.request import urlopen\neval('1')\nrun('ls', shell=True)"
-    assert sorted(offences(text)) == [
+    assert sorted(offenses(text)) == [
         "calls eval",
         "imports pickle",
         "imports urllib.request",

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit.colmap.adjustment import AdjustmentOptions
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.options import LocateOptions, MapOptions
@@ -45,7 +44,6 @@ OUT_OF_RANGE = {
         *(("max_reprojection_error_px", 0.0), ("max_reprojection_error_px", NAN)),
         *(("min_triangulation_angle_deg", 90.0), ("min_track_length", 1)),
     ],
-    AdjustmentOptions: [("max_iterations", 0), ("num_threads", 0)],
     LocateOptions: [("min_inlier_ratio", 3.0), ("tol", 2.0), ("threads", -1)],
     SceneOptions: [
         *(("shape", "torus"), ("num_images", 1), ("pixel_noise_px", NAN), ("focal_length_px", 0.0)),
@@ -106,7 +104,7 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
     with pytest.raises(TypeError, match="'min_trus' is no option of LocateOptions; did you mean min_trust"):
         merge_options(given, LocateOptions, {"min_trus": 0.0})
     with pytest.raises(TypeError, match="known are"):
-        merge_options(None, SolverOptions, {"colour": 3})
+        merge_options(None, SolverOptions, {"color": 3})
 
 
 def test_completion_shows_public_names_only_and_after_two_arguments_all_are_given_by_name():

@@ -5,8 +5,8 @@ Each takes the path of a private copy and a generator, and says whether the answ
 
 import sqlite3
 import struct
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -215,17 +215,10 @@ WAYS: tuple[Callable[[Path, Generator], bool], ...] = (
 )
 
 
-class _Edit(closing[sqlite3.Connection]):
-    """Commits and closes."""
-
-    def __exit__(self, *error: object) -> None:
-        if error[0] is None:
-            self.thing.commit()
-        self.thing.close()
-
-
-def _edit(path: Path) -> _Edit:
+@contextmanager
+def _edit(path: Path) -> Iterator[sqlite3.Connection]:
     """Open a private copy for writing; text may hold any bytes."""
-    connection = sqlite3.connect(path)
-    connection.text_factory = bytes
-    return _Edit(connection)
+    with closing(sqlite3.connect(path)) as connection:
+        connection.text_factory = bytes
+        yield connection
+        connection.commit()

@@ -16,13 +16,13 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.random import Generator
 
-from abuse.layouts import Field, binary_fields
+from abuse.layouts import binary_fields, cut_records, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
+from harness.record import leave_out
 
 HELP = "byte-identical output for threads, hash seeds and repetition; the same positions for reordered input"
 _PROJECT = Path(__file__).resolve().parents[2]
@@ -81,20 +81,15 @@ def differing_files(scene: Path, work: Path, command: str = "locate") -> Iterato
 
 def contents(out: Path) -> dict[str, object]:
     """Return the bytes of every file of an output, and of JSON files all but times and threads."""
-    found: dict[str, object] = {
-        str(path.relative_to(out)): path.read_bytes() for path in sorted(out.rglob("*")) if path.is_file()
+    return {
+        str(path.relative_to(out)): leave_out(
+            ("timings_s", "seconds", "threads"), json.loads(path.read_bytes())
+        )
+        if path.suffix == ".json"
+        else path.read_bytes()
+        for path in sorted(out.rglob("*"))
+        if path.is_file()
     }
-    for path in out.rglob("*.json"):
-        facts = json.loads(path.read_text(encoding="utf-8"))
-        found[str(path.relative_to(out))] = _without_times(facts)
-    return found
-
-
-def _without_times(value: Any) -> Any:
-    if isinstance(value, dict):
-        left_out = ("timings_s", "seconds", "threads")
-        return {key: _without_times(item) for key, item in value.items() if key not in left_out}
-    return [_without_times(item) for item in value] if isinstance(value, list) else value
 
 
 def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environment: dict[str, str]) -> Path:
@@ -138,7 +133,10 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     source, model = scene / "sparse" / "0", target / "sparse" / "0"
     model.mkdir(parents=True)
     data = {name: (source / f"{name}.bin").read_bytes() for name in MODEL_FILES}
-    images, points = (_ids(data[name], name) for name in ("images", "points3D"))
+    images, points = (
+        [read_field(data[name], field) for field in binary_fields(name, data[name]) if field.meaning == "id"]
+        for name in ("images", "points3D")
+    )
     image_ids = dict(zip(images, (1 + rng.permutation(2 * len(images)))[: len(images)].tolist(), strict=True))
     point_ids = dict(zip(points, (1 + rng.permutation(len(points))).tolist(), strict=True))
     for name in MODEL_FILES:
@@ -146,14 +144,6 @@ def reorder(scene: Path, target: Path, rng: Generator) -> Path:
     if (scene / "database.db").exists():
         _reorder_database(scene / "database.db", target / "database.db", image_ids, rng)
     return target
-
-
-def _ids(data: bytes, name: str) -> list[int]:
-    return [_value(data, field) for field in binary_fields(name, data) if field.meaning == "id"]
-
-
-def _value(data: bytes, field: Field) -> int:
-    return int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0])
 
 
 def _reorder_file(
@@ -167,14 +157,13 @@ def _reorder_file(
         ("points3D", "image reference"): image_ids,
         ("frames", "image reference"): image_ids,
     }
-    fields, changed = binary_fields(name, data), bytearray(data)
-    for field in fields:
+    changed = bytearray(data)
+    for field in binary_fields(name, data):
         if (name, field.meaning) in maps:
-            value = _value(data, field)
+            value = read_field(data, field)
             renamed = maps[name, field.meaning].get(value, value)  # no point: stays
             struct.pack_into(f"<{field.kind}", changed, field.offset, renamed)
-    starts = [field.offset for field in fields if field.meaning == "id"]
-    records = [bytes(changed[a:b]) for a, b in zip(starts, [*starts[1:], len(changed)], strict=False)]
+    records = cut_records(name, bytes(changed))
     if name not in ("cameras", "rigs"):
         records = [records[int(k)] for k in rng.permutation(len(records))]
     return bytes(changed[:8]) + b"".join(records)
@@ -193,7 +182,12 @@ def _reorder_database(source: Path, target: Path, image_ids: dict[int, int], rng
         for row in (*tables["images"], *tables["keypoints"]):
             row["image_id"] = image_ids[row["image_id"]]
         for row in tables["two_view_geometries"]:
-            _rename_pair(row, image_ids, rng)
+            first, second = (image_ids[i] for i in divmod(row["pair_id"], _MAX_NUM_IMAGES))
+            row["pair_id"] = min(first, second) * _MAX_NUM_IMAGES + max(first, second)
+            matches = np.frombuffer(row["data"] or b"", dtype="<u4").reshape(-1, 2)
+            row["data"] = rng.permutation(matches if first < second else matches[:, ::-1], axis=0).tobytes()
+            # Of the pair in its old order, and not read for directions.
+            row.update(dict.fromkeys(("F", "E", "H", "qvec", "tvec")))
         for table, rows in tables.items():
             for k in rng.permutation(len(rows)):
                 row = rows[int(k)]
@@ -202,12 +196,3 @@ def _reorder_database(source: Path, target: Path, image_ids: dict[int, int], rng
                     f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", [*row.values()]
                 )
         connection.commit()
-
-
-def _rename_pair(row: dict[str, Any], image_ids: dict[int, int], rng: Generator) -> None:
-    first, second = (image_ids[i] for i in divmod(row["pair_id"], _MAX_NUM_IMAGES))
-    row["pair_id"] = min(first, second) * _MAX_NUM_IMAGES + max(first, second)
-    matches = np.frombuffer(row["data"] or b"", dtype="<u4").reshape(-1, 2)
-    row["data"] = rng.permutation(matches if first < second else matches[:, ::-1], axis=0).tobytes()
-    for name in ("F", "E", "H", "qvec", "tvec"):  # of the pair in its old order; not read for directions
-        row[name] = None

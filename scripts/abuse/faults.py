@@ -15,7 +15,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -30,7 +30,7 @@ HELP = "signals, full disks, little memory, rivals and locks while a command run
 _PROJECT = Path(__file__).resolve().parents[2]
 _NOBODY = 65534
 # The address space may grow by so much beyond what the idle process maps.
-_EXTRA_MEMORY_MB = (0, 2, 5, 10, 20, 40, 80, 160, 320)
+_EXTRA_MEMORY = tuple(megabytes * 10**6 for megabytes in (0, 2, 5, 10, 20, 40, 80, 160, 320))
 # A file may have so many bytes.
 _FILE_SIZES = (0, 8, 100, 1000, 3000, 6000)
 
@@ -61,9 +61,9 @@ def run(args: argparse.Namespace) -> int:
                 )
                 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
             },
-            "files that may not grow": partial(small_files, bench),
+            "files that may not grow": partial(starve, bench, resource.RLIMIT_FSIZE, _FILE_SIZES),
             "a full disk": partial(full_disk, bench),
-            "little memory": partial(little_memory, bench),
+            "little memory": partial(starve, bench, resource.RLIMIT_AS, _EXTRA_MEMORY),
             f"two runs at once, {args.rivals} times": partial(rivals, bench, args.rivals),
             "a read-only input": partial(read_only_input, bench),
             "a database in use": partial(lock_database, bench),
@@ -87,17 +87,17 @@ class Bench:
         self.base = make_base(work / "base")
         self.expected = warm(self.base)["database"]
         self.folder = work / "case"
+        self.writable = [self.folder, *caches()]
         self.endings: Counter[str] = Counter()
-        self.duration_s = min(self._sound_run_s() for _ in range(3))
         self.before: dict[str, str] = {}
-
-    def _sound_run_s(self) -> float:
-        self.prepare()
-        start = time.perf_counter()
-        outcome = run_forked(self.locate(), self.folder, self.writable())
-        if outcome.code:
-            raise RuntimeError(f"the sound run failed: {outcome.stderr}")
-        return time.perf_counter() - start
+        self.duration_s = float("inf")
+        for _ in range(3):
+            self.prepare()
+            start = time.perf_counter()
+            outcome = run_forked(self.locate(), self.folder, self.writable)
+            self.duration_s = min(self.duration_s, time.perf_counter() - start)
+            if outcome.code:
+                raise RuntimeError(f"the sound run failed: {outcome.stderr}")
 
     def prepare(self) -> None:
         """Make a fresh folder with the input."""
@@ -118,15 +118,11 @@ class Bench:
 
     def start(self, *extra: str, logs: str = "log") -> Child:
         """Start the command in a child."""
-        return start_forked(self.locate(*extra), self.folder, self.writable(), logs=logs)
-
-    def writable(self) -> list[Path]:
-        """Return where a child may write."""
-        return [self.folder, *caches()]
+        return start_forked(self.locate(*extra), self.folder, self.writable, logs=logs)
 
     def judge(self, main: Callable[[], None], label: str, cut: int | None = None) -> Problems:
         """Run a disturbed command: it must succeed or say one sentence, of which `cut` bytes may be kept."""
-        outcome = self.note(run_forked(main, self.folder, self.writable()))
+        outcome = self.note(run_forked(main, self.folder, self.writable))
         is_cut = cut is not None and len(outcome.stderr) >= cut
         if outcome.code not in (0, 3) or (outcome.stderr.count("\n") != outcome.code // 3 and not is_cut):
             yield f"{label}: exit {outcome.code}, {outcome.stderr[-300:]!r}"
@@ -143,21 +139,17 @@ class Bench:
         after = verdicts.snapshot(self.folder)
         yield from (f"changed {name}" for name in self.before if after.get(name) != self.before[name])
         out = self.folder / "place" / "out"
-        if out.exists():
-            yield from self.problems_of(out)
-        new = [name for name in after.keys() - self.before.keys() if not name.startswith("place/out")]
-        if new and not strays:
-            yield f"left {sorted(new)[0]}"
-
-    def problems_of(self, out: Path) -> Problems:
-        """Yield what is wrong with an output."""
         try:
-            yield from verdicts.faults_of_tables(out)
-            yield from verdicts.faults_of_model(out)
-            if verdicts.differs(verdicts.positions(out), self.expected):
+            if out.exists():
+                yield from verdicts.faults_of_tables(out)
+                yield from verdicts.faults_of_model(out)
+            if out.exists() and verdicts.differs(verdicts.positions(out), self.expected):
                 yield "another answer"
         except OSError as error:
             yield f"the output is not whole: {error}"
+        new = [name for name in after.keys() - self.before.keys() if not name.startswith("place/out")]
+        if new and not strays:
+            yield f"left {sorted(new)[0]}"
 
 
 def signals(bench: Bench, number: signal.Signals, moments: np.ndarray) -> Problems:
@@ -217,23 +209,25 @@ def _after_signal(
         yield "the earlier output is gone"
     yield from bench.problems(strays=killed or code < 0)
     if killed:
-        run_forked(bench.locate("-q", out="place/later"), bench.folder, bench.writable())
+        run_forked(bench.locate("-q", out="place/later"), bench.folder, bench.writable)
         shutil.rmtree(bench.folder / "place" / "later")
         yield from (f"after the next run: {problem}" for problem in bench.problems())
 
 
-def _limit_resource(main: Callable[[], None], what: int, value: int) -> None:
-    resource.setrlimit(what, (value, value))
-    main()
-
-
-def small_files(bench: Bench) -> Problems:
-    """No file may be larger than so many bytes, as on a disk that is full."""
-    for size in _FILE_SIZES:
+def starve(bench: Bench, what: int, sizes: Iterable[int]) -> Problems:
+    """No file may be larger than so many bytes, or the address space may grow by so many."""
+    for size in sizes:
         bench.prepare()
-        main = partial(_limit_resource, bench.locate("-q"), resource.RLIMIT_FSIZE, size)
+        main = partial(_limit_resource, bench.locate("-q"), what, size)
         # What the child prints goes into files too, and is cut.
-        yield from bench.judge(main, f"{size} bytes", cut=size)
+        yield from bench.judge(main, f"{size} bytes", cut=size if what == resource.RLIMIT_FSIZE else None)
+
+
+def _limit_resource(main: Callable[[], None], what: int, size: int) -> None:
+    if what == resource.RLIMIT_AS:
+        size += int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(what, (size, size))
+    main()
 
 
 def full_disk(bench: Bench) -> Problems:
@@ -257,19 +251,6 @@ def _small_disk(folder: Path, size: int) -> Iterator[bool]:
     finally:
         if mounted:
             subprocess.run(["umount", str(folder)], check=True)
-
-
-def little_memory(bench: Bench) -> Problems:
-    """The address space may grow by so many megabytes."""
-    for megabytes in _EXTRA_MEMORY_MB:
-        bench.prepare()
-        main = partial(_with_memory, bench.locate("-q"), megabytes * 1_000_000)
-        yield from bench.judge(main, f"{megabytes} MB")
-
-
-def _with_memory(main: Callable[[], None], extra: int) -> None:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    _limit_resource(main, resource.RLIMIT_AS, pages * resource.getpagesize() + extra)
 
 
 def rivals(bench: Bench, rounds: int) -> Problems:
@@ -297,7 +278,7 @@ def read_only_input(bench: Bench) -> Problems:
             bench.endings[f"left out: others may not enter {parent}"] += 1
             return
     main = partial(_as_nobody, bench.locate("-q"))
-    outcome = bench.note(run_forked(main, bench.folder, bench.writable()))
+    outcome = bench.note(run_forked(main, bench.folder, bench.writable))
     if outcome.code:
         yield f"exit {outcome.code}: {outcome.stderr[-300:]}"
     yield from bench.problems()

@@ -18,7 +18,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -26,7 +25,8 @@ import numpy as np
 from numpy.random import Generator
 
 from abuse import databases, mutations, strangers
-from abuse.layouts import binary_fields
+from abuse.layouts import binary_fields, cut_records
+from abuse.mutations import Case
 from abuse.sandbox import Outcome, run_forked
 from abuse.verdicts import (
     MODEL_FILES,
@@ -40,30 +40,6 @@ from abuse.verdicts import (
 
 HELP = "damaged models, databases and graphs through the commands"
 _OLD_FILES = ("cameras", "images", "points3D")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
-    """A damaged input and how it is used."""
-
-    label: str
-    """What was damaged and how."""
-    arguments: tuple[str, ...]
-    """Of the command line, relative to the case's folder."""
-    same_answer: bool = False
-    """Whether the positions must be those of the sound input, since the damage does not concern them."""
-    encoding: str = "utf-8"
-    """Of the child's standard streams."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Report:
-    """How one case went."""
-
-    number: int
-    case: Case
-    outcome: Outcome
-    faults: tuple[str, ...]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -82,24 +58,23 @@ def run(args: argparse.Namespace) -> int:
         expected = warm(base)
         numbers = range(args.first, args.first + args.cases) if args.only is None else [args.only]
         start = time.perf_counter()
-        codes: collections.Counter[tuple[str, int]] = collections.Counter()
-        slowest = largest = failed = 0.0
-        done = 0
+        done: list[tuple[str, Outcome]] = []
+        failed = 0
         with contextlib.suppress(KeyboardInterrupt):  # which ends it early, with the figures so far
-            for report in reports(base, work / "case", numbers, args.seed, expected):
-                done += 1
-                outcome = report.outcome
-                codes[report.case.label.partition(":")[0], outcome.code] += 1
-                slowest, largest = max(slowest, outcome.cpu_s), max(largest, outcome.peak_bytes / 1e9)
-                if report.faults:
+            for number in numbers:
+                case, outcome, found = try_case(base, work / "case", [args.seed, number], expected)
+                done.append((case.label.partition(":")[0], outcome))
+                if found:
                     failed += 1
-                    print(f"case {report.number} ({report.case.label}): {'; '.join(report.faults)}")
-                    print(f"    {' '.join(report.case.arguments)}: {outcome.stderr[-1200:]}", flush=True)
+                    print(f"case {number} ({case.label}): {'; '.join(found)}")
+                    print(f"    {' '.join(case.arguments)}: {outcome.stderr[-1200:]}", flush=True)
                 if args.only is not None:
-                    print(report)
-        print(f"{done} cases, {failed:.0f} failed, in {time.perf_counter() - start:.0f} s")
-        print(f"slowest {slowest:.1f} s of processor time, largest {largest:.2f} GB")
-        for (kind, code), count in sorted(codes.items()):
+                    print(case, outcome)
+        print(f"{len(done)} cases, {failed} failed, in {time.perf_counter() - start:.0f} s")
+        slowest_s = max((outcome.cpu_s for _, outcome in done), default=0.0)
+        largest_gb = max((outcome.peak_bytes for _, outcome in done), default=0) / 1e9
+        print(f"slowest {slowest_s:.1f} s of processor time, largest {largest_gb:.2f} GB")
+        for (kind, code), count in sorted(collections.Counter((k, o.code) for k, o in done).items()):
             print(f"{kind:10} exit {code:3}: {count}")
     return int(failed > 0)
 
@@ -119,17 +94,10 @@ def make_base(folder: Path) -> Path:
         (folder / name).mkdir()
     model.write_text(folder / "text")
     model.write_binary(folder / "truth")
-    strangers.write_models(model, folder)
-    strangers.write_tables(model, folder)
+    shutil.copytree(strangers.SAMPLES, folder, dirs_exist_ok=True)
     shutil.copytree(folder / "sparse" / "0", folder / "old")
     for name in ("rigs", "frames"):
         (folder / "old" / f"{name}.bin").unlink()
-    rng = np.random.default_rng(0)
-    centers = rng.normal(size=(8, 3))
-    pairs = [(i, j) for i in range(8) for j in range(i) if rng.random() < 0.7]
-    units = [(centers[i] - centers[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
-    lines = [f"{i} {j} {' '.join(map(repr, v.tolist()))} 1.5" for (i, j), v in zip(pairs, units, strict=True)]
-    (folder / "graph.txt").write_text("# i j vx vy vz weight\n" + "\n".join(lines) + "\n")
     return folder
 
 
@@ -176,25 +144,19 @@ def _command(*arguments: str) -> None:
         raise RuntimeError(f"{' '.join(arguments)} failed: {result.output} {result.exception!r}")
 
 
-def reports(
-    base: Path,
-    folder: Path,
-    numbers: "range | list[int]",
-    seed: int,
-    expected: dict[str, list[tuple[float, ...]]],
-) -> Iterator[Report]:
-    """Make, run and judge the cases of these numbers one after the other; the last one's folder stays."""
-    for number in numbers:
-        shutil.rmtree(folder, ignore_errors=True)
-        (folder / "tmp").mkdir(parents=True)
-        rng = np.random.default_rng([seed, number])
-        make = mutations.pick(rng, _KINDS)
-        case = make(base, folder, rng)
-        before = snapshot(folder)
-        main = partial(command_line, case.arguments, folder / "tmp")
-        outcome = run_forked(main, folder, [folder, *caches()], encoding=case.encoding)
-        found = tuple(_judge(case, outcome, folder, before, expected))
-        yield Report(number=number, case=case, outcome=outcome, faults=found)
+def try_case(
+    base: Path, folder: Path, seed: list[int], expected: dict[str, list[tuple[float, ...]]]
+) -> tuple[Case, Outcome, list[str]]:
+    """Make, run and judge a case, whose folder stays until the next one."""
+    shutil.rmtree(folder, ignore_errors=True)
+    (folder / "tmp").mkdir(parents=True)
+    rng = np.random.default_rng(seed)
+    case = mutations.pick(rng, _KINDS)(base, folder, rng)
+    before = snapshot(folder)
+    main = partial(command_line, case.arguments, folder / "tmp")
+    encoding = "ascii" if rng.random() < 0.1 else "utf-8"
+    outcome = run_forked(main, folder, [folder, *caches()], encoding=encoding)
+    return case, outcome, list(_judge(case, outcome, folder, before, expected))
 
 
 def command_line(arguments: tuple[str, ...], temporary: Path) -> None:
@@ -231,25 +193,17 @@ def _judge(
     strays = [name for name in after if name.startswith("tmp/")]
     if strays:
         yield f"left {strays[0]} behind"
-    for out in _outputs(case, folder) if writes else ():
-        if case.arguments[0] != "convert":
-            yield from faults_of_tables(out)
-        if case.arguments[0] != "solve":
-            yield from faults_of_model(out)
+    if writes and (folder / case.arguments[2]).is_dir():
+        out = folder / case.arguments[2]
+        for written in sorted(out.glob("*/")) if case.arguments[0] == "map" else [out]:
+            yield from faults_of_tables(written) if case.arguments[0] != "convert" else ()
+            yield from faults_of_model(written) if case.arguments[0] != "solve" else ()
     if case.same_answer:
         if outcome.code:
             yield f"refused what is sound: {outcome.stderr[:300]!r}"
         form = "database" if "--database" in case.arguments else case.arguments[1]
         if not outcome.code and differs(positions(folder / "out"), expected[form]):
             yield "another answer"
-
-
-def _outputs(case: Case, folder: Path) -> list[Path]:
-    """Return the folders with a model or tables that a command wrote."""
-    out = folder / case.arguments[2]
-    if not out.is_dir():
-        return []
-    return [path for path in sorted(out.iterdir()) if path.is_dir()] if case.arguments[0] == "map" else [out]
 
 
 def _choose_command(
@@ -276,10 +230,6 @@ def _copy(base: Path, folder: Path, *names: str) -> None:
             shutil.copyfile(base / name, folder / name)
 
 
-def _encoding(rng: Generator) -> str:
-    return "ascii" if rng.random() < 0.1 else "utf-8"
-
-
 def _binary(base: Path, folder: Path, rng: Generator) -> Case:
     """One damaged binary file; if it holds points, which a database makes superfluous, the answer stays."""
     source = str(mutations.pick(rng, ("sparse/0", "sparse/0", "old")))
@@ -290,27 +240,17 @@ def _binary(base: Path, folder: Path, rng: Generator) -> Case:
     data = path.read_bytes()
     fields = binary_fields(name, data)
     ways = (*[mutations.change_fields] * 3, mutations.cut_at_field, mutations.shuffle_fields)
-    way = mutations.pick(rng, ways)
-    if rng.random() < 0.3:
-        path.write_bytes(mutations.change_bytes(data, rng))
-        label = "bytes"
-    else:
-        path.write_bytes(way(data, fields, rng))
-        label = way.__name__
-    arguments = _choose_command(source, rng, database=database)
-    return Case(label=f"binary: {name} {label}", arguments=arguments, encoding=_encoding(rng))
+    way = mutations.pick(rng, (*ways, mutations.change_bytes, mutations.change_bytes))
+    path.write_bytes(way(data, rng) if way is mutations.change_bytes else way(data, fields, rng))
+    return Case(f"binary: {name} {way.__name__}", _choose_command(source, rng, database=database))
 
 
 def _text(base: Path, folder: Path, rng: Generator) -> Case:
     database = rng.random() < 0.3
     _copy(base, folder, "text", "truth", *(["database.db"] if database else []))
     name = str(mutations.pick(rng, MODEL_FILES))
-    path = folder / "text" / f"{name}.txt"
-    ways = (*[mutations.change_words] * 4, *[mutations.change_lines] * 2)
-    way = mutations.pick(rng, (*ways, mutations.cut_at_word, mutations.change_bytes))
-    path.write_bytes(way(path.read_bytes(), rng))
-    arguments = _choose_command("text", rng, database=database)
-    return Case(label=f"text: {name} {way.__name__}", arguments=arguments, encoding=_encoding(rng))
+    way = mutations.damage_text(folder / "text" / f"{name}.txt", rng)
+    return Case(f"text: {name} {way}", _choose_command("text", rng, database=database))
 
 
 def _database(base: Path, folder: Path, rng: Generator) -> Case:
@@ -320,19 +260,14 @@ def _database(base: Path, folder: Path, rng: Generator) -> Case:
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=same)
     if not same and rng.random() < 0.15 and arguments[0] == "locate":
         arguments = (*arguments, "--directions", "relative-poses")
-    return Case(
-        label=f"database: {way.__name__}", arguments=arguments, same_answer=same, encoding=_encoding(rng)
-    )
+    return Case(f"database: {way.__name__}", arguments=arguments, same_answer=same)
 
 
 def _graph(base: Path, folder: Path, rng: Generator) -> Case:
     _copy(base, folder, "graph.txt")
-    path = folder / "graph.txt"
-    ways = (*[mutations.change_words] * 3, mutations.change_lines, mutations.cut_at_word)
-    way = mutations.pick(rng, (*ways, mutations.change_bytes))
-    path.write_bytes(way(path.read_bytes(), rng))
+    way = mutations.damage_text(folder / "graph.txt", rng)
     command = ("inspect", "graph.txt") if rng.random() < 0.15 else ("solve", "graph.txt", "out")
-    return Case(label=f"graph: {way.__name__}", arguments=command, encoding=_encoding(rng))
+    return Case(f"graph: {way}", command)
 
 
 def _names(base: Path, folder: Path, rng: Generator) -> Case:
@@ -350,7 +285,7 @@ def _names(base: Path, folder: Path, rng: Generator) -> Case:
         connection.commit()
     path.write_bytes(data)
     arguments = _choose_command("sparse/0", rng, database=True, locate_only=True)
-    return Case(label="names: hostile", arguments=arguments, same_answer=True, encoding=_encoding(rng))
+    return Case("names: hostile", arguments, same_answer=True)
 
 
 def _place(base: Path, folder: Path, rng: Generator) -> Case:
@@ -363,12 +298,10 @@ def _place(base: Path, folder: Path, rng: Generator) -> Case:
     target = str(mutations.pick(rng, (*models, "database.db", "graph.txt")))
     kind = mutations.misplace(folder / target, rng)
     if target == "graph.txt":
-        return Case(label=f"place: {kind}", arguments=("solve", "graph.txt", "out"))
+        return Case(f"place: {kind}", ("solve", "graph.txt", "out"))
     source = "text" if target.startswith("text") else "sparse/0"
-    return Case(
-        label=f"place: {kind} as {target}",
-        arguments=_choose_command(source, rng, database=target == "database.db"),
-    )
+    arguments = _choose_command(source, rng, database=target == "database.db")
+    return Case(f"place: {kind} as {target}", arguments)
 
 
 def _several(base: Path, folder: Path, rng: Generator) -> Case:
@@ -376,25 +309,21 @@ def _several(base: Path, folder: Path, rng: Generator) -> Case:
     _copy(base, folder, "sparse/0", "truth")
     name = str(mutations.pick(rng, MODEL_FILES))
     path = folder / "sparse" / "0" / f"{name}.bin"
-    data = path.read_bytes()
-    # Records start at their ids, all of one kind.
-    starts = [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
-    records = [data[a:b] for a, b in zip(starts, [*starts[1:], len(data)], strict=True)]
+    records = cut_records(name, path.read_bytes())
     order = rng.integers(len(records), size=int(rng.integers(0, 2 * len(records) + 1)))
     if rng.random() < 0.5:
         order = rng.permutation(len(records))[: int(rng.integers(0, len(records) + 1))]
     path.write_bytes(struct.pack("<Q", len(order)) + b"".join(records[int(k)] for k in order))
-    return Case(label=f"records: {name}", arguments=_choose_command("sparse/0", rng, database=False))
-
-
-def _of_others(base: Path, folder: Path, rng: Generator) -> Case:
-    """What other programs and people write."""
-    ways = (strangers.damage_stranger, strangers.damage_database, strangers.damage_table)
-    label, arguments = mutations.pick(rng, ways)(base, folder, rng)
-    return Case(label=label, arguments=arguments, encoding=_encoding(rng))
+    return Case(f"records: {name}", _choose_command("sparse/0", rng, database=False))
 
 
 _KINDS: tuple[Callable[[Path, Path, Generator], Case], ...] = (
     *(_binary, _binary, _binary, _text, _text, _database, _database, _database, _graph, _graph),
-    *(_names, _place, _several, _of_others, _of_others, _of_others, _of_others),
+    *(_names, _place, _several),
+    *(
+        strangers.damage_stranger,
+        strangers.damage_database,
+        strangers.damage_database,
+        strangers.damage_table,
+    ),
 )

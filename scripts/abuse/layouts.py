@@ -7,14 +7,34 @@ under attack. Layouts: see `sfm_shapefit/colmap/check.py`.
 
 import re
 import struct
-from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
 
 # Parameters of the camera models that the base scenes may have.
 _NUM_PARAMS = {0: 3, 1: 4, 2: 4, 3: 5, 4: 8, 5: 8, 6: 12}
+_POSE = ("ddddddd", "pose")
+_SENSOR = (("i", "sensor type"), ("I", "reference"))
+_RECORDS = {
+    "cameras": (("I", "id"), ("i", "camera model"), ("QQ", "size"), ("parameters", "parameter")),
+    "images": (
+        *(("I", "id"), _POSE, ("I", "reference"), ("name", "name")),
+        ("Q", "count", (("dd", "xy"), ("Q", "point reference"))),
+    ),
+    "points3D": (
+        *(("Q", "id"), ("ddd", "xyz"), ("BBB", "color"), ("d", "error")),
+        ("Q", "count", (("I", "image reference"), ("I", "reference"))),
+    ),
+    "rigs": (("I", "id"), ("I", "count", _SENSOR, (*_SENSOR, ("B", "has pose", (_POSE,))))),
+    "frames": (
+        *(("I", "id"), ("I", "reference"), _POSE),
+        ("I", "count", (*_SENSOR, ("Q", "image reference"))),
+    ),
+}
+"""Kinds and meaning of the fields of a record. One more entry follows so often as the field says; of two
+entries, the first follows once and then the second."""
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
+class Field(NamedTuple):
     """One field of a binary file."""
 
     offset: int
@@ -25,91 +45,44 @@ class Field:
     size: int
 
 
-class _Cutter:
-    """Cuts bytes into fields from the start."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.offset = data, 0
-        self.fields: list[Field] = []
-
-    def take(self, kind: str, meaning: str) -> int:
-        size = struct.calcsize(f"<{kind}")
-        self.fields.append(Field(self.offset, kind, meaning, size))
-        (value,) = struct.unpack_from(f"<{kind}", self.data, self.offset)
-        self.offset += size
-        return int(value) if kind != "d" else 0
-
-    def take_many(self, kinds: str, meaning: str) -> None:
-        for kind in kinds:
-            self.take(kind, meaning)
-
-    def take_name(self) -> None:
-        end = self.data.index(b"\0", self.offset) + 1
-        self.fields.append(Field(self.offset, "name", "name", end - self.offset))
-        self.offset = end
-
-
 def binary_fields(name: str, data: bytes) -> list[Field]:
     """Return the fields of a sound file; `name` is cameras, images, points3D, rigs or frames."""
-    cutter = _Cutter(data)
-    take_record = {
-        "cameras": _cut_camera,
-        "images": _cut_image,
-        "points3D": _cut_point,
-        "rigs": _cut_rig,
-        "frames": _cut_frame,
-    }[name]
-    for _ in range(cutter.take("Q", "count")):
-        take_record(cutter)
-    if cutter.offset != len(data):
-        raise ValueError(f"{name}: {len(data) - cutter.offset} bytes follow the last record")
-    return cutter.fields
+    fields: list[Field] = []
+    end = _cut(data, 0, (("Q", "count", _RECORDS[name]),), fields)
+    if end != len(data):
+        raise ValueError(f"{name}: {len(data) - end} bytes follow the last record")
+    return fields
 
 
-def _cut_camera(cutter: _Cutter) -> None:
-    cutter.take("I", "id")
-    model = cutter.take("i", "camera model")
-    cutter.take_many("QQ", "size")
-    cutter.take_many("d" * _NUM_PARAMS[model], "parameter")
+def cut_records(name: str, data: bytes) -> list[bytes]:
+    """Return the records of a sound file; each starts at its id."""
+    starts = [field.offset for field in binary_fields(name, data) if field.meaning == "id"]
+    return [data[a:b] for a, b in pairwise([*starts, len(data)])]
 
 
-def _cut_image(cutter: _Cutter) -> None:
-    cutter.take("I", "id")
-    cutter.take_many("d" * 7, "pose")
-    cutter.take("I", "reference")
-    cutter.take_name()
-    for _ in range(cutter.take("Q", "count")):
-        cutter.take_many("dd", "xy")
-        cutter.take("Q", "point reference")
+def read_field(data: bytes, field: Field) -> int:
+    """Return the whole number that a field holds."""
+    return int(struct.unpack_from(f"<{field.kind}", data, field.offset)[0])
 
 
-def _cut_point(cutter: _Cutter) -> None:
-    cutter.take("Q", "id")
-    cutter.take_many("ddd", "xyz")
-    cutter.take_many("BBB", "colour")
-    cutter.take("d", "error")
-    for _ in range(cutter.take("Q", "count")):
-        cutter.take("I", "image reference")
-        cutter.take("I", "reference")
-
-
-def _cut_rig(cutter: _Cutter) -> None:
-    cutter.take("I", "id")
-    for k in range(cutter.take("I", "count")):
-        cutter.take("i", "sensor type")
-        cutter.take("I", "reference")
-        if k and cutter.take("B", "has pose"):
-            cutter.take_many("d" * 7, "pose")
-
-
-def _cut_frame(cutter: _Cutter) -> None:
-    cutter.take("I", "id")
-    cutter.take("I", "reference")
-    cutter.take_many("d" * 7, "pose")
-    for _ in range(cutter.take("I", "count")):
-        cutter.take("i", "sensor type")
-        cutter.take("I", "reference")
-        cutter.take("Q", "image reference")
+def _cut(data: bytes, offset: int, record: tuple[tuple, ...], fields: list[Field]) -> int:
+    """Add the fields of a record that begins at an offset; return where it ends."""
+    for kinds, meaning, *inner in record:
+        if kinds == "name":
+            fields.append(Field(offset, "name", meaning, data.index(b"\0", offset) + 1 - offset))
+            offset += fields[-1].size
+            continue
+        if kinds == "parameters":
+            model = next(field for field in reversed(fields) if field.meaning == "camera model")
+            singles = "d" * _NUM_PARAMS[read_field(data, model)]
+        else:
+            singles = kinds
+        for kind in singles:
+            fields.append(Field(offset, kind, meaning, struct.calcsize(f"<{kind}")))
+            offset += fields[-1].size
+        for k in range(read_field(data, fields[-1]) if inner else 0):
+            offset = _cut(data, offset, inner[min(k, len(inner) - 1)], fields)
+    return offset
 
 
 def words(data: bytes) -> list[tuple[int, int]]:

@@ -7,11 +7,23 @@ import os
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from numpy.random import Generator
 
 from abuse.layouts import Field, words
+
+
+class Case(NamedTuple):
+    """A damaged input and how it is used."""
+
+    label: str
+    """What was damaged and how."""
+    arguments: tuple[str, ...]
+    """Of the command line, relative to the case's folder."""
+    same_answer: bool = False
+    """Whether the positions must be those of the sound input, since the damage does not concern them."""
+
 
 INTEGERS = (
     *(0, 1, 2, 7, 255, 2**31 - 1, 2**31, 2**32 - 1, 2**32),
@@ -154,21 +166,19 @@ def cut_at_word(data: bytes, rng: Generator) -> bytes:
     return data[: int(pick(rng, (start, end, (start + end) // 2)))]
 
 
+def damage_text(path: Path, rng: Generator) -> str:
+    """Damage a text file in one of the ways; return which."""
+    way = pick(rng, (*[change_words] * 3, change_lines, cut_at_word, change_bytes))
+    path.write_bytes(way(path.read_bytes(), rng))
+    return str(way.__name__)
+
+
 def misplace(path: Path, rng: Generator) -> str:
     """Put something that is no ordinary file in the place of one; return what."""
     data = path.read_bytes()
     path.unlink()
-    kinds = (
-        "nothing",
-        "empty file",
-        "folder",
-        "fifo",
-        "dangling link",
-        "link loop",
-        "endless device",
-        "link",
-    )
-    kind = str(pick(rng, kinds))
+    links = ("dangling link", "link loop", "endless device", "link")
+    kind = str(pick(rng, ("nothing", "empty file", "folder", "fifo", *links)))
     match kind:
         case "empty file":
             path.write_bytes(b"")

@@ -13,8 +13,8 @@ import signal
 import sys
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 CPU_LIMIT_S = 10
 # Several times the former, for the machine may be shared.
@@ -30,8 +30,7 @@ _FORBIDDEN = ("socket.", "subprocess.", "os.system", "os.exec", "os.posix_spawn"
 _HARMLESS = ("/dev/null", "/dev/tty")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class Outcome(NamedTuple):
     """How a call ended."""
 
     code: int
@@ -45,8 +44,7 @@ class Outcome:
     """What the child did outside the folders it may write to, and what nobody may do, from audit events."""
 
 
-@dataclass(frozen=True, slots=True)
-class Child:
+class Child(NamedTuple):
     """A forked child that is at work."""
 
     pid: int

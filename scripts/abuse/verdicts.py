@@ -43,16 +43,13 @@ def faults(outcome: Outcome) -> Iterator[str]:
         yield f"did {outcome.deeds[0]}"
     if "Traceback" in outcome.stderr:
         yield "a traceback"
-    if outcome.code in (3, 4):
-        yield from _faults_of_refusal(outcome)
-    if outcome.code == 0 and outcome.stderr:
-        yield f"stderr in spite of success: {outcome.stderr[:200]!r}"
-
-
-def _faults_of_refusal(outcome: Outcome) -> Iterator[str]:
     text = outcome.stderr
+    if outcome.code == 0 and text:
+        yield f"stderr in spite of success: {text[:200]!r}"
     if outcome.stdout and outcome.code == 3:
         yield "stdout in spite of a refusal"
+    if outcome.code not in (3, 4):
+        return
     if not text.startswith("sfm-shapefit: ") or text.count("\n") != 1 or not text.endswith("\n"):
         yield f"not one sentence: {text[:300]!r}"
     if not text[:-1].isprintable():
@@ -68,9 +65,9 @@ def faults_of_tables(out: Path) -> Iterator[str]:
     placed = [row for row in rows if row["placed"] == "true"]
     axes = [name for name in rows[0] if name in "xyz" or name.startswith("x")] if rows else []
     if any(not math.isfinite(float(row[axis] or "nan")) for row in placed for axis in axes):
-        yield "a placed camera without a finite centre"
+        yield "a placed camera without a finite center"
     if any(row[axis] for row in rows if row["placed"] != "true" and not row["piece"] for axis in axes):
-        yield "a camera that is not placed has a centre"
+        yield "a camera that is not placed has a center"
     if facts["num_placed"] != len(placed):
         yield f"{facts['num_placed']} placed in locate.json, {len(placed)} in cameras.csv"
     gap = facts["solve"]["gap"]
@@ -99,7 +96,7 @@ def read_cameras(out: Path) -> list[dict[str, str]]:
 
 
 def positions(out: Path) -> list[tuple[float, ...]]:
-    """Return the centres of the placed cameras, sorted: they identify cameras whose names were changed."""
+    """Return the centers of the placed cameras, sorted: they identify cameras whose names were changed."""
     rows = (row for row in read_cameras(out) if row["placed"] == "true")
     return sorted(tuple(float(row[axis]) for axis in "xyz") for row in rows)
 

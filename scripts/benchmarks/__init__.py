@@ -7,7 +7,7 @@ A module has `BENCHMARK`, which `harness.driver` runs, or the functions `add_arg
 INDEX = {
     "answers": "What every command answers: recorded, and compared with an earlier recording.",
     "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
-    "directions": "Directions from matches: speed, memory, calibration, and what their weights are worth.",
+    "directions": "Directions from matches: speed, memory and calibration.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
@@ -18,5 +18,5 @@ INDEX = {
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
-    "trust": "Standard deviations and trust against errors; wrong rotations recognised.",
+    "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
 }

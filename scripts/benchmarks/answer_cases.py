@@ -5,8 +5,8 @@ is run.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.answer_inputs import MADE, MADRID, truth_of
 
@@ -19,8 +19,7 @@ _LARGE = ("kitti-turn", "liberty", "liberty-calibrated", "robots-1")
 _SILENT = "--quiet --no-report"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
+class Case(NamedTuple):
     """One run of the command line."""
 
     name: str
@@ -213,7 +212,7 @@ def all_cases(folders: Mapping[str, Path]) -> list[Case]:
         *(_case(name, line) for name, line in _OTHERS.items()),
         *(_case(f"wrong/{name}", line) for name, line in _WRONG.items()),
     ]
-    return [replace(case, quick=case.name in _QUICK) for case in cases]
+    return [case._replace(quick=case.name in _QUICK) for case in cases]
 
 
 def _out(name: str) -> str:
@@ -237,7 +236,7 @@ def _locate_cases(scene: str, truth: str) -> Iterator[Case]:
     followers = [_evaluation(name, "", reference, scene)]
     if scene == "ring8":
         followers += [
-            replace(_case("report/ring8", f"report {_out(name)}"), out=_out(name)),
+            _case("report/ring8", f"report {_out(name)}")._replace(out=_out(name)),
             _case("table/evaluate", f"evaluate {_out(name)} {reference}"),
             _case("convert/output", f"convert {_out(name)} OUT.csv"),
         ]

@@ -26,9 +26,8 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -37,6 +36,7 @@ from benchmarks.answer_cases import BUNDLED, Case, all_cases
 from benchmarks.answer_differences import compare, report
 from benchmarks.answer_inputs import MADE, MADRID, make_inputs
 from harness.driver import DATA, ROOT
+from harness.record import leave_out
 
 LIMIT_S = 300
 """Seconds after which a case is ended; its exit code is then recorded as "timeout"."""
@@ -50,8 +50,7 @@ _MODEL_FILES = {f"{stem}.txt" for stem in ("cameras", "images", "points3D", "rig
 Answer = dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class Runner:
+class Runner(NamedTuple):
     """Runs commands of one checkout in the folder of the inputs."""
 
     package: Path
@@ -73,7 +72,7 @@ class Runner:
         answer = {"exit": code, "said": said[-1] if said else "", "files": [], "printed": ""}
         answer |= {"models": {}, "tables": {}, "json": {}, "texts": {}}
         if stdout.startswith("{"):
-            answer["json"]["stdout"] = _keep(json.loads(stdout))
+            answer["json"]["stdout"] = leave_out(_VARIABLE, json.loads(stdout))
         else:
             printed = stdout.replace(f"{self.work}/", "")
             answer["printed"] = _NUMBER.sub("#", _BORDERS.sub(" ", printed)).strip()
@@ -112,13 +111,6 @@ class Runner:
             )
 
 
-def _keep(value: Any) -> Any:
-    """Return a JSON value without what differs from run to run."""
-    if isinstance(value, dict):
-        return {key: _keep(inner) for key, inner in value.items() if key not in _VARIABLE}
-    return [_keep(inner) for inner in value] if isinstance(value, list) else value
-
-
 def _collect(out: Path, answer: Answer) -> None:
     """Add what was written to an answer, file by file."""
     files = sorted(path for path in (out.rglob("*") if out.is_dir() else [out]) if path.is_file())
@@ -130,7 +122,7 @@ def _collect(out: Path, answer: Answer) -> None:
         elif path.suffix == ".csv":
             answer["tables"][key] = _table(path)
         elif path.suffix == ".json":
-            answer["json"][key] = _keep(json.loads(path.read_text(encoding="utf-8")))
+            answer["json"][key] = leave_out(_VARIABLE, json.loads(path.read_text(encoding="utf-8")))
         elif path.suffix == ".db":
             answer["texts"][key] = _digest(path)
         elif path.suffix in (".txt", ".tum", ".g2o") and path.name not in _MODEL_FILES:
@@ -138,7 +130,7 @@ def _collect(out: Path, answer: Answer) -> None:
 
 
 def _model(folder: Path) -> dict[str, Any]:
-    """Return the poses of a model by image name, centre and quaternion, and figures of its points."""
+    """Return the poses of a model by image name, center and quaternion, and figures of its points."""
     model = pycolmap.Reconstruction(folder)
     posed = {image.name: image for image in model.images.values() if image.has_pose}
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)

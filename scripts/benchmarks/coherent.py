@@ -8,16 +8,15 @@ answer stands beside it.
 """
 
 import argparse
-import statistics
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
 from functools import partial
+from typing import NamedTuple
 
 from harness import ours
 from harness.driver import Benchmark, Case
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
-from harness.metrics import Check, Quantity, number, verdict
-from harness.record import table, table_of
+from harness.metrics import Check, Quantity, Trials, number, verdict
+from harness.record import table_of
 
 PROBLEMS = {
     "er2-50": GraphSpec(family="er2", n=50, sigma=0.01),
@@ -30,8 +29,7 @@ BROKEN = 0.2
 """Relative error from which a method counts as broken; two independent configurations are 1.4 apart."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trial:
+class Trial(NamedTuple):
     """One graph, solved by all methods."""
 
     shapefit: float
@@ -41,24 +39,6 @@ class Trial:
     """Error against the second configuration."""
     contradicting: float
     warned: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trials:
-    """All seeds of one problem at one share of wrong pairs."""
-
-    name: str
-    q: float
-    trials: Sequence[Trial]
-
-    @property
-    def broken(self) -> list[Trial]:
-        """Those whose placed answer is wrong."""
-        return [trial for trial in self.trials if trial.placed > BROKEN]
-
-    def median(self, column: str) -> float:
-        """Return the median of a field of the trials."""
-        return float(statistics.median(getattr(trial, column) for trial in self.trials))
 
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
@@ -73,7 +53,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
 
 def measure_seeds(name: str, spec: GraphSpec, q: float, seeds: int) -> Trials:
     """Measure a problem at one share of wrong pairs."""
-    return Trials(name=name, q=q, trials=[measure(spec, q, seed) for seed in range(seeds)])
+    return Trials(name, q, [measure(spec, q, seed) for seed in range(seeds)])
 
 
 def measure(spec: GraphSpec, q: float, seed: int) -> Trial:
@@ -96,13 +76,18 @@ def measure(spec: GraphSpec, q: float, seed: int) -> Trial:
     )
 
 
+def find_broken(found: Trials) -> list[Trial]:
+    """Return those whose placed answer is wrong; the problem is the share of wrong pairs."""
+    return [trial for trial in found.trials if trial.placed > BROKEN]
+
+
 def checks(found: Trials) -> list[Check]:
     """Return the limits: a broken answer carries a warning, and one without wrong pairs does not."""
     limits = []
-    if found.broken:
-        warned = sum(trial.warned for trial in found.broken)
-        limits.append(Check(name="warned", value=warned, limit=len(found.broken), better="higher"))
-    if found.q == 0.0:
+    if broken := find_broken(found):
+        warned = sum(trial.warned for trial in broken)
+        limits.append(Check(name="warned", value=warned, limit=len(broken), better="higher"))
+    if found.problem == 0.0:
         alarms = sum(trial.warned for trial in found.trials)
         limits.append(Check(name="false alarms", value=alarms, limit=0))
     return limits
@@ -127,7 +112,7 @@ def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterato
         measured.values(),
         {
             "problem": lambda one: one.name,
-            "q": lambda one: f"{one.q:g}",
+            "q": lambda one: f"{one.problem:g}",
             "ShapeFit": lambda one: number(one.median("shapefit")),
             "LUD": lambda one: number(one.median("lud")),
             "placed": lambda one: number(one.median("placed")),
@@ -135,21 +120,27 @@ def tables(measured: Mapping[str, Trials], _args: argparse.Namespace) -> Iterato
             "contradicting": lambda one: f"{one.median('contradicting'):.0%}",
             "warned": lambda one: (
                 f"{sum(trial.warned for trial in one.trials)} of {len(one.trials)},"
-                f" {sum(trial.warned for trial in one.broken)} of {len(one.broken)} broken"
+                f" {sum(trial.warned for trial in find_broken(one))} of {len(find_broken(one))} broken"
             ),
             "verdict": lambda one: verdict(checks(one)),
         },
     )
     yield f"## Where the methods break\n\nThe least q from which on the median error stays above {BROKEN:g}."
-    rows = []
-    for name in dict.fromkeys(one.name for one in measured.values()):
-        cells = []
-        for column in ("shapefit", "lud", "placed"):
-            errors = {one.q: one.median(column) for one in measured.values() if one.name == name}
-            share = breaking_share(errors)
-            cells.append("never" if share is None else f"{share:g}")
-        rows.append([name, *cells])
-    yield table(["problem", "ShapeFit", "LUD", "placed"], rows)
+
+    def show_share(name: str, column: str) -> str:
+        errors = {one.problem: one.median(column) for one in measured.values() if one.name == name}
+        share = breaking_share(errors)
+        return "never" if share is None else f"{share:g}"
+
+    yield table_of(
+        dict.fromkeys(one.name for one in measured.values()),
+        {
+            "problem": str,
+            "ShapeFit": lambda name: show_share(name, "shapefit"),
+            "LUD": lambda name: show_share(name, "lud"),
+            "placed": lambda name: show_share(name, "placed"),
+        },
+    )
 
 
 BENCHMARK = Benchmark(
@@ -163,16 +154,9 @@ BENCHMARK = Benchmark(
     repeats=5,
     quantities=(
         Quantity("q", "1", "neither", 0.0, "odds that a direction is a wrong one"),
-        Quantity(
-            *("ShapeFit, LUD, placed", "1", "lower", 0.05),
-            "error against the truth, both centred and of unit norm, median of the seeds; "
-            "placed is what `place` and `locate` give",
-        ),
+        Quantity("ShapeFit, LUD, placed", "1", "lower", 0.05, "against the truth, median of the seeds"),
         Quantity("placed, false", "1", "neither", 0.05, "the same against the second configuration"),
         Quantity("contradicting", "1", "neither", 0.05, "share of pairs that contradict the answer, median"),
-        Quantity(
-            *("warned", "seeds", "neither", 0.0),
-            f"seeds with a warning in the report, and of those, seeds with an error above {BROKEN:g}",
-        ),
+        Quantity("warned", "seeds", "neither", 0.0, f"and of those with an error above {BROKEN:g}"),
     ),
 )

@@ -1,5 +1,4 @@
-"""Directions from matches: pairs per second, memory over many batches, whether the covariance is right, and
-what the weights made of it are worth.
+"""Directions from matches: pairs per second, memory over many batches, and whether the covariance is right.
 
 The matches are synthetic: two cameras of 1000 px focal length and 1000 x 750 px see points 4 to 8 units
 away, with Gaussian noise in each pixel coordinate; wrong matches end anywhere in the second image. The
@@ -15,14 +14,11 @@ import multiprocessing
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
-from benchmarks import weights
-from benchmarks.real import SCENES
-from harness.driver import Benchmark, if_there, positive
-from harness.driver import Case as AnyCase
+from harness import driver
+from harness.driver import Benchmark, positive
 from harness.metrics import Check, Quantity, number, numbers, verdict
 from harness.process import resident_memory_mb
 from harness.record import table_of
@@ -40,8 +36,7 @@ MAX_GROWTH_MB = 20.0
 NO_PARALLAX_LIMIT = 0.01
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Case:
+class Case(NamedTuple):
     """Pairs of one kind."""
 
     name: str
@@ -74,8 +69,7 @@ STILL = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class Calibration(NamedTuple):
     """What one case gave."""
 
     case: Case
@@ -83,15 +77,13 @@ class Calibration:
     """Share of the pairs that have a direction."""
     no_parallax: float
     """Share of the pairs that are said to have no parallax."""
-    mean: float
+    mean: float = math.nan
     """Mean normalized error."""
-    median_deg: float
-    p95_deg: float
-    """95th percentile of the error."""
+    angles_deg: tuple[float, float] = (math.nan, math.nan)
+    """Median and 95th percentile of the error."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Speed:
+class Speed(NamedTuple):
     """How fast so many pairs went in one setting."""
 
     label: str
@@ -101,40 +93,23 @@ class Speed:
     growth_mb: float
     """Resident memory at the end minus that after the first batch, of the worst process."""
 
-    @property
-    def pairs_per_s(self) -> float:
-        """Pairs per second of wall-clock time."""
-        return self.pairs / self.seconds
-
-
-Measured = Speed | Calibration | weights.Comparison
-
 
 def flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pairs", type=positive, default=1_000_000, help="pairs in batches")
     parser.add_argument("--draws", type=positive, default=2000, help="pairs per calibration case")
 
 
-def cases(args: argparse.Namespace) -> dict[str, AnyCase]:
-    """Return speed by threads and processes, the kinds of pairs, and the sets with and without weights."""
+def cases(args: argparse.Namespace) -> dict[str, driver.Case]:
+    """Return speed by threads and processes, and the kinds of pairs."""
     tenth = max(args.pairs // 10, BATCH)
-    found: dict[str, AnyCase] = {
+    found: dict[str, driver.Case] = {
         "1 thread": partial(measure_batches, BATCH if args.quick else tenth, 1),
         "2 threads": partial(measure_batches, BATCH if args.quick else tenth, 2),
         "2 processes": partial(measure_processes, args.pairs),
     }
     found |= {case.name: partial(measure_case, case, args.draws) for case in (*CASES, *STILL)}
-    for name in SCENES:
-        folder = args.data / name
-        found[name] = if_there(folder, partial(weights.compare_real, name, folder))
-    for shape in weights.MADE:
-        for seed in range(weights.SEEDS):
-            found[f"{shape}, made {seed}"] = partial(weights.compare_made, shape, seed)
-    quick = ("1 thread", CASES[0].name, STILL[0].name, "cloud, made 0")
+    quick = ("1 thread", CASES[0].name, STILL[0].name)
     return {name: found[name] for name in quick} if args.quick else found
-
-
-# --- measuring -------------------------------------------------------------------------------------
 
 
 def make_pairs(case: Case, count: int, seed: int) -> "tuple[RayMatches, FloatArray]":
@@ -194,22 +169,12 @@ def measure_case(case: Case, count: int) -> Calibration:
     usable = found.usable()
     missing = found.counts().get(DirectionStatus.NO_PARALLAX, 0) / count
     if len(usable) == 0:
-        nothing = math.nan
-        return Calibration(
-            case=case, usable=0.0, no_parallax=missing, mean=nothing, median_deg=nothing, p95_deg=nothing
-        )
+        return Calibration(case, 0.0, missing)
     d, truth = found.directions[usable], truth[usable]
     error = np.einsum("kdi,kd->ki", tangent_bases(d), truth)
     squares = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.covariance[usable]), error)
-    angles_deg = angle_between_deg(d, truth)
-    return Calibration(
-        case=case,
-        usable=len(usable) / count,
-        no_parallax=missing,
-        mean=float(squares.mean()),
-        median_deg=float(np.median(angles_deg)),
-        p95_deg=float(np.quantile(angles_deg, 0.95)),
-    )
+    angles_deg = tuple(np.quantile(angle_between_deg(d, truth), (0.5, 0.95)).tolist())
+    return Calibration(case, len(usable) / count, missing, float(squares.mean()), angles_deg)
 
 
 def measure_batches(pairs: int, threads: int) -> Speed:
@@ -245,16 +210,13 @@ def measure_processes(pairs: int) -> Speed:
     )
 
 
-def checks(one: Measured) -> list[Check]:
-    """Return the limits of one case; a comparison of weights has none of its own."""
-    if isinstance(one, weights.Comparison):
-        return []
+def checks(one: Speed | Calibration) -> list[Check]:
+    """Return the limits of one case."""
     if isinstance(one, Speed):
         limits = [Check(name="growth", value=one.growth_mb, limit=MAX_GROWTH_MB)]
         if one.label == "2 processes":
-            limits.append(
-                Check(name="pairs/s", value=one.pairs_per_s, limit=MIN_PAIRS_PER_S, better="higher")
-            )
+            speed = one.pairs / one.seconds
+            limits.append(Check(name="pairs/s", value=speed, limit=MIN_PAIRS_PER_S, better="higher"))
         return limits
     if one.case in STILL:
         return [Check(name="usable", value=one.usable, limit=NO_PARALLAX_LIMIT)]
@@ -266,7 +228,7 @@ def checks(one: Measured) -> list[Check]:
     ]
 
 
-def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
+def tables(measured: Mapping[str, Speed | Calibration], _args: argparse.Namespace) -> Iterator[str]:
     found = list(measured.values())
     calibrations = [one for one in found if isinstance(one, Calibration)]
     yield f"## Speed, {MATCHES} matches per pair, batches of {BATCH} pairs"
@@ -275,7 +237,7 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
         {
             "setting": lambda one: one.label,
             "pairs": lambda one: str(one.pairs),
-            "pairs/s": lambda one: number(one.pairs_per_s),
+            "pairs/s": lambda one: number(one.pairs / one.seconds),
             "pairs per CPU second": lambda one: number(one.pairs / one.cpu_s),
             "growth, MB": lambda one: number(one.growth_mb),
             "verdict": lambda one: verdict(checks(one)),
@@ -288,7 +250,7 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
             "case": lambda one: one.case.name,
             "usable": lambda one: f"{one.usable:.1%}",
             "normalized error": lambda one: number(one.mean),
-            "error, median / 95 %, deg": lambda one: numbers([one.median_deg, one.p95_deg]),
+            "error, median / 95 %, deg": lambda one: numbers(one.angles_deg),
             "verdict": lambda one: verdict(checks(one)),
         },
     )
@@ -302,8 +264,6 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
             "verdict": lambda one: verdict(checks(one)),
         },
     )
-    yield "## What the pairs' weights are worth"
-    yield from weights.tables([one for one in found if isinstance(one, weights.Comparison)])
 
 
 BENCHMARK = Benchmark(
@@ -317,15 +277,8 @@ BENCHMARK = Benchmark(
     quick={"pairs": BATCH, "draws": 200},
     quantities=(
         Quantity("pairs/s", "1/s", "higher", 0.25, "wall-clock, without start-up"),
-        Quantity(
-            *("growth", "MB", "lower", 1.0),
-            "resident memory at the end minus that after the first batch, of the worst process",
-        ),
-        Quantity(
-            *("normalized error", "1", "neither", 0.05),
-            "mean of r^T Sigma^-1 r over the usable pairs; 2 where the covariance is right",
-        ),
+        Quantity("growth", "MB", "lower", 1.0, "of resident memory after the first batch, worst process"),
+        Quantity("normalized error", "1", "neither", 0.05, "mean of r^T Sigma^-1 r; 2 where Sigma is right"),
         Quantity("error, median / 95 %", "deg", "lower", 0.05, "of the usable directions"),
-        *weights.QUANTITIES,
     ),
 )

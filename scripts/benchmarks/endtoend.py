@@ -10,14 +10,16 @@ a stage is linear; other users of the machine change the clock, and hardly that.
 import argparse
 import json
 import math
+import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case, if_there, positive
@@ -30,14 +32,17 @@ LARGEST = 10_000
 MOST_S, MOST_MB = 600.0, 4000.0
 FORECAST_FACTOR = 1.5
 """By which the forecast of memory may be off, either way."""
-MATCHES_PER_PAIR, PAIRS_PER_IMAGE, POINTS_PER_IMAGE = 100, 60, 33
+POINTS_PER_IMAGE = 33
+SCENE_FLAGS = (
+    "--shape facade --max-pairs-per-image 60 --min-matches 100 --max-matches-per-pair 100"
+    " --wrong-match-fraction 0.2 --corrupted-pair-fraction 0.1 --seed 1"
+)
 SETS = ("fountain-P11", "Herz-Jesus-P8", "Herz-Jesus-P25", "castle-P19", "castle-P30", "lego100", "liberty")
 # A shorter stage says nothing of an exponent.
 _SHORT_S = 1.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Usage:
+class Usage(NamedTuple):
     """What a process took."""
 
     wall_s: float = 0.0
@@ -45,8 +50,7 @@ class Usage:
     peak_mb: float = 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Located:
+class Located(NamedTuple):
     """One scene."""
 
     name: str
@@ -62,12 +66,8 @@ class Located:
     @property
     def usage(self) -> Usage:
         """What all stages took."""
-        used = self.stages.values()
-        return Usage(
-            wall_s=sum(one.wall_s for one in used),
-            cpu_s=sum(one.cpu_s for one in used),
-            peak_mb=max(one.peak_mb for one in used),
-        )
+        wall_s, cpu_s, peaks_mb = zip(*self.stages.values(), strict=True)
+        return Usage(sum(wall_s), sum(cpu_s), max(peaks_mb))
 
 
 class Stages:
@@ -75,19 +75,16 @@ class Stages:
 
     def __init__(self) -> None:
         self.found: dict[str, Usage] = {}
-        self._stage, self._wall_s, self._cpu_s = "imports", time.perf_counter(), 0.0
+        self._stage, self._start = "imports", (time.perf_counter(), 0.0)
 
     def __call__(self, stage: str, _done: int = 0, _total: int = 1) -> None:
         if stage == self._stage:
             return
-        earlier = self.found.get(self._stage, Usage())
-        wall_s, cpu_s = time.perf_counter(), time.process_time()
-        self.found[self._stage] = Usage(
-            wall_s=earlier.wall_s + wall_s - self._wall_s,
-            cpu_s=earlier.cpu_s + cpu_s - self._cpu_s,
-            peak_mb=max(earlier.peak_mb, peak_memory_mb()),
-        )
-        self._stage, self._wall_s, self._cpu_s = stage, wall_s, cpu_s
+        wall_s, cpu_s, peak_mb = self.found.get(self._stage, Usage())
+        now = time.perf_counter(), time.process_time()
+        wall_s, cpu_s = wall_s + now[0] - self._start[0], cpu_s + now[1] - self._start[1]
+        self.found[self._stage] = Usage(wall_s, cpu_s, max(peak_mb, peak_memory_mb()))
+        self._stage, self._start = stage, now
         reset_peak()
 
 
@@ -113,14 +110,13 @@ def measure_made(num_images: int, folder: Path | None, threads: int) -> Located:
     with tempfile.TemporaryDirectory() as temporary:
         scene = (folder or Path(temporary)) / f"facade{num_images}"
         if not scene.exists():
-            run_command("synth", scene, *scene_flags(num_images))
+            size = f"--num-images {num_images} --num-points {POINTS_PER_IMAGE * num_images}"
+            run_command("synth", scene, *size.split(), *SCENE_FLAGS.split())
         return measure(f"{num_images} images", scene, threads, is_made=True)
 
 
 def measure(name: str, scene: Path, threads: int, is_made: bool = False) -> Located:
     """Locate the cameras of a scene, and write the result."""
-    import pycolmap
-
     model = scene / "sparse" / "0"
     forecast = json.loads(run_command("inspect", model, "--json"))["expected"]
     with tempfile.TemporaryDirectory() as temporary:
@@ -134,8 +130,8 @@ def measure(name: str, scene: Path, threads: int, is_made: bool = False) -> Loca
             # The model's centers are the true ones, at which `locate` does not look.
             found = json.loads(run_command("evaluate", out, model, "--json"))
             error = found["position_error"]["median"] / found["extent"]
-        with pycolmap.Database.open(_copy(scene / "database.db", temporary)) as opened:
-            num_matches = int(opened.num_inlier_matches())
+        with closing(sqlite3.connect(f"file:{scene / 'database.db'}?mode=ro", uri=True)) as opened:
+            (num_matches,) = opened.execute("SELECT sum(rows) FROM two_view_geometries").fetchone()
     return Located(
         name=name,
         num_images=facts["num_images"],
@@ -146,22 +142,6 @@ def measure(name: str, scene: Path, threads: int, is_made: bool = False) -> Loca
         forecast_mb=forecast["peak_mb"],
         stages=stages.found,
     )
-
-
-def _copy(database: Path, folder: str) -> Path:
-    """Return a copy of a database, for pycolmap changes what it opens."""
-    from peers.colmap import copy_database
-
-    return copy_database(database, Path(folder))
-
-
-def scene_flags(num_images: int) -> Iterator[object]:
-    """Yield what `synth` makes a scene of."""
-    yield from ("--shape", "facade", "--num-images", num_images)
-    yield from ("--num-points", POINTS_PER_IMAGE * num_images)
-    yield from ("--max-pairs-per-image", PAIRS_PER_IMAGE)
-    yield from ("--min-matches", MATCHES_PER_PAIR, "--max-matches-per-pair", MATCHES_PER_PAIR)
-    yield from ("--wrong-match-fraction", 0.2, "--corrupted-pair-fraction", 0.1, "--seed", 1)
 
 
 def run_command(*words: object) -> str:
@@ -216,15 +196,11 @@ def _show_stages(made: Sequence[Located]) -> str:
     for name in made[-1].stages:
         used = [one.stages.get(name, Usage()) for one in made]
         cells = [f"{one.wall_s:.1f} / {one.cpu_s:.1f} / {one.peak_mb:.0f}" for one in used]
-        rows.append([name, *cells, _show_exponent(made, [one.cpu_s for one in used])])
+        exponent, first_s, last_s = math.nan, used[0].cpu_s, used[-1].cpu_s
+        if len(made) > 1 and min(first_s, last_s) >= _SHORT_S:
+            exponent = math.log(last_s / first_s) / math.log(made[-1].num_matches / made[0].num_matches)
+        rows.append([name, *cells, f"{exponent:.2f}".replace("nan", "-")])
     return table(["stage", *[one.name for one in made], "exponent"], rows)
-
-
-def _show_exponent(made: Sequence[Located], cpu_s: Sequence[float]) -> str:
-    if len(made) < 2 or min(cpu_s[0], cpu_s[-1]) < _SHORT_S:
-        return "-"
-    growth = math.log(made[-1].num_matches / made[0].num_matches)
-    return f"{math.log(cpu_s[-1] / cpu_s[0]) / growth:.2f}"
 
 
 BENCHMARK = Benchmark(

@@ -8,9 +8,9 @@ any other.
 import argparse
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from benchmarks.real import SCENES, Scene, show_errors
 from harness.driver import Benchmark, Case, if_there, positive
@@ -24,12 +24,11 @@ CPU_LIMIT_S = 150
 QUICK = GraphSpec(family="er2", n=20, sigma=0.01)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OnScene:
+class OnScene(NamedTuple):
     """All contenders on a real scene."""
 
     scene: Scene
-    rows: tuple[on_scenes.Row, ...]
+    rows: tuple[on_graphs.Answer, ...]
 
 
 def flags(parser: argparse.ArgumentParser) -> None:
@@ -95,19 +94,14 @@ def tables(measured: Mapping[str, on_graphs.Compared | OnScene], args: argparse.
 
 
 def _rows(one: on_graphs.Compared | OnScene) -> Iterator[list[str]]:
-    if isinstance(one, OnScene):
-        for row in one.rows:
-            yield [one.scene.label, row.name, show_errors(row.errors), *_costs(row), row.note]
-    else:
-        for answer in one.answers:
-            label = f"{one.name} ({one.num_edges} pairs)"
-            yield [label, answer.name, number(answer.error), *_costs(answer), answer.note]
-
-
-def _costs(answer: on_graphs.Answer | on_scenes.Row) -> list[str]:
-    """Return the cells of time and memory."""
-    cpu = f" ({number(answer.cpu_s)})" if math.isfinite(answer.cpu_s) else ""
-    return [number(answer.seconds) + cpu, f"{answer.peak_mb:.0f}".replace("nan", "-")]
+    for answer in one.rows if isinstance(one, OnScene) else one.answers:
+        if isinstance(one, OnScene):
+            problem, error = one.scene.label, show_errors(answer.error)
+        else:
+            problem, error = f"{one.name} ({one.num_edges} pairs)", number(answer.error)
+        cpu = f" ({number(answer.cpu_s)})" if math.isfinite(answer.cpu_s) else ""
+        peak = f"{answer.peak_mb:.0f}".replace("nan", "-")
+        yield [problem, answer.name, error, number(answer.seconds) + cpu, peak, answer.note]
 
 
 BENCHMARK = Benchmark(
@@ -122,19 +116,13 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity(
             *("error", "1 on graphs, the set's on scenes", "lower", 0.05),
-            "graphs: against the truth, both centered and of unit norm; scenes: median / mean / max of"
-            " position after robust (L1) alignment, over the cameras that are placed",
+            "graphs: both centered and of unit norm; scenes: median / mean / max after L1 alignment",
         ),
         Quantity(
             *("seconds (CPU)", "s", "lower", 0.5),
-            "wall-clock, and CPU time of all threads, of the call that turns directions, tracks or"
-            " (mapping) a database into positions, one run; for `locate`, wall-clock of placing and judging,"
-            " for positioning without its tracks",
+            "of the call that turns directions, tracks or (mapping) a database into positions; for"
+            " `locate`, wall-clock of placing and judging, for positioning without its tracks",
         ),
-        Quantity(
-            *("peak MB", "10^6 bytes", "lower", 0.1),
-            "peak resident memory of the whole process while the clock ran; for `locate` and pycolmap with"
-            " reading the database",
-        ),
+        Quantity("peak MB", "10^6 bytes", "lower", 0.1, "resident, of the whole process while the clock ran"),
     ),
 )

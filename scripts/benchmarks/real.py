@@ -14,9 +14,9 @@ import math
 import tempfile
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from harness import ours
 from harness.driver import ROOT, Benchmark, Case, if_there
@@ -25,14 +25,13 @@ from harness.process import peak_memory_mb
 from harness.record import table_of
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scene:
+class Scene(NamedTuple):
     """A data set and what is to be reached on it; limits of the median and mean position error."""
 
     name: str
     unit: str
-    truth: str = "gt"
-    limits: tuple[float, float] | None = None
+    truth: str
+    limits: tuple[float, float]
     """Median and mean before bundle adjustment."""
     adjusted_reference: float | None = None
     """Mean error of the better of COLMAP incremental and GLOMAP, both after bundle adjustment."""
@@ -50,37 +49,23 @@ class Scene:
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene(
-            name="fountain-P11",
-            unit="m",
-            limits=(0.0024, 0.0025),
-            adjusted_reference=0.0023,
-            averaged_limits=(0.007, 0.010),
-        ),
-        Scene(name="Herz-Jesus-P8", unit="m", limits=(0.0036, 0.0042)),
-        Scene(name="Herz-Jesus-P25", unit="m", limits=(0.0060, 0.0058), adjusted_reference=0.0053),
-        Scene(name="castle-P19", unit="m", limits=(0.022, 0.050), adjusted_reference=0.0263),
-        Scene(
-            name="castle-P30",
-            unit="m",
-            limits=(0.027, 0.032),
-            adjusted_reference=0.0232,
-            limit_s=8.0,
-            averaged_limits=(0.08, 0.11),
-        ),
-        Scene(name="lego100", unit="scene units", limits=(0.0052, 0.012)),
-        Scene(name="liberty", unit="reference units", truth="sparse/0", limits=(0.004, 0.008), limit_s=15.0),
-        Scene(name="liberty-calibrated", unit="reference units", truth="sparse/0", limits=(0.004, 0.008)),
+        Scene("fountain-P11", "m", "gt", (0.0024, 0.0025), 0.0023, (0.007, 0.010)),
+        Scene("Herz-Jesus-P8", "m", "gt", (0.0036, 0.0042)),
+        Scene("Herz-Jesus-P25", "m", "gt", (0.0060, 0.0058), 0.0053),
+        Scene("castle-P19", "m", "gt", (0.022, 0.050), 0.0263),
+        Scene("castle-P30", "m", "gt", (0.027, 0.032), 0.0232, (0.08, 0.11), limit_s=8.0),
+        Scene("lego100", "scene units", "gt", (0.0052, 0.012)),
+        Scene("liberty", "reference units", "sparse/0", (0.004, 0.008), limit_s=15.0),
+        Scene("liberty-calibrated", "reference units", "sparse/0", (0.004, 0.008)),
     )
 }
-QUICK = Scene(name="courtyard", unit="m", truth="truth", limits=(0.02, 0.02))
+QUICK = Scene("courtyard", "m", "truth", (0.02, 0.02))
 """A bundled scene."""
 ADJUSTED_SLACK = 1.15
 """How far the mean error may be above the reference's."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Errors:
+class Errors(NamedTuple):
     """Position errors in the truth's units, over the cameras that model and truth have in common."""
 
     median: float
@@ -90,22 +75,19 @@ class Errors:
     """Cameras of the truth that the model does not have; they are in no average."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Averaged:
+class Averaged(NamedTuple):
     """One run on rotations from averaging."""
 
-    refined: bool
-    """Whether `locate` refined the rotations."""
     scene: Scene
+    rotations: str
+    """Whether `locate` refined them."""
     errors: Errors
     rotation_deg: tuple[float, float, float]
     """Median, mean and maximum of the rotation errors."""
-    num_turned: int
     cpu_s: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Measured:
+class Measured(NamedTuple):
     """What one set gave; seconds are wall-clock unless they say CPU."""
 
     scene: Scene
@@ -192,21 +174,22 @@ def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
     from peers.colmap import average_rotations
     from sfm_shapefit import evaluate
 
-    model = average_rotations(folder / "database.db", folder / "sparse" / "0")
+    model, truth = average_rotations(folder / "database.db", folder / "sparse" / "0"), folder / scene.truth
     measured = []
     for refine in (False, True):
         run = ours.time_call(
             lambda refine=refine: ours.locate(model, folder / "database.db", refine_rotations=refine)
         )
-        rotation = evaluate(run.found.reconstruction, folder / scene.truth).rotation_deg
+        rotation = evaluate(run.found.reconstruction, truth).rotation_deg
         turned = run.found.turned_deg
         measured.append(
             Averaged(
                 scene=scene,
-                refined=refine,
-                errors=compare(run.found.reconstruction, folder / scene.truth),
+                rotations=f"refined, {0 if turned is None else (turned > 0.0).sum()} cameras"
+                if refine
+                else "kept",
+                errors=compare(run.found.reconstruction, truth),
                 rotation_deg=(rotation.median, rotation.mean, rotation.max),
-                num_turned=0 if turned is None else int((turned > 0.0).sum()),
                 cpu_s=run.cpu_s,
             )
         )
@@ -218,10 +201,7 @@ def compare(reconstruction: object, truth: Path) -> Errors:
     from sfm_shapefit import evaluate
 
     found = evaluate(reconstruction, truth)  # type: ignore[arg-type]
-    position = found.position
-    return Errors(
-        median=position.median, mean=position.mean, max=position.max, num_missing=len(found.missing)
-    )
+    return Errors(found.position.median, found.position.mean, found.position.max, len(found.missing))
 
 
 def _error_checks(errors: Errors, limits: tuple[float, float] | None) -> list[Check]:
@@ -238,6 +218,11 @@ def adjusted_checks(one: Measured) -> list[Check]:
     return [Check(name="mean", value=one.adjusted.mean, limit=ADJUSTED_SLACK * reference)]
 
 
+def over_reference(one: Measured) -> float:
+    """Return the mean error after bundle adjustment over the reference's; NaN without one."""
+    return ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
+
+
 def time_checks(one: Measured) -> list[Check]:
     """Return the check of the warm time end to end."""
     limit = one.scene.limit_s
@@ -252,15 +237,61 @@ def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Itera
     found = list(measured.values())
     yield "Errors are in the set's unit; a limit is compared with the unrounded value."
     yield "## Before bundle adjustment"
-    yield _show_accuracy(found)
+    yield table_of(
+        found,
+        {
+            "set": lambda one: one.scene.label,
+            "placed": lambda one: f"{one.num_placed} of {one.num_posed}",
+            "pairs used": lambda one: f"{one.num_pairs_used} of {one.num_pairs}",
+            "median / mean / max": lambda one: show_errors(one.errors),
+            "to reach, median / mean": lambda one: numbers(one.scene.limits),
+            "verdict": lambda one: _judge(_error_checks(one.errors, one.scene.limits), one.errors),
+            "gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
+        },
+    )
     yield "## Time and memory of `locate`, without bundle adjustment"
-    yield _show_times(found)
+    yield table_of(
+        found,
+        {
+            "set": lambda one: one.scene.name,
+            "solver": lambda one: one.method,
+            "warm": lambda one: number(median(one.warm_s)),
+            "min / max": lambda one: numbers([min(one.warm_s), max(one.warm_s)]),
+            "CPU": lambda one: number(median(one.cpu_s)),
+            "cold": lambda one: number(one.cold_s),
+            "solve": lambda one: number(one.solve_s),
+            "memory": lambda one: number(one.peak_memory_mb),
+            "to reach, warm": lambda one: "-" if one.scene.limit_s is None else f"{one.scene.limit_s:g} s",
+            "verdict": lambda one: verdict(time_checks(one)),
+        },
+    )
     if any(one.adjusted for one in found):
         yield f"## After bundle adjustment (intrinsics fixed)\n\n{_ADJUSTED_NOTE}"
-        yield _show_adjusted([one for one in found if one.adjusted])
+        yield table_of(
+            [one for one in found if one.adjusted],
+            {
+                "set": lambda one: one.scene.label,
+                "median / mean / max": lambda one: show_errors(one.adjusted),
+                "reference mean": lambda one: number(one.scene.adjusted_reference or math.nan),
+                "mean / reference": lambda one: f"{over_reference(one):.2f}".replace("nan", "-"),
+                "verdict": lambda one: _judge(adjusted_checks(one), one.adjusted),
+                "adjustment, s": lambda one: number(one.adjustment_s),
+            },
+        )
     if any(one.averaged for one in found):
         yield f"## Rotations from averaging\n\n{_AVERAGED_NOTE}"
-        yield _show_averaged([run for one in found for run in one.averaged])
+        yield table_of(
+            [run for one in found for run in one.averaged],
+            {
+                "set": lambda run: run.scene.label,
+                "rotations": lambda run: run.rotations,
+                "median / mean / max": lambda run: show_errors(run.errors),
+                "rotation error, deg": lambda run: numbers(run.rotation_deg),
+                "to reach, median / mean": lambda run: numbers(run.scene.averaged_limits or ()) or "-",
+                "verdict": lambda run: verdict(_error_checks(run.errors, run.scene.averaged_limits)),
+                "CPU, s": lambda run: number(run.cpu_s),
+            },
+        )
     yield _CAVEATS
 
 
@@ -271,14 +302,14 @@ _ADJUSTED_NOTE = (
 )
 _AVERAGED_NOTE = (
     "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15 matches or"
-    " more), intrinsics of sparse/0, no centres; position error median / mean / max and rotation error in"
+    " more), intrinsics of sparse/0, no centers; position error median / mean / max and rotation error in"
     " degrees, once with the rotations kept and once with `--refine-rotations`. The target is that of the"
     " kept rotations."
 )
 _CAVEATS = (
     "Caveats: liberty* are judged against the model that gives their rotations, which flatters every method"
     " in the tables. Five of lego100's given rotations are wrong; they set its mean and maximum, so look at"
-    " its median. Differences below about 1 mm on the sets in metres mean nothing: that is the accuracy of"
+    " its median. Differences below about 1 mm on the sets in meters mean nothing: that is the accuracy of"
     " their truth. Where the load average is above the number of cores, times are upper bounds;"
     " the CPU column depends less on the load."
 )
@@ -294,74 +325,7 @@ def show_errors(errors: Errors | None) -> str:
 
 def _judge(limits: Sequence[Check], errors: Errors) -> str:
     """Return a verdict that says how many cameras of the truth it leaves out."""
-    without = f", without {errors.num_missing} cameras" if errors.num_missing else ""
-    return verdict(limits) + without
-
-
-def _show_accuracy(found: Sequence[Measured]) -> str:
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.label,
-            "placed": lambda one: f"{one.num_placed} of {one.num_posed}",
-            "pairs used": lambda one: f"{one.num_pairs_used} of {one.num_pairs}",
-            "median / mean / max": lambda one: show_errors(one.errors),
-            "to reach, median / mean": lambda one: numbers(one.scene.limits or ()) or "-",
-            "verdict": lambda one: _judge(_error_checks(one.errors, one.scene.limits), one.errors),
-            "gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
-        },
-    )
-
-
-def _show_times(found: Sequence[Measured]) -> str:
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.name,
-            "solver": lambda one: one.method,
-            "warm": lambda one: number(median(one.warm_s)),
-            "min / max": lambda one: numbers([min(one.warm_s), max(one.warm_s)]),
-            "CPU": lambda one: number(median(one.cpu_s)),
-            "cold": lambda one: number(one.cold_s),
-            "solve": lambda one: number(one.solve_s),
-            "memory": lambda one: number(one.peak_memory_mb),
-            "to reach, warm": lambda one: "-" if one.scene.limit_s is None else f"{one.scene.limit_s:g} s",
-            "verdict": lambda one: verdict(time_checks(one)),
-        },
-    )
-
-
-def _show_adjusted(found: Sequence[Measured]) -> str:
-    def compare_mean(one: Measured) -> str:
-        over = ratio(one.adjusted.mean, one.scene.adjusted_reference or math.nan)
-        return "-" if math.isnan(over) else f"{over:.2f}"
-
-    return table_of(
-        found,
-        {
-            "set": lambda one: one.scene.label,
-            "median / mean / max": lambda one: show_errors(one.adjusted),
-            "reference mean": lambda one: number(one.scene.adjusted_reference or math.nan),
-            "mean / reference": compare_mean,
-            "verdict": lambda one: _judge(adjusted_checks(one), one.adjusted),
-            "adjustment, s": lambda one: number(one.adjustment_s),
-        },
-    )
-
-
-def _show_averaged(runs: Sequence[Averaged]) -> str:
-    return table_of(
-        runs,
-        {
-            "set": lambda run: run.scene.label,
-            "rotations": lambda run: f"refined, {run.num_turned} cameras" if run.refined else "kept",
-            "median / mean / max": lambda run: show_errors(run.errors),
-            "rotation error, deg": lambda run: numbers(run.rotation_deg),
-            "to reach, median / mean": lambda run: numbers(run.scene.averaged_limits or ()) or "-",
-            "verdict": lambda run: verdict(_error_checks(run.errors, run.scene.averaged_limits)),
-            "CPU, s": lambda run: number(run.cpu_s),
-        },
-    )
+    return verdict(limits) + (f", without {errors.num_missing} cameras" if errors.num_missing else "")
 
 
 BENCHMARK = Benchmark(
@@ -378,27 +342,12 @@ BENCHMARK = Benchmark(
     quantities=(
         Quantity("placed", "cameras", "higher", 0.0, "of those with a rotation"),
         Quantity("pairs used", "pairs", "neither", 0.0, "of all pairs with verified matches"),
-        Quantity(
-            *("median / mean / max", "the set's", "lower", 0.01),
-            "position error after robust (L1) alignment, over the placed cameras of the truth",
-        ),
+        Quantity("median / mean / max", "the set's", "lower", 0.01, "position error after L1 alignment"),
         Quantity("gap", "1", "lower", 1.0, "certified: objective minus a rigorous dual bound"),
-        Quantity(
-            *("warm", "s", "lower", 0.5),
-            "`locate` and writing its output, wall-clock, median of the repeats after the cold run",
-        ),
+        Quantity("warm", "s", "lower", 0.5, "`locate` and writing, wall-clock, median of the repeats"),
         Quantity("CPU", "s", "lower", 0.25, "the same in processor time of all threads"),
-        Quantity(
-            *("cold", "s", "lower", 0.5),
-            "first run of a fresh process, imports included; a first run ever also compiles and caches",
-        ),
-        Quantity(
-            *("solve", "s", "lower", 0.5),
-            "the solver alone, by its own clock, median of the warm runs",
-        ),
-        Quantity(
-            *("memory", "MB", "lower", 0.15),
-            "peak resident memory of the fresh process after the cold run, libraries included",
-        ),
+        Quantity("cold", "s", "lower", 0.5, "first run of a fresh process, imports included"),
+        Quantity("solve", "s", "lower", 0.5, "the solver alone, by its own clock, median of the warm runs"),
+        Quantity("memory", "MB", "lower", 0.15, "peak of the fresh process after the cold run"),
     ),
 )

@@ -2,8 +2,7 @@
 
 Random graphs: G(n, 1/2), a quarter of the directions random, with and without noise. Three contenders are
 given the same `ViewGraph` and run in turns of 50 ms or two runs, in one process on one thread, so that a
-change of the machine's load meets all of them. The median of all runs counts; that of each turn's first run,
-when the caches hold another contender's data, is told beside it.
+change of the machine's load meets all of them. The median of all runs counts.
 
     ours      solve(graph, solver="newton"), checks, rigidity and certificate included, to a certified 1e-8
     cvxpy     the program as a user would write it (`solve_cvxpy`), cvxpy's own compilation included
@@ -20,20 +19,16 @@ several times as many nodes: no limit of time was measured on those.
 
 import argparse
 import math
-import tempfile
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from benchmarks.real import SCENES
 from harness import ours
 from harness.driver import Benchmark, Case, if_there
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
 from harness.metrics import Check, Quantity, check_all, median, number, numbers, ratio, times, verdict
-from harness.process import call, thread_environment
 from harness.record import table_of
 
 if TYPE_CHECKING:
@@ -64,16 +59,13 @@ POINTS = ("never", "always")
 _TIGHTEST = 1e-13
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Contender:
+class Contender(NamedTuple):
     """What one solver did on one problem."""
 
     name: str
     tolerance: float
     wall_s: tuple[float, ...] = ()
     cpu_s: tuple[float, ...] = ()
-    first_s: tuple[float, ...] = ()
-    """Wall-clock of the first run of each turn."""
     error: float = math.nan
     """Against the truth."""
     excess: float = math.nan
@@ -83,14 +75,8 @@ class Contender:
     iterations: int = 0
     failure: str = ""
 
-    @property
-    def wall_ms(self) -> float:
-        """Median of the runs."""
-        return 1e3 * median(self.wall_s)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Compared:
+class Compared(NamedTuple):
     """One random problem and its contenders, ours first."""
 
     spec: GraphSpec
@@ -103,8 +89,7 @@ class Compared:
         return [ratio(rival, first) for rival in rivals]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RealGraph:
+class RealGraph(NamedTuple):
     """One real graph, solved by `auto`."""
 
     name: str
@@ -123,18 +108,8 @@ class RealGraph:
     """From the locations of a solve to a gap of 1e-11, by the paper's error."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FirstSolve:
-    """Seconds of a cold process to its first answer, imports included."""
-
-    loaded_s: float
-    """With compiled code on disk."""
-    compiled_s: float
-    """Where nothing is compiled yet; NaN if that was left out."""
-
-
 def cases(args: argparse.Namespace) -> dict[str, Case]:
-    """Return the random graphs, the real ones without and with points, and the start of a process."""
+    """Return the random graphs, and the real ones without and with points."""
     specs = [GraphSpec(family="er2", n=n, sigma=s, q=CORRUPTED) for n in TARGETS for s in SIGMAS]
     if args.quick:
         specs = [GraphSpec(family="er2", n=20, sigma=0.05, q=CORRUPTED)]
@@ -147,27 +122,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         for points in POINTS:
             case = partial(measure_real, name, folder, points)
             found[f"{name}, points {points}"] = if_there(folder, case)
-    return found | {"first solve": partial(measure_first_solve, args.quick)}
-
-
-def measure_first_solve(is_quick: bool) -> FirstSolve:
-    """Measure the first solve of fresh processes."""
-    one_thread = thread_environment(1)
-    # The first call fills the cache of compiled code.
-    call(first_solve, environment=one_thread)
-    loaded_s = call(first_solve, environment=one_thread)
-    if is_quick:
-        return FirstSolve(loaded_s=loaded_s, compiled_s=math.nan)
-    with tempfile.TemporaryDirectory() as folder:
-        compiled_s = call(first_solve, environment=one_thread | {"NUMBA_CACHE_DIR": folder})
-    return FirstSolve(loaded_s=loaded_s, compiled_s=compiled_s)
-
-
-def first_solve() -> float:
-    """Return the seconds of imports and a small problem's solve; to be called once per process."""
-    start = time.perf_counter()
-    solve_ours(view_graph(draw(GraphSpec(family="er2", n=50, q=CORRUPTED))), TOL)
-    return time.perf_counter() - start
+    return found
 
 
 def solve_ours(graph: "ViewGraph", tol: float, method: str = "newton") -> "SolverResult":
@@ -210,11 +165,16 @@ def compare(spec: GraphSpec, repeats: int) -> Compared:
         "Clarabel directly": partial(solve_direct, graph),
     }
     tuned = {name: _tune(name, solver, graph, problem.locations, bound) for name, solver in solvers.items()}
-    turns: dict[str, list[list[ours.Timed]]] = {name: [] for name in solvers}
+    runs: dict[str, list[ours.Timed]] = {name: [] for name in solvers}
     for name in [name for _ in range(repeats) for name in solvers if not tuned[name].failure]:
-        turns[name].append(_turn(solvers[name], tuned[name].tolerance))
-    contenders = tuple(_with_times(tuned[name], turns[name]) for name in solvers)
-    return Compared(spec=spec, num_edges=graph.num_edges, contenders=contenders)
+        runs[name] += _turn(solvers[name], tuned[name].tolerance)
+    contenders = tuple(
+        tuned[name]._replace(
+            wall_s=tuple(run.wall_s for run in runs[name]), cpu_s=tuple(run.cpu_s for run in runs[name])
+        )
+        for name in solvers
+    )
+    return Compared(spec, graph.num_edges, contenders)
 
 
 def _tune(
@@ -240,14 +200,9 @@ def _tune(
             return best
         centered, excess = locations - locations.mean(axis=0), objective(graph, locations) - bound
         if best.failure or excess < best.excess:
-            best = Contender(
-                name=name,
-                tolerance=tol,
-                error=relative_error(locations, truth),
-                excess=excess,
-                gap=math.nan if dual is None else certify(graph, centered, dual, uniqueness=False).gap,
-                iterations=iterations,
-            )
+            gap = math.nan if dual is None else certify(graph, centered, dual, uniqueness=False).gap
+            error = relative_error(locations, truth)
+            best = Contender(name, tol, error=error, excess=excess, gap=gap, iterations=iterations)
         if excess <= TOL:
             break
         tol /= 10.0
@@ -262,16 +217,6 @@ def _turn(solver: Callable[[float], object], tol: float) -> list[ours.Timed]:
     return runs
 
 
-def _with_times(contender: Contender, turns: Sequence[Sequence[ours.Timed]]) -> Contender:
-    runs = [run for turn in turns for run in turn]
-    return replace(
-        contender,
-        wall_s=tuple(run.wall_s for run in runs),
-        cpu_s=tuple(run.cpu_s for run in runs),
-        first_s=tuple(turn[0].wall_s for turn in turns),
-    )
-
-
 def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     """Solve the graph of a real set, with points or without; to be called in a process of one thread."""
     placement = ours.locate(folder / "sparse" / "0", points=points).placement
@@ -280,11 +225,14 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
     tight = solve_ours(graph, 1e-11)
     # This is a warm-up, too.
     found = solve_ours(graph, TOL, "auto")
-    wall: dict[str, list[float]] = {"auto": [], "newton": []}
-    for _ in range(REAL_REPEATS):
-        for method, seconds in wall.items():
-            run = ours.time_call(lambda method=method: solve_ours(graph, TOL, method))
-            seconds.append(run.wall_s)
+    runs = [
+        [
+            ours.time_call(lambda method=method: solve_ours(graph, TOL, method))
+            for method in ("auto", "newton")
+        ]
+        for _ in range(REAL_REPEATS)
+    ]
+    wall_s, newton_s = ([run.wall_s for run in column] for column in zip(*runs, strict=True))
     return RealGraph(
         name=name,
         num_cameras=graph.num_nodes - num_points,
@@ -296,17 +244,15 @@ def measure_real(name: str, folder: Path, points: str) -> RealGraph:
         gap=found.gap,
         # Newton's start factors the projected Laplacian.
         factorizations=found.iterations + 1,
-        wall_s=tuple(wall["auto"]),
-        newton_s=tuple(wall["newton"]),
+        wall_s=tuple(wall_s),
+        newton_s=tuple(newton_s),
         distance=relative_error(found.locations, tight.locations),
     )
 
 
-def checks(one: Compared | RealGraph | FirstSolve) -> list[Check]:
+def checks(one: Compared | RealGraph) -> list[Check]:
     """Return the limits of one case."""
-    if isinstance(one, RealGraph):
-        return real_checks(one)
-    return ratio_checks(one) if isinstance(one, Compared) else []
+    return real_checks(one) if isinstance(one, RealGraph) else ratio_checks(one)
 
 
 def ratio_checks(one: Compared) -> list[Check]:
@@ -327,31 +273,77 @@ def real_checks(one: RealGraph) -> list[Check]:
     return check_all(values, {k: v for k, v in REAL_LIMITS.items() if k != "ms" or one.num_points == 0})
 
 
-def tables(
-    measured: Mapping[str, Compared | RealGraph | FirstSolve], _args: argparse.Namespace
-) -> Iterator[str]:
+def tables(measured: Mapping[str, Compared | RealGraph], _args: argparse.Namespace) -> Iterator[str]:
     compared = [one for one in measured.values() if isinstance(one, Compared)]
     real = [one for one in measured.values() if isinstance(one, RealGraph)]
-    for one in measured.values():
-        if isinstance(one, FirstSolve):
-            yield (
-                "All contenders have one thread and are warmed up before the clock runs. A cold process,"
-                f" imports included, takes {number(one.loaded_s)} s to its first answer, and"
-                f" {number(one.compiled_s)} s where nothing is compiled yet."
-            )
+    yield "All contenders have one thread and are warmed up before the clock runs."
     if compared:
         yield f"## G(n, 1/2), q = {CORRUPTED:g}, to a certified gap of {TOL:.0e}"
-        yield _compare_ratios(compared)
+        yield table_of(
+            compared,
+            {
+                "n": lambda one: str(one.spec.n),
+                "pairs": lambda one: str(one.num_edges),
+                "sigma": lambda one: f"{one.spec.sigma:g}",
+                "ours, ms": lambda one: number(1e3 * median(one.contenders[0].wall_s)),
+                "cvxpy, ms": lambda one: number(1e3 * median(one.contenders[1].wall_s)),
+                "Clarabel, ms": lambda one: number(1e3 * median(one.contenders[2].wall_s)),
+                "ratio to cvxpy": lambda one: times(one.ratios()[0]),
+                "cvxpy, to reach": lambda one: show_limit(one, 1),
+                "ratio to Clarabel": lambda one: times(one.ratios()[1]),
+                "Clarabel, to reach": lambda one: show_limit(one, 2),
+                "CPU ratios": lambda one: " / ".join(map(times, one.ratios("cpu_s"))),
+                "verdict": lambda one: verdict(ratio_checks(one)),
+            },
+        )
         yield "## The same in detail"
-        yield _show_details(compared)
+        yield table_of(
+            [(one.spec, contender) for one in compared for contender in one.contenders],
+            {
+                "problem": lambda row: f"{row[0].n}, sigma {row[0].sigma:g}",
+                "contender": lambda row: row[1].name + (f": {row[1].failure}" if row[1].failure else ""),
+                "tolerance": lambda row: f"{row[1].tolerance:.0e}",
+                "iterations": lambda row: str(row[1].iterations),
+                "repeats": lambda row: str(len(row[1].wall_s)),
+                "min / max, ms": lambda row: numbers(
+                    [1e3 * pick(row[1].wall_s, default=math.nan) for pick in (min, max)]
+                ),
+                "CPU, ms": lambda row: number(1e3 * median(row[1].cpu_s)),
+                "excess": lambda row: number(row[1].excess),
+                "certified gap": lambda row: number(row[1].gap),
+                "error": lambda row: number(row[1].error),
+            },
+        )
     if real:
         yield f"## Real graphs, directions from known rotations, `auto`\n\n{_REAL_NOTE}"
-        yield _show_real(real)
+        yield table_of(
+            real,
+            {
+                "set": lambda one: one.name,
+                "cameras": lambda one: str(one.num_cameras),
+                "points": lambda one: str(one.num_points),
+                "pairs": lambda one: str(one.num_edges),
+                "method": lambda one: one.method,
+                "objective": lambda one: number(one.objective),
+                "certified gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
+                "factorizations": lambda one: str(one.factorizations),
+                "ms": lambda one: number(1e3 * median(one.wall_s)),
+                "ms, newton": lambda one: number(1e3 * median(one.newton_s)),
+                "distance": lambda one: number(one.distance),
+                "verdict": lambda one: verdict(real_checks(one)),
+            },
+        )
     yield _CAVEATS
 
 
+def show_limit(one: Compared, rival: int) -> str:
+    """Return the ratio that is to be reached."""
+    limits = ratio_checks(one)
+    return f"{limits[rival].limit:g}x" if limits else "-"
+
+
 _REAL_NOTE = (
-    "Factorisations are the Newton steps and the one of the start. The distance is that of `auto`'s locations"
+    "Factorizations are the Newton steps and the one of the start. The distance is that of `auto`'s locations"
     " from those of a gap of 1e-11: what is lost by stopping where it stops. The limits were measured on"
     " graphs of cameras alone: those have a limit of 32 ms. The same graphs with the points that"
     " `locate` joins are several times larger and have none."
@@ -365,72 +357,6 @@ _CAVEATS = (
 )
 
 
-def _compare_ratios(compared: Sequence[Compared]) -> str:
-    def show_limit(one: Compared, rival: int) -> str:
-        limits = ratio_checks(one)
-        return f"{limits[rival].limit:g}x" if limits else "-"
-
-    return table_of(
-        compared,
-        {
-            "n": lambda one: str(one.spec.n),
-            "pairs": lambda one: str(one.num_edges),
-            "sigma": lambda one: f"{one.spec.sigma:g}",
-            "ours, ms": lambda one: number(one.contenders[0].wall_ms),
-            "cvxpy, ms": lambda one: number(one.contenders[1].wall_ms),
-            "Clarabel, ms": lambda one: number(one.contenders[2].wall_ms),
-            "ratio to cvxpy": lambda one: times(one.ratios()[0]),
-            "cvxpy, to reach": lambda one: show_limit(one, 1),
-            "ratio to Clarabel": lambda one: times(one.ratios()[1]),
-            "Clarabel, to reach": lambda one: show_limit(one, 2),
-            "CPU ratios": lambda one: " / ".join(map(times, one.ratios("cpu_s"))),
-            "verdict": lambda one: verdict(ratio_checks(one)),
-        },
-    )
-
-
-def _show_details(compared: Sequence[Compared]) -> str:
-    def show_range(wall_s: Sequence[float]) -> str:
-        return numbers([1e3 * min(wall_s), 1e3 * max(wall_s)]) if wall_s else "-"
-
-    return table_of(
-        [(one.spec, contender) for one in compared for contender in one.contenders],
-        {
-            "problem": lambda row: f"{row[0].n}, sigma {row[0].sigma:g}",
-            "contender": lambda row: row[1].name + (f": {row[1].failure}" if row[1].failure else ""),
-            "tolerance": lambda row: f"{row[1].tolerance:.0e}",
-            "iterations": lambda row: str(row[1].iterations),
-            "repeats": lambda row: str(len(row[1].wall_s)),
-            "min / max, ms": lambda row: show_range(row[1].wall_s),
-            "first, ms": lambda row: number(1e3 * median(row[1].first_s)),
-            "CPU, ms": lambda row: number(1e3 * median(row[1].cpu_s)),
-            "excess": lambda row: number(row[1].excess),
-            "certified gap": lambda row: number(row[1].gap),
-            "error": lambda row: number(row[1].error),
-        },
-    )
-
-
-def _show_real(real: Sequence[RealGraph]) -> str:
-    return table_of(
-        real,
-        {
-            "set": lambda one: one.name,
-            "cameras": lambda one: str(one.num_cameras),
-            "points": lambda one: str(one.num_points),
-            "pairs": lambda one: str(one.num_edges),
-            "method": lambda one: one.method,
-            "objective": lambda one: number(one.objective),
-            "certified gap": lambda one: f"{one.gap:.0e}" + ("" if one.converged else " (not converged)"),
-            "factorizations": lambda one: str(one.factorizations),
-            "ms": lambda one: number(1e3 * median(one.wall_s)),
-            "ms, newton": lambda one: number(1e3 * median(one.newton_s)),
-            "distance": lambda one: number(one.distance),
-            "verdict": lambda one: verdict(real_checks(one)),
-        },
-    )
-
-
 BENCHMARK = Benchmark(
     name="solver",
     title="The solver against a generic cone solver",
@@ -440,23 +366,10 @@ BENCHMARK = Benchmark(
     packages=("numpy", "scipy", "numba", "cvxpy", "clarabel"),
     quantities=(
         Quantity("ours, cvxpy, Clarabel", "ms", "lower", 0.5, "wall-clock, median of the repeats"),
-        Quantity(
-            *("first", "ms", "lower", 0.5),
-            "the same of the first runs of the turns: another contender's data fill the caches",
-        ),
         Quantity("CPU", "ms", "lower", 0.25, "the same in processor time"),
-        Quantity(
-            *("ratio", "1", "higher", 0.3),
-            "the rival's median over ours; the limit applies to wall-clock",
-        ),
-        Quantity(
-            *("excess", "1", "lower", 1.0),
-            "objective above the best rigorous lower bound, in the scale of `SolverResult.objective`",
-        ),
-        Quantity(
-            *("certified gap", "1", "lower", 1.0),
-            "what `certify` proves from the solver's own dual; cvxpy's form gives no dual of the edges",
-        ),
+        Quantity("ratio", "1", "higher", 0.3, "the rival's median over ours; limits are of wall-clock"),
+        Quantity("excess", "1", "lower", 1.0, "objective above the best rigorous lower bound"),
+        Quantity("certified gap", "1", "lower", 1.0, "proved from the solver's own dual; cvxpy gives none"),
         Quantity("error", "1", "lower", 0.01, "against the truth, both centered and of unit norm"),
     ),
 )

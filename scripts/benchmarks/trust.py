@@ -1,4 +1,4 @@
-"""Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognised?
+"""Trust: do standard deviations cover the errors, does trust rank them, are wrong rotations recognized?
 
 Calibration: scenes of known truth, directions with known or unknown covariances, and photographed scenes
 through `locate`. A standard deviation covers an error that it is not smaller than; of normal errors 68 % are.
@@ -14,10 +14,10 @@ camera is flagged if `locate` leaves it out. The truth of liberty* is the model 
 import argparse
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import partial
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -43,8 +43,7 @@ WRONG_DEG = 5.0
 SHAPES = ("ring", "facade", "cloud", "courtyard")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Graph:
+class Graph(NamedTuple):
     """Directions between known locations."""
 
     locations: "FloatArray"
@@ -53,8 +52,7 @@ class Graph:
     covariances: "FloatArray"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibration:
+class Calibration(NamedTuple):
     """Errors over standard deviations of one problem."""
 
     name: str
@@ -62,8 +60,7 @@ class Calibration:
     rms: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Ranking:
+class Ranking(NamedTuple):
     """How trust ranks the errors of one problem."""
 
     name: str
@@ -72,8 +69,7 @@ class Ranking:
     num_bad: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Flagged:
+class Flagged(NamedTuple):
     """Which cameras of a real set were left out."""
 
     name: str
@@ -90,14 +86,12 @@ class Flagged:
 
 def cases(args: argparse.Namespace) -> dict[str, Case]:
     """Return the problems of calibration and of ranking, and the real sets."""
-    found: dict[str, Case] = {
-        f"graph {name}, {wrong:.0%} wrong": partial(calibrate_graph, name, wrong, args.repeats)
-        for name in GRAPHS
-        for wrong in (0.0, 0.2)
+    ratios: dict[str, Callable[[int], FloatArray]] = {
+        f"graph {name}, {wrong:.0%} wrong": partial(graph_ratios, name, wrong)
+        for name, wrong in product(GRAPHS, (0.0, 0.2))
     }
-    found |= {
-        f"scene {shape}, 25 images, 0.5 px": partial(calibrate_scene, shape, args.repeats) for shape in SHAPES
-    }
+    ratios |= {f"scene {shape}, 25 images, 0.5 px": partial(scene_ratios, shape) for shape in SHAPES}
+    found: dict[str, Case] = {n: partial(calibrate, n, ask, args.repeats) for n, ask in ratios.items()}
     found |= {name: partial(rank, name, args.repeats) for name in SPOILED}
     for name in (*SETS, *FURTHER_SETS):
         found[name] = if_there(args.data / name, partial(flag, args.data / name))
@@ -108,21 +102,10 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     return found
 
 
-def calibrate_graph(name: str, wrong: float, seeds: int) -> Calibration:
-    """Compare errors with standard deviations on graphs of one kind."""
-    ratios = [graph_ratios(draw_graph(name, seed, wrong)) for seed in range(seeds)]
-    return _summarize(f"graph {name}, {wrong:.0%} wrong", np.concatenate(ratios))
-
-
-def calibrate_scene(shape: str, seeds: int) -> Calibration:
-    """Compare errors with standard deviations on photographed scenes of one shape."""
-    ratios = [scene_ratios(shape, seed) for seed in range(seeds)]
-    return _summarize(f"scene {shape}, 25 images, 0.5 px", np.concatenate(ratios))
-
-
-def _summarize(name: str, ratios: "FloatArray") -> Calibration:
-    covered, rms = float(np.mean(np.abs(ratios) < 1.0)), float(np.sqrt(np.mean(ratios**2)))
-    return Calibration(name=name, covered=covered, rms=rms)
+def calibrate(name: str, ask: "Callable[[int], FloatArray]", seeds: int) -> Calibration:
+    """Return what the errors over standard deviations of all seeds say of a kind of problem."""
+    ratios = np.concatenate([ask(seed) for seed in range(seeds)])
+    return Calibration(name, float(np.mean(np.abs(ratios) < 1.0)), float(np.sqrt(np.mean(ratios**2))))
 
 
 def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray") -> "FloatArray":
@@ -134,13 +117,10 @@ def error_ratios(found: "FloatArray", truth: "FloatArray", sigmas: "FloatArray")
     return ratios
 
 
-def graph_ratios(graph: Graph) -> "FloatArray":
+def graph_ratios(name: str, wrong: float, seed: int) -> "FloatArray":
     """Return errors over standard deviations of a graph's placement."""
-    return _placement_ratios(_place(graph), graph.locations)
-
-
-def _place(graph: Graph) -> "Placement":
-    return ours.place(view_graph(graph), covariance=graph.covariances)
+    graph = draw_graph(name, seed, wrong)
+    return _placement_ratios(ours.place(view_graph(graph), covariance=graph.covariances), graph.locations)
 
 
 def _placement_ratios(placement: "Placement", truth: "FloatArray") -> "FloatArray":
@@ -167,11 +147,8 @@ def rank(name: str, seeds: int) -> Ranking:
     """Rank the cameras of spoiled graphs by their trust."""
     found = [rank_graph(SPOILED[name](seed)) for seed in range(seeds)]
     areas = [area for area, num_bad in found if num_bad]
-    return Ranking(
-        name=name,
-        area=float(np.mean(areas)) if areas else float("nan"),
-        num_bad=sum(num_bad for _, num_bad in found),
-    )
+    area = float(np.mean(areas)) if areas else float("nan")
+    return Ranking(name, area, sum(num_bad for _, num_bad in found))
 
 
 def area_under_curve(trust: "FloatArray", bad: "BoolArray") -> float:
@@ -184,7 +161,7 @@ def rank_graph(graph: Graph) -> tuple[float, int]:
     """Return the AUC of one graph, and its number of bad cameras."""
     from sfm_shapefit.geometry import fit_similarity_l1
 
-    placement = _place(graph)
+    placement = ours.place(view_graph(graph), covariance=graph.covariances)
     truth = graph.locations[placement.cameras]
     found = placement.locations
     errors = np.linalg.norm(fit_similarity_l1(found, truth, rotate=False).apply(found) - truth, axis=1)
@@ -202,12 +179,8 @@ def _measure(locations: "FloatArray", edges: "IntArray", wrong: "BoolArray", see
     errors = sigmas[:, None] * rng.standard_normal((len(edges), 2))
     noisy = normalized(true + np.einsum("edk,ek->ed", tangent_bases(true), errors))
     random = normalized(rng.standard_normal(true.shape))
-    return Graph(
-        locations=locations,
-        edges=edges,
-        directions=np.where(wrong[:, None], random, noisy),
-        covariances=sigmas[:, None, None] ** 2 * np.eye(2),
-    )
+    directions = np.where(wrong[:, None], random, noisy)
+    return Graph(locations, edges, directions, sigmas[:, None, None] ** 2 * np.eye(2))
 
 
 GRAPHS: dict[str, tuple[str, int, float]] = {
@@ -252,12 +225,7 @@ def turn_cameras(seed: int) -> Graph:
     axes = normalized(np.random.default_rng(3000 + seed).standard_normal(graph.locations.shape))
     turns = np.where(_chosen(seed, graph)[:, None], np.radians(20.0) * axes, 0.0)
     moved = np.cross(turns[graph.edges].sum(axis=1) / 2.0, graph.directions)
-    return Graph(
-        locations=graph.locations,
-        edges=graph.edges,
-        directions=normalized(graph.directions + moved),
-        covariances=graph.covariances,
-    )
+    return graph._replace(directions=normalized(graph.directions + moved))
 
 
 def weaken(seed: int) -> Graph:
@@ -331,42 +299,41 @@ def checks(one: Calibration | Ranking | Flagged) -> list[Check]:
     ]
 
 
-def tables(
-    measured: Mapping[str, Calibration | Ranking | Flagged], _args: argparse.Namespace
-) -> Iterator[str]:
-    found = list(measured.values())
-    yield "## Standard deviations"
-    yield table_of(
-        [one for one in found if isinstance(one, Calibration)],
+COLUMNS: dict[type, tuple[str, dict[str, Callable[[Any], str]]]] = {
+    Calibration: (
+        "Standard deviations",
         {
             "problem": lambda one: one.name,
             "covered": lambda one: number(one.covered),
             "rms": lambda one: number(one.rms),
-            "verdict": lambda one: verdict(checks(one)),
         },
-    )
-    yield "## Ranking"
-    yield table_of(
-        [one for one in found if isinstance(one, Ranking)],
+    ),
+    Ranking: (
+        "Ranking",
         {
             "problem": lambda one: one.name,
             "AUC": lambda one: number(one.area),
             "bad cameras": lambda one: str(one.num_bad),
-            "verdict": lambda one: verdict(checks(one)),
         },
-    )
-    yield "## Wrong rotations"
-    yield table_of(
-        [one for one in found if isinstance(one, Flagged)],
+    ),
+    Flagged: (
+        "Wrong rotations",
         {
             "set": lambda one: one.name,
             "wrong rotations": lambda one: f"{one.num_wrong} of {one.num_cameras}",
             "flagged wrong / right": lambda one: f"{one.num_caught} / {one.num_blamed}",
             "lowest trust kept": lambda one: number(one.lowest_trust),
             "median / mean": lambda one: numbers(one.errors),
-            "verdict": lambda one: verdict(checks(one)),
         },
-    )
+    ),
+}
+
+
+def tables(measured: Mapping[str, Any], _args: argparse.Namespace) -> Iterator[str]:
+    for kind, (heading, columns) in COLUMNS.items():
+        yield f"## {heading}"
+        found = [one for one in measured.values() if isinstance(one, kind)]
+        yield table_of(found, columns | {"verdict": lambda one: verdict(checks(one))})
 
 
 BENCHMARK = Benchmark(
@@ -379,10 +346,7 @@ BENCHMARK = Benchmark(
     repeats=5,
     threads=2,
     quantities=(
-        Quantity(
-            *("covered", "1", "neither", 0.05),
-            "share of coordinate errors within one standard deviation; 0.546 to 0.816 is asked",
-        ),
+        Quantity("covered", "1", "neither", 0.05, "share of errors within one standard deviation"),
         Quantity("rms", "1", "neither", 0.05, "of errors over standard deviations"),
         Quantity("AUC", "1", "higher", 0.02, "trust against bad cameras"),
         Quantity("flagged", "cameras", "neither", 0.0, "wrong ones / right ones left out"),

@@ -1,20 +1,17 @@
 """The README's picture: `python scripts/figure.py courtyard --out docs/courtyard.png`.
 
 The bundled courtyard from above: on the left what `locate` is given (a direction per pair, a quarter of
-them wrong), on the right what it returns, coloured by verdict.
+them wrong), on the right what it returns, colored by verdict.
 """
 
 import argparse
 from pathlib import Path
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 import sfm_shapefit
-from sfm_shapefit.results import LocateResult
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 
 SCENE = Path(__file__).parents[2] / "data_synthetic" / "courtyard"
 INLIER, OUTLIER, CAMERA, POINT = "#2a9d5c", "#d1495b", "#1d3557", "#a0a0a0"
@@ -22,14 +19,9 @@ STUB_M = 1.5
 """Length at which directions are drawn; they have none."""
 
 
-def run(args: argparse.Namespace) -> None:
-    """Locate the cameras of the courtyard and draw them."""
+def run(_args: argparse.Namespace) -> Figure:
+    """Locate the cameras of the courtyard and draw two plans, of what is given and of what is found."""
     found = sfm_shapefit.locate(SCENE / "truth", SCENE / "database.db")
-    draw_courtyard(found, args.out)
-
-
-def draw_courtyard(found: LocateResult, path: Path) -> None:
-    """Draw the directions before and after as two plans side by side."""
     figure, (given, solved) = plt.subplots(1, 2, figsize=(11, 4.9), dpi=110, sharex=True, sharey=True)
     images = [found.reconstruction.image(i) for i in found.model.image_ids.tolist()]
     centers = np.array([image.projection_center() for image in images])
@@ -68,4 +60,4 @@ def draw_courtyard(found: LocateResult, path: Path) -> None:
         axes.set_xlabel("x [m]")
     given.set_ylabel("y [m]")
     figure.tight_layout()
-    figure.savefig(path)
+    return figure

@@ -17,28 +17,12 @@ from sfm_shapefit.viewgraph import ViewGraph
 _TOL = 1e-12
 
 
-def _shapefit(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return ours.solve(graph, tol=_TOL).locations
-
-
-def _conic(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return ours.solve(graph, solver="conic", tol=1e-9).locations
-
-
 def _refine(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
     """ShapeFit and LUD, both refined in angles, the better kept: what `locate` does."""
     placement = ours.place(graph, tol=_TOL, uniqueness=False)
     if len(placement.cameras) < graph.num_nodes:
         raise UnsolvableError("the graph is not parallel rigid")
     return placement.locations
-
-
-def _lud(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return locate_lud(graph)
-
-
-def _least_squares(graph: ViewGraph, _problem: GraphProblem) -> FloatArray:
-    return locate_least_squares(graph)
 
 
 def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
@@ -51,19 +35,18 @@ def _oracle(graph: ViewGraph, problem: GraphProblem) -> FloatArray:
     if len(cameras) < graph.num_nodes:
         return np.full((graph.num_nodes, graph.dimension), np.nan)
     answers = [locate_least_squares(clean, reweightings=count) for count in (0, 10)]
-    return min(answers, key=lambda t: _misfit(clean, t))
 
+    def misfit(locations: FloatArray) -> float:
+        return float(np.sum((normalized(differences(locations, clean.edges)) - clean.directions) ** 2))
 
-def _misfit(graph: ViewGraph, locations: FloatArray) -> float:
-    """Return the sum of squared distances between directions as measured and as located."""
-    return float(np.sum((normalized(differences(locations, graph.edges)) - graph.directions) ** 2))
+    return min(answers, key=misfit)
 
 
 METHODS: dict[str, Callable[[ViewGraph, GraphProblem], FloatArray]] = {
-    "ShapeFit": _shapefit,
-    "ShapeFit, conic": _conic,
+    "ShapeFit": lambda graph, _: ours.solve(graph, tol=_TOL).locations,
+    "ShapeFit, conic": lambda graph, _: ours.solve(graph, solver="conic", tol=1e-9).locations,
     "refined": _refine,
-    "LUD": _lud,
-    "least squares": _least_squares,
+    "LUD": lambda graph, _: locate_lud(graph),
+    "least squares": lambda graph, _: locate_least_squares(graph),
     "oracle": _oracle,
 }

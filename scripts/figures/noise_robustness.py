@@ -8,15 +8,12 @@ seeds 0, 1 and 4, and none for 2 and 3. Source: Hand, Lee, Voroninski (2015), se
 """
 
 import argparse
-from pathlib import Path
 
-import matplotlib as mpl
-import numpy as np
-
-from figures.trials import Cell, Results, run_trials
-
-mpl.use("Agg")
 import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+
+from figures.trials import Cell, run_trials
 
 SHOWN = ("ShapeFit", "refined", "LUD", "oracle")
 NUM_LOCATIONS, CORRUPTED = 50, 0.2
@@ -31,31 +28,13 @@ def fit_slope(sigmas: np.ndarray, errors: np.ndarray) -> float:
     return float(np.polyfit(np.log10(sigmas[used]), np.log10(errors[used]), 1)[0])
 
 
-def draw(sigmas: np.ndarray, results: Results, path: Path) -> None:
-    """Draw the mean errors of each method."""
-    figure, axis = plt.subplots(figsize=(6.4, 4.4), dpi=100)
-    for method in results.methods:
-        errors = results.mean_errors(method)
-        axis.loglog(sigmas, errors, marker=".", label=f"{method}, slope {fit_slope(sigmas, errors):.3f}")
-    axis.set(
-        xlabel="noise sigma",
-        ylabel="mean relative error",
-        title=f"n = {NUM_LOCATIONS}, q = {CORRUPTED}, p = 1/2",
-    )
-    axis.grid(visible=True, which="major", alpha=0.3)
-    axis.legend()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, bbox_inches="tight")
-    plt.close(figure)
-
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the seed."""
     parser.add_argument("--seed", type=int, default=2, help="of the problems, the same at every sigma")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Compute and draw the figure, and print the slopes."""
+def run(args: argparse.Namespace) -> Figure:
+    """Draw the mean errors of each method, and print the slopes."""
     sigmas = np.logspace(-6, -2 if args.quick else 0, 4 if args.quick else 25)
     results = run_trials(
         [Cell(NUM_LOCATIONS, CORRUPTED, float(sigma)) for sigma in sigmas],
@@ -65,11 +44,17 @@ def run(args: argparse.Namespace) -> None:
         processes=args.processes,
         seed=args.seed,
     )
-    draw(sigmas, results, args.out)
-    print(f"{len(sigmas)} values of sigma in {results.seconds:.0f} s")
+    figure, axis = plt.subplots(figsize=(6.4, 4.4), dpi=100, layout="constrained")
     for method in results.methods:
-        lost = int(np.sum(results.values[0, results.methods.index(method), :, 0] > NOT_RECOVERABLE))
-        slope = fit_slope(sigmas, results.mean_errors(method))
+        errors = results.mean_errors(method)
+        slope = fit_slope(sigmas, errors)
+        axis.loglog(sigmas, errors, marker=".", label=f"{method}, slope {slope:.3f}")
+        lost = int(np.sum(results.of(method)[0, :, 0] > NOT_RECOVERABLE))
         print(
             f"{method}: slope {slope:.4f} for sigma <= {LARGEST_FITTED:g}; {lost} problems lost without noise"
         )
+    title = f"n = {NUM_LOCATIONS}, q = {CORRUPTED}, p = 1/2"
+    axis.set(xlabel="noise sigma", ylabel="mean relative error", title=title)
+    axis.grid(visible=True, which="major", alpha=0.3)
+    axis.legend()
+    return figure

@@ -9,20 +9,17 @@ import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, get_args
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from figures.trials import Cell, Results, problems, run_trials
 from harness import ours
 from harness.graphs import view_graph
 from sfm_shapefit.rigidity import is_parallel_rigid
 from sfm_shapefit.synthetic.graphs import Corruption
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 
 SEED = 0
 EXACT = 1e-9
@@ -53,16 +50,12 @@ class Panel:
         return all(later == 2 * n for n, later in pairwise(self.n))
 
 
-def _grid(low: int, high: int, step: int) -> tuple[int, ...]:
-    return tuple(range(low, high + 1, step))
-
-
 def _shares(num: int) -> tuple[float, ...]:
     return tuple(np.round(np.linspace(0.0, 0.5, num), 4).tolist())
 
 
 NOISES = ((0.0, "no noise"), (NOISE, f"noise {NOISE}"))
-FINE, COARSE = (_grid(10, 80, 2), _shares(21)), (_grid(10, 80, 5), _shares(11))
+FINE, COARSE = (tuple(range(10, 81, 2)), _shares(21)), (tuple(range(10, 81, 5)), _shares(11))
 
 
 def _paper(method: str = "ShapeFit") -> list[Panel]:
@@ -86,22 +79,10 @@ FIGURES: dict[str, list[Panel]] = {
     "density": [_coarse(f"ShapeFit, p = {p}", "ShapeFit", p=p) for p in (0.25, 0.5, 0.75)],
     "dimension": [
         *(_coarse(f"ShapeFit, d = {d}", "ShapeFit", d=d) for d in (2, 3, 10)),
-        Panel("ShapeFit, d = 50", "ShapeFit", _grid(10, 60, 10), _shares(6), d=50),
+        Panel("ShapeFit, d = 50", "ShapeFit", tuple(range(10, 61, 10)), _shares(6), d=50),
     ],
     "large": [Panel("ShapeFit, n to 320", "ShapeFit", (20, 40, 80, 160, 320), COARSE[1])],
 }
-
-
-def quick(panel: Panel) -> Panel:
-    """Return the panel with few cells: what the tests run."""
-    return replace(panel, n=(10, 30), q=(0.0, 0.2))
-
-
-def compute(shown: Sequence[Panel], trials: int, cache: Path | None, processes: int) -> Results:
-    """Run all cells of the panels; every method runs on every cell."""
-    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
-    methods = list(dict.fromkeys(panel.method for panel in shown))
-    return run_trials(cells, methods, trials, cache=cache, processes=processes, seed=SEED)
 
 
 def image(panel: Panel, results: Results) -> np.ndarray:
@@ -110,7 +91,7 @@ def image(panel: Panel, results: Results) -> np.ndarray:
     return np.array([means[cell] for cell in panel.cells()]).reshape(len(panel.n), len(panel.q))
 
 
-def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
+def draw(shown: Sequence[Panel], results: Results) -> Figure:
     """Draw the panels as the paper does."""
     columns = min(len(shown), 3 if len(shown) % 3 == 0 else 4)
     rows = -(-len(shown) // columns)
@@ -129,17 +110,14 @@ def draw(shown: Sequence[Panel], results: Results, path: Path) -> None:
     for axis in axes.ravel()[len(shown) :]:
         axis.set_axis_off()
     figure.colorbar(picture, ax=axes, label="mean relative error", shrink=0.7)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
+    return figure
 
 
 def report(shown: Sequence[Panel], results: Results) -> str:
     """Say what the paper's text says of its figure, and which camera fails where a large problem does."""
-    lines = [f"{len(results.cells)} cells in {results.seconds:.0f} s"]
+    lines = [f"{len(results.cells)} cells"]
     for panel in shown:
-        rows = {cell: k for k, cell in enumerate(results.cells)}
-        values = results.values[[rows[cell] for cell in panel.cells()], results.methods.index(panel.method)]
+        values = results.of(panel.method)[[results.cells.index(cell) for cell in panel.cells()]]
         exact = values[..., 0] < EXACT
         lines.append(f"{panel.title}: {exact.mean():.1%} of {exact.size} problems recovered below {EXACT:g}")
         if panel.sigma == 0.0 and panel.method in ("ShapeFit", "refined"):
@@ -190,17 +168,15 @@ def _failures(cells: Sequence[Cell], values: np.ndarray) -> list[str]:
         if (cell.n, cell.q) == (50, 0.25) or (cell.n == largest and cell.q <= 0.3):
             mean = np.minimum(trials[:, 0], 1.0).mean()
             lines.append(f"  n = {cell.n}, q = {cell.q:g}: mean error {mean:.2g}")
-            lines += [_failure(t) for t in trials.tolist() if t[0] >= EXACT]
+            lines += [
+                "    a problem that is not parallel rigid"
+                if camera < 0
+                else f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong;"
+                f" {others:.2g} without it"
+                for error, camera, share, others in trials.tolist()
+                if error >= EXACT
+            ]
     return lines
-
-
-def _failure(trial: Sequence[float]) -> str:
-    error, camera, share, others = trial
-    if camera < 0:
-        return "    a problem that is not parallel rigid"
-    return (
-        f"    error {error:.2g}: camera {camera:.0f}, {share:.0%} of its pairs wrong; {others:.2g} without it"
-    )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -208,11 +184,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--figure", choices=FIGURES, default="paper")
 
 
-def run(args: argparse.Namespace) -> None:
-    """Compute and draw a figure, and say what the paper's text says of its own."""
+def run(args: argparse.Namespace) -> Figure:
+    """Compute and draw a figure, and say what the paper's text says of its own.
+
+    Every method runs on every cell.
+    """
     shown, trials = FIGURES[args.figure], args.trials
     if args.quick:
-        shown, trials = [quick(panel) for panel in shown], 2
-    results = compute(shown, trials, args.cache, args.processes)
-    draw(shown, results, args.out)
+        shown, trials = [replace(panel, n=(10, 30), q=(0.0, 0.2)) for panel in shown], 2
+    cells = list(dict.fromkeys(cell for panel in shown for cell in panel.cells()))
+    methods = list(dict.fromkeys(panel.method for panel in shown))
+    results = run_trials(cells, methods, trials, cache=args.cache, processes=args.processes, seed=SEED)
     print(report(shown, results))
+    return draw(shown, results)

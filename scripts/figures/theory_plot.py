@@ -12,20 +12,17 @@ Source: Hand, Lee, Voroninski (2015), theorems of sections 2.1 and 3.1.
 import argparse
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from typing import NamedTuple
 
-import matplotlib as mpl
+import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.figure import Figure
 
 from figures.methods import METHODS
 from harness.graphs import relative_error, view_graph
 from sfm_shapefit.errors import ShapeFitError
 from sfm_shapefit.synthetic.graphs import GraphProblem, random_graph_problem
 from sfm_shapefit.theory import recovery_conditions
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 
 EXACT = 1e-9
 SIZES, P_OF_SIZES = (20, 30, 40, 60, 80, 120, 160, 240), 0.5
@@ -39,8 +36,7 @@ CURVES = {
 }
 
 
-@dataclass(frozen=True)
-class Point:
+class Point(NamedTuple):
     """One setting of the model: medians over its graphs of what is granted, and what was recovered."""
 
     any_dimension: float
@@ -48,11 +44,6 @@ class Point:
     feasible: float
     recovered: float
     """Wrong pairs of the worst camera, over n: least of a problem that was lost, the largest if none was."""
-
-
-def shares(num: int) -> np.ndarray:
-    """Return the probabilities of corruption that are tried."""
-    return np.linspace(0.0, 0.5, num)[1:]
 
 
 def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
@@ -63,7 +54,7 @@ def measure(n: int, p: float, trials: int, num_shares: int) -> Point:
         clean = random_graph_problem(n, p, seed=trial)
         found = recovery_conditions(clean.locations, clean.edges, threads=threads)
         granted.append((found.granted, found.granted_in_space, found.feasible))
-        for k, q in enumerate(shares(num_shares)):
+        for k, q in enumerate(np.linspace(0.0, 0.5, num_shares)[1:]):
             problem = random_graph_problem(n, p, q=float(q), seed=1000 * (k + 1) + trial)
             outcomes.append((worst_share(problem), is_recovered(problem)))
     lost = [share for share, good in outcomes if not good]
@@ -86,7 +77,7 @@ def is_recovered(problem: GraphProblem) -> bool:
     return relative_error(locations, problem.locations) < EXACT
 
 
-def draw(panels: Sequence[tuple[str, Sequence[float], list[Point]]], path: Path) -> None:
+def draw(panels: Sequence[tuple[str, Sequence[float], list[Point]]]) -> Figure:
     """Draw the curves of each panel over its axis; a theorem that grants nothing leaves a gap."""
     figure, axes = plt.subplots(
         1, len(panels), figsize=(10.5, 4.2), dpi=90, sharey=True, layout="constrained"
@@ -99,23 +90,10 @@ def draw(panels: Sequence[tuple[str, Sequence[float], list[Point]]], path: Path)
         axis.grid(visible=True, alpha=0.3)
     axes[0].set_ylabel("eps: wrong pairs of a camera / n")
     axes[0].legend(loc="center right", fontsize=8)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
-    plt.close(figure)
+    return figure
 
 
-def report(label: str, values: Sequence[float], points: list[Point]) -> str:
-    """Return the figures behind a panel."""
-    lines = [label]
-    for value, point in zip(values, points, strict=True):
-        lines.append(
-            f"  {value:g}: granted {point.any_dimension:.1e} (any d), {point.in_space:.1e} (d = 3); "
-            f"feasible {point.feasible:.1e}; recovered {point.recovered:.2f}"
-        )
-    return "\n".join(lines)
-
-
-def run(args: argparse.Namespace) -> None:
+def run(args: argparse.Namespace) -> Figure:
     """Compute and draw the curves, and print the figures behind them."""
     sizes, densities = (QUICK_SIZES, QUICK_DENSITIES) if args.quick else (SIZES, DENSITIES)
     trials, num_shares = (2, 6) if args.quick else (args.trials, 21)
@@ -126,6 +104,11 @@ def run(args: argparse.Namespace) -> None:
         (f"number of locations n (p = {P_OF_SIZES:g})", sizes, by_size),
         (f"edge probability p (n = {n_of_densities})", densities, by_density),
     ]
-    draw(panels, args.out)
-    for panel in panels:
-        print(report(*panel))
+    for label, values, points in panels:
+        print(label)
+        for value, point in zip(values, points, strict=True):
+            print(
+                f"  {value:g}: granted {point.any_dimension:.1e} (any d), {point.in_space:.1e} (d = 3); "
+                f"feasible {point.feasible:.1e}; recovered {point.recovered:.2f}"
+            )
+    return draw(panels)

@@ -1,24 +1,22 @@
 """Many small problems over several processes, resumable: cells x methods x trials of the random model.
 
 A cell is a setting of the paper's model, of which a number of trials are drawn; every method solves the same
-ones. The results are kept in an npz beside the settings they belong to, so that an interrupted run goes on.
+ones. The results are kept in a file with the settings they belong to, so that an interrupted run goes on.
 """
 
-import json
 import os
-import time
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from figures.methods import METHODS
+from harness.driver import Kept
 from harness.graphs import relative_error, to_unit_norm, view_graph
 from harness.process import thread_environment
 from sfm_shapefit.arrays import FloatArray
@@ -28,7 +26,6 @@ from sfm_shapefit.viewgraph import ViewGraph
 
 NOT_RECOVERED = 1.0
 """The error of a problem that has no unique answer, as in the paper's black cells."""
-_SAVE_EVERY_S = 5.0
 # A process takes so many cells at a time.
 _BATCH = 8
 
@@ -60,19 +57,20 @@ class Trial(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Results:
-    """Trials of cells by methods, each array of shape (cells, methods, trials)."""
+    """Trials of cells by methods."""
 
     cells: tuple[Cell, ...]
     methods: tuple[str, ...]
     values: FloatArray
     """(cells, methods, trials, fields of `Trial`)."""
-    seconds: float
-    """Time of the runs that made them."""
+
+    def of(self, method: str) -> FloatArray:
+        """Return the trials of a method, (cells, trials, fields of `Trial`)."""
+        return self.values[:, self.methods.index(method)]
 
     def mean_errors(self, method: str) -> FloatArray:
         """Return each cell's mean error, (cells,); an error counts as 1 at most, as in the paper's figure."""
-        errors = self.values[:, self.methods.index(method), :, 0]
-        return np.asarray(np.minimum(errors, 1.0).mean(axis=1))
+        return np.asarray(np.minimum(self.of(method)[..., 0], 1.0).mean(axis=1))
 
 
 def run_trials(
@@ -84,58 +82,25 @@ def run_trials(
     processes: int = 2,
     seed: int = 0,
 ) -> Results:
-    """Run all trials that the cache, an npz file, does not hold, with a progress bar on stderr.
+    """Run all trials that the cache, a file, does not hold; the largest problems go first.
 
     Raises:
         ValueError: if the cache belongs to other settings.
     """
-    settings = {"cells": [asdict(c) for c in cells], "methods": list(methods), "trials": trials, "seed": seed}
-    values = np.full((len(cells), len(methods), trials, len(Trial._fields)), np.nan)
-    spent = 0.0
-    if cache is not None and cache.exists():
-        values, spent = _load(cache, settings)
-    missing = np.flatnonzero(np.isnan(values[..., 0]).any(axis=(1, 2)))
-    start = saved = time.perf_counter()
-    for rows, part in _compute(missing, cells, methods, trials, seed, processes):
-        values[rows] = part
-        if cache is not None and time.perf_counter() - saved > _SAVE_EVERY_S:
-            saved = time.perf_counter()
-            _save(cache, settings, values, spent + saved - start)
-    spent += time.perf_counter() - start
-    if cache is not None and len(missing):
-        _save(cache, settings, values, spent)
-    return Results(tuple(cells), tuple(methods), values, spent)
-
-
-def _compute(
-    missing: FloatArray,
-    cells: Sequence[Cell],
-    methods: Sequence[str],
-    trials: int,
-    seed: int,
-    processes: int,
-) -> Iterator[tuple[list[int], FloatArray]]:
-    """Yield batches of rows and their values as they are done; the largest problems go first."""
-    order = sorted(missing.tolist(), key=lambda k: -cells[k].n)
-    if not order:
-        return
-    step = max(len(order) // _BATCH, 1)
-    batches = [order[k::step] for k in range(step)]
+    kept = Kept(cache, {"methods": list(methods), "trials": trials, "seed": seed})
+    missing = sorted((cell for cell in cells if str(cell) not in kept), key=lambda cell: -cell.n)
+    step = max(len(missing) // _BATCH, 1)
     # The spawned workers read it when they load numpy.
     os.environ.update(thread_environment(1))
-    columns = (TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with (
-        Progress(*columns, console=Console(stderr=True)) as progress,
-        ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool,
-    ):
-        bar = progress.add_task("trials", total=len(order))
-        running = {
-            pool.submit(run_batch, [cells[k] for k in batch], methods, trials, seed): batch
-            for batch in batches
-        }
-        for done in as_completed(running):
-            progress.advance(bar, len(running[done]))
-            yield running[done], done.result()
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        batches = [missing[k::step] for k in range(step)] if missing else []
+        running = {pool.submit(run_batch, batch, methods, trials, seed): batch for batch in batches}
+        for count, done in enumerate(as_completed(running), start=1):
+            for cell, values in zip(running[done], done.result(), strict=True):
+                kept.get(str(cell), lambda values=values: values)
+            print(f"{count} of {len(batches)} batches of cells", file=sys.stderr)
+    values = np.array([kept.get(str(cell), lambda: None) for cell in cells])
+    return Results(tuple(cells), tuple(methods), values)
 
 
 def run_batch(cells: Sequence[Cell], methods: Sequence[str], trials: int, seed: int) -> FloatArray:
@@ -173,23 +138,3 @@ def trial(problem: GraphProblem, method: Callable[[ViewGraph, GraphProblem], Flo
         float(problem.corrupted[touching].mean()),
         relative_error(np.delete(found, worst, axis=0), np.delete(problem.locations, worst, axis=0)),
     )
-
-
-def _load(cache: Path, settings: dict[str, object]) -> tuple[FloatArray, float]:
-    """Return the values kept in a cache file and the time they took.
-
-    Raises:
-        ValueError: if the file belongs to other settings.
-    """
-    with np.load(cache, allow_pickle=False) as kept:
-        if json.loads(str(kept["settings"])) != json.loads(json.dumps(settings)):
-            raise ValueError(f"{cache} holds other settings; delete it or give another --cache")
-        return np.array(kept["values"]), float(kept["seconds"])
-
-
-def _save(cache: Path, settings: dict[str, object], values: FloatArray, seconds: float) -> None:
-    """Write the cache in place of the old one."""
-    cache.parent.mkdir(parents=True, exist_ok=True)
-    partial = cache.with_name(f".{cache.stem}.partial.npz")
-    np.savez_compressed(partial, settings=json.dumps(settings), values=values, seconds=seconds)
-    partial.replace(cache)

@@ -36,15 +36,6 @@ Case = Callable[[], Any] | str
 """A function to be called in a fresh process, or the reason why the case is skipped."""
 
 
-def no_flags(_parser: argparse.ArgumentParser) -> None:
-    """Declare no arguments beside the common ones."""
-
-
-def no_checks(_found: Any) -> Sequence[Check]:
-    """Return nothing: the tables compare, and have no limit."""
-    return ()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Benchmark:
     """What is measured, how it is judged, and how it is shown."""
@@ -56,10 +47,11 @@ class Benchmark:
     tables: Callable[[Mapping[str, Any], argparse.Namespace], Iterable[str]]
     """The parts of the section, of what all cases gave."""
     quantities: Sequence[Quantity]
-    checks: Callable[[Any], Sequence[Check]] = no_checks
-    """The limits of what one case gave."""
+    checks: Callable[[Any], Sequence[Check]] = lambda _found: ()
+    """The limits of what one case gave; none where tables only compare."""
     packages: Sequence[str] = ("numpy", "scipy", "numba", "pycolmap")
-    flags: Callable[[argparse.ArgumentParser], None] = no_flags
+    flags: Callable[[argparse.ArgumentParser], None] = lambda _parser: None
+    """Declares further arguments."""
     quick: Mapping[str, Any] = field(default_factory=dict)
     """Arguments that --quick changes."""
     repeats: int = 1
@@ -167,6 +159,9 @@ class Kept:
         kept_settings, self._answers = pickle.loads(file.read_bytes())
         if kept_settings != settings:
             raise ValueError(f"{file} holds answers of other settings; delete it or give another --cache")
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._answers
 
     def get(self, name: str, ask: Callable[[], Any]) -> Any:
         """Return the answer kept under a name, or ask for it and keep it."""

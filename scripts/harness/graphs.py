@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 SEED = 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class GraphSpec:
     """A random graph problem that can be drawn again anywhere."""
 
@@ -57,7 +57,7 @@ def view_graph(problem: "GraphProblem") -> "ViewGraph":
 
 
 def relative_error(locations: "FloatArray", truth: "FloatArray") -> float:
-    """Return the paper's error: the distance of the two sets, each centred and scaled to unit norm.
+    """Return the paper's error: the distance of the two sets, each centered and scaled to unit norm.
 
     Source: Hand, Lee, Voroninski (2015), section 4.
     """

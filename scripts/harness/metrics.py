@@ -7,7 +7,7 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 Better = Literal["lower", "higher", "neither"]
 
@@ -97,3 +97,16 @@ def count_met(checks: Sequence[Check]) -> str:
 def median(values: Sequence[float]) -> float:
     """Return the median, NaN of nothing."""
     return statistics.median(values) if values else math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class Trials:
+    """What all seeds of one case gave."""
+
+    name: str
+    problem: Any
+    trials: Sequence[Any]
+
+    def median(self, column: str) -> float:
+        """Return the median of a field of the trials."""
+        return median([getattr(trial, column) for trial in self.trials])

@@ -68,20 +68,9 @@ def place_file(source: Path, **options: Any) -> Any:
     return place_graph_file(source, PlacementOptions(**options))
 
 
-def lud_of(placement: "Placement") -> "FloatArray | None":
-    """Return the locations of the LUD start that a placement was compared with, if there was one."""
-    lud = placement.refined.lud
-    return None if lud is None else lud.locations
-
-
-def start_of(placement: "Placement") -> str:
-    """Return which start was kept."""
-    return placement.refined.start
-
-
 def warns(placement: "Placement") -> bool:
     """Return whether the report of a placement carries a warning."""
-    from sfm_shapefit.results import quality_warnings
+    from sfm_shapefit.results.warnings import quality_warnings
 
     return any(True for _ in quality_warnings(placement))
 
@@ -108,21 +97,6 @@ def map_database(database: Path, **options: Any) -> Any:
 
     found = sfm_shapefit.map_database(database, **options)
     return found.models[0].located.reconstruction
-
-
-def directions_of_set(folder: Path) -> Any:
-    """Return the names of a model's images, and the directions measured from its database."""
-    from sfm_shapefit import LocateOptions
-    from sfm_shapefit.colmap.database import open_database
-    from sfm_shapefit.colmap.model import read_model
-    from sfm_shapefit.directions.estimate import estimate_directions
-    from sfm_shapefit.directions.pair_directions import concatenate
-
-    model = read_model(folder / "sparse" / "0")
-    wanted = LocateOptions()
-    with open_database(folder / "database.db", model) as database:
-        parts = [estimate_directions(batch, wanted) for batch in database.iter_matches(1)]
-    return model.names, concatenate(parts)
 
 
 def rigid_pieces(num_nodes: int, edges: "IntArray") -> "IntArray":

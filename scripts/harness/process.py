@@ -10,10 +10,11 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 THREAD_VARIABLES = (
     "OPENBLAS_NUM_THREADS",
@@ -46,7 +47,7 @@ def call(
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    with _environment(environment or {}):
+    with patch.dict(os.environ, environment or {}):
         process = context.Process(target=_answer, args=(sender, function, args, cpu_limit_s))
         process.start()
     sender.close()
@@ -86,21 +87,6 @@ def _answer(
         sender.send((False, f"{type(error).__name__}: {' '.join(str(error).split())[:200]}"))
     finally:
         sender.close()
-
-
-@contextlib.contextmanager
-def _environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for the processes that are started inside."""
-    before = {name: os.environ.get(name) for name in variables}
-    os.environ.update(variables)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 def peak_memory_mb() -> float:

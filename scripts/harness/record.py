@@ -3,7 +3,7 @@
 import datetime
 import os
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -66,6 +66,13 @@ def cpu_model(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
         lines = []
     models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return models[0] if models else platform.processor() or "processor unknown"
+
+
+def leave_out(keys: Collection[str], value: Any) -> Any:
+    """Return a JSON value without the entries of these keys, wherever they stand."""
+    if isinstance(value, dict):
+        return {key: leave_out(keys, inner) for key, inner in value.items() if key not in keys}
+    return [leave_out(keys, inner) for inner in value] if isinstance(value, list) else value
 
 
 def _version(package: str) -> str:

@@ -3,7 +3,7 @@
 One camera is grounded, and each edge has one cone of d - 1 rows beside its bound, in an orthonormal basis
 B_e of the complement of v_e:
 
-    minimise    sum_e w_e s_e
+    minimize    sum_e w_e s_e
     subject to  <c, T> = kappa,    (s_e, B_e^T (t_i - t_j)) in the second-order cone,    t_0 = 0
 
 The multiplier of edge e is (w_e, z_e) in the same cone, and y_e = -B_e z_e the dual of the program.

@@ -18,8 +18,7 @@ Source: Pan, Barath, Pollefeys, Schonberger, "Global Structure-from-Motion Revis
 import shutil
 import tempfile
 import time
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +27,8 @@ import numpy.typing as npt
 import pycolmap
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+
+from sfm_shapefit.colmap.quiet import quiet_log
 
 MIN_VIEWS = 3
 MAX_SPREAD_PX = 10.0
@@ -63,17 +64,6 @@ class Positioned(NamedTuple):
     """`run_global_positioning` alone."""
     positioning_cpu_s: float
     """CPU time of it, all threads."""
-
-
-@contextmanager
-def quiet() -> Iterator[None]:
-    """Keep pycolmap's information and warnings off stderr while the block runs."""
-    level = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.ERROR)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = level
 
 
 def copy_database(database: Path, folder: Path) -> Path:
@@ -162,7 +152,7 @@ def average_rotations(database: Path, model: Path, min_num_matches: int = 15) ->
     Raises:
         RuntimeError: if pycolmap reports that the averaging failed.
     """
-    with quiet():
+    with quiet_log():
         reconstruction, _, pose_graph = _read(database, min_num_matches)
         # The intrinsics are wanted; the rotations are estimated anew.
         take_rotations(reconstruction, pycolmap.Reconstruction(str(model)))

@@ -16,9 +16,9 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from functools import partial
 from importlib.util import find_spec
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from harness import ours
 from harness.graphs import GraphSpec, draw, relative_error, view_graph
@@ -53,20 +53,28 @@ WARM_UP = {
 }
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Answer:
-    """What a contender gave on a problem."""
+Solver = Callable[[], tuple["FloatArray", str]]
+"""Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
+
+
+class Answer(NamedTuple):
+    """What a contender gave on a problem or a scene."""
 
     name: str
-    ours: bool
-    error: float = math.nan
+    error: Any = math.nan
+    """Against the truth: a number of a graph, `Errors` of a scene or None."""
     seconds: float = math.nan
     cpu_s: float = math.nan
-    """CPU time of all threads of its process while the clock ran."""
+    """CPU time of all threads while the clock ran; unknown where the clock covers a part of a call."""
     peak_mb: float = math.nan
     """Peak resident memory of its process while the clock ran, in 10^6 bytes."""
     note: str = ""
     """Why there is no answer, or what else it says."""
+
+    @property
+    def ours(self) -> bool:
+        """Whether it is no peer's."""
+        return self.name.startswith("ours")
 
     @property
     def spent_s(self) -> float:
@@ -74,8 +82,7 @@ class Answer:
         return self.cpu_s if math.isfinite(self.cpu_s) else self.seconds
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Compared:
+class Compared(NamedTuple):
     """A problem and all answers."""
 
     name: str
@@ -83,104 +90,79 @@ class Compared:
     answers: tuple[Answer, ...]
 
 
-def answer(contender: "Contender", spec: GraphSpec, cpu_limit_s: int) -> Answer:
-    """Return a contender's answer, or why there is none."""
-    empty = Answer(name=contender.name, ours=contender.package is None)
-    if contender.package is not None and find_spec(contender.package) is None:
-        return replace(empty, note=f"skipped: {contender.package} is not installed")
+def ask(name: str, package: str | None, run: Callable[[], Answer], cpu_limit_s: int) -> Answer:
+    """Return what a contender answers in a fresh process of one thread, or why there is none."""
+    if package is not None and find_spec(package) is None:
+        return Answer(name, note=f"skipped: {package} is not installed")
+    limits = {"timeout_s": WALL_PER_CPU * cpu_limit_s, "cpu_limit_s": cpu_limit_s}
     try:
-        error, seconds, cpu_s, note, peak_mb = call(
-            measure,
-            contender.name,
-            spec,
-            environment=thread_environment(1),
-            timeout_s=WALL_PER_CPU * cpu_limit_s,
-            cpu_limit_s=cpu_limit_s,
-        )
+        found: Answer = call(run, environment=thread_environment(1), **limits)
     except (TimeoutError, RuntimeError) as reason:
-        return replace(empty, note=f"failed: {reason}")
-    return replace(empty, error=error, seconds=seconds, cpu_s=cpu_s, note=note, peak_mb=peak_mb)
+        return Answer(name, note=f"failed: {reason}")
+    return found
 
 
-Solver = Callable[[], tuple["FloatArray", str]]
-"""Solves the problem that it was prepared for; returns locations (n, 3) and a note."""
+def _solve_shapefit(graph: "ViewGraph") -> tuple["FloatArray", str]:
+    found = ours.solve(graph, tol=_SHAPEFIT_TOL)
+    return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
 
 
-def _prepare_shapefit(graph: "ViewGraph") -> Solver:
+def _place(graph: "ViewGraph") -> tuple["FloatArray", str]:
+    found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
+    points = dict(zip(found.cameras.tolist(), found.locations, strict=True))
+    return _gather(points, graph.num_nodes), f"from {found.refined.start}, verdicts included"
+
+
+def _by_pytheia(nonlinear: bool, graph: "ViewGraph") -> Solver:
+    import numpy as np
+    from pytheia import sfm
+
+    pairs = {}
+    for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
+        info = sfm.TwoViewInfo()
+        info.rotation_2 = np.zeros(3)
+        # Where the second camera is, seen from the first.
+        info.position_2 = -v if i < j else v
+        info.num_verified_matches = 100
+        pairs[min(i, j), max(i, j)] = info
+    orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
+
     def run_it() -> tuple["FloatArray", str]:
-        found = ours.solve(graph, tol=_SHAPEFIT_TOL)
-        return found.locations, f"{found.method}, certified gap {found.gap:.0e}"
+        with _silence():
+            if nonlinear:
+                options = sfm.NonlinearPositionEstimatorOptions()
+                estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
+            else:
+                options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
+                estimator = sfm.LeastUnsquaredDeviationPositionEstimator(options)
+            found = estimator.EstimatePositions(pairs, orientations)
+        return _gather({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
 
     return run_it
 
 
-def _prepare_place(graph: "ViewGraph") -> Solver:
+def _by_gtsam(robust: bool, bilinear: bool, graph: "ViewGraph") -> Solver:
+    import gtsam
+
+    noise = gtsam.noiseModel.Isotropic.Sigma(2, _GTSAM_SIGMA)
+    if robust:
+        noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(_HUBER), noise)
+    measurements = [
+        gtsam.BinaryMeasurementUnit3(i, j, gtsam.Unit3(-v), noise)  # gtsam's points from i to j
+        for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True)
+    ]
+    recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), bilinear)
+
     def run_it() -> tuple["FloatArray", str]:
-        found = ours.place(graph, tol=_SHAPEFIT_TOL, uniqueness=False)
-        positions = dict(zip(found.cameras.tolist(), found.locations, strict=True))
-        return _gather(positions, graph.num_nodes), f"from {ours.start_of(found)}, verdicts included"
+        with _silence():
+            values = recovery.run(measurements, 1.0)
+        points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
+        return _gather(points, graph.num_nodes), ""
 
     return run_it
 
 
-def _prepare_pytheia(nonlinear: bool) -> Callable[["ViewGraph"], Solver]:
-    def prepare(graph: "ViewGraph") -> Solver:
-        import numpy as np
-        from pytheia import sfm
-
-        pairs = {}
-        for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True):
-            info = sfm.TwoViewInfo()
-            info.rotation_2 = np.zeros(3)
-            # Where the second camera is, seen from the first.
-            info.position_2 = -v if i < j else v
-            info.num_verified_matches = 100
-            pairs[min(i, j), max(i, j)] = info
-        orientations = {camera: np.zeros(3) for camera in range(graph.num_nodes)}
-
-        def run_it() -> tuple["FloatArray", str]:
-            with _silence():
-                if nonlinear:
-                    options = sfm.NonlinearPositionEstimatorOptions()
-                    estimator = sfm.NonlinearPositionEstimator(options, sfm.Reconstruction())
-                else:
-                    options = sfm.LeastUnsquaredDeviationPositionEstimatorOptions()
-                    estimator = sfm.LeastUnsquaredDeviationPositionEstimator(options)
-                found = estimator.EstimatePositions(pairs, orientations)
-            return _gather({k: np.ravel(p) for k, p in found.items()}, graph.num_nodes), ""
-
-        return run_it
-
-    return prepare
-
-
-def _prepare_gtsam(robust: bool, bilinear: bool = False) -> Callable[["ViewGraph"], Solver]:
-    def prepare(graph: "ViewGraph") -> Solver:
-        import gtsam
-
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, _GTSAM_SIGMA)
-        if robust:
-            huber = gtsam.noiseModel.mEstimator.Huber.Create(_HUBER)
-            noise = gtsam.noiseModel.Robust.Create(huber, noise)
-        measurements = [
-            gtsam.BinaryMeasurementUnit3(i, j, gtsam.Unit3(-v), noise)  # gtsam's points from i to j
-            for (i, j), v in zip(graph.edges.tolist(), graph.directions, strict=True)
-        ]
-        recovery = gtsam.TranslationRecovery(gtsam.LevenbergMarquardtParams(), bilinear)
-
-        def run_it() -> tuple["FloatArray", str]:
-            with _silence():
-                values = recovery.run(measurements, 1.0)
-            points = {k: values.atPoint3(k) for k in range(graph.num_nodes) if values.exists(k)}
-            return _gather(points, graph.num_nodes), ""
-
-        return run_it
-
-    return prepare
-
-
-@dataclass(frozen=True, slots=True)
-class Contender:
+class Contender(NamedTuple):
     """A solver of bare graphs and the package it needs; None: ours."""
 
     name: str
@@ -191,18 +173,23 @@ class Contender:
 
 
 CONTENDERS = (
-    Contender("ours, placed", _prepare_place),
-    Contender("ours, ShapeFit", _prepare_shapefit),
-    Contender("pytheia LUD", _prepare_pytheia(nonlinear=False), "pytheia"),
-    Contender("pytheia Nonlinear", _prepare_pytheia(nonlinear=True), "pytheia", runs=3),
-    Contender("gtsam TranslationRecovery", _prepare_gtsam(robust=False), "gtsam"),
-    Contender("gtsam with Huber", _prepare_gtsam(robust=True), "gtsam"),
-    Contender("gtsam bilinear with Huber", _prepare_gtsam(robust=True, bilinear=True), "gtsam"),
+    Contender("ours, placed", lambda graph: partial(_place, graph)),
+    Contender("ours, ShapeFit", lambda graph: partial(_solve_shapefit, graph)),
+    Contender("pytheia LUD", partial(_by_pytheia, False), "pytheia"),
+    Contender("pytheia Nonlinear", partial(_by_pytheia, True), "pytheia", runs=3),
+    Contender("gtsam TranslationRecovery", partial(_by_gtsam, False, False), "gtsam"),
+    Contender("gtsam with Huber", partial(_by_gtsam, True, False), "gtsam"),
+    Contender("gtsam bilinear with Huber", partial(_by_gtsam, True, True), "gtsam"),
 )
 
 
-def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float]:
-    """Return error, seconds, CPU seconds, note and peak memory; to be called once per process."""
+def answer(contender: Contender, spec: GraphSpec, cpu_limit_s: int) -> Answer:
+    """Return a contender's answer, or why there is none."""
+    return ask(contender.name, contender.package, partial(measure, contender.name, spec), cpu_limit_s)
+
+
+def measure(name: str, spec: GraphSpec) -> Answer:
+    """Return the answer of a contender; to be called once per process."""
     contender = next(one for one in CONTENDERS if one.name == name)
     if contender.package is None:
         # Compiled code is loaded.
@@ -212,14 +199,14 @@ def measure(name: str, spec: GraphSpec) -> tuple[float, float, float, str, float
     runs = []
     reset_peak()
     for _ in range(contender.runs):
-        solver = contender.prepare(view_graph(problem))
-        (locations, note), wall_s, cpu_s = ours.time_call(solver)
-        runs.append((relative_error(locations, problem.locations), wall_s, cpu_s, note))
+        (locations, note), wall_s, cpu_s = ours.time_call(contender.prepare(view_graph(problem)))
+        runs.append((relative_error(locations, problem.locations), wall_s, cpu_s, peak_memory_mb(), note))
     runs.sort()
-    error, wall_s, cpu_s, note = runs[len(runs) // 2]
-    if len(runs) > 1:
-        note = f"median of {len(runs)} random starts, errors {numbers([run[0] for run in runs])}"
-    return error, wall_s, cpu_s, note, peak_memory_mb()
+    found = Answer(name, *runs[len(runs) // 2])
+    if len(runs) == 1:
+        return found
+    note = f"median of {len(runs)} random starts, errors {numbers([run[0] for run in runs])}"
+    return found._replace(peak_mb=max(run[3] for run in runs), note=note)
 
 
 def _gather(points: "dict[int, FloatArray]", n: int) -> "FloatArray":
@@ -253,27 +240,21 @@ def _silence() -> Iterator[None]:
         os.close(nowhere)
 
 
-def best_of_ours(one: Compared) -> Answer | None:
-    """Return our answer of the lowest error, None if there is none."""
-    found = [answer for answer in one.answers if answer.ours and math.isfinite(answer.error)]
-    return min(found, key=lambda answer: answer.error, default=None)
-
-
 def checks(one: Compared) -> list[Check]:
     """Return the checks of one problem: the lowest error of all, and the time of the equally accurate.
 
     A peer without an answer has no check; where no peer is as accurate as ours, there is none of the time.
     """
-    ours = best_of_ours(one)
-    peers = [answer for answer in one.answers if not answer.ours and math.isfinite(answer.error)]
+    answered = [answer for answer in one.answers if math.isfinite(answer.error)]
+    peers = [answer for answer in answered if not answer.ours]
     if not peers:
         return []
-    error = math.nan if ours is None else ours.error
-    spent_s = math.nan if ours is None else ours.spent_s
+    best = min((a for a in answered if a.ours), key=lambda answer: answer.error, default=Answer("ours"))
+    error = best.error
     found = [Check(name="error", value=error, limit=min(peer.error for peer in peers))]
     as_good = [peer.spent_s for peer in peers if peer.error <= error]
     if as_good:
         found.append(
-            Check(name="times faster", value=ratio(min(as_good), spent_s), limit=FASTER, better="higher")
+            Check(name="times faster", value=ratio(min(as_good), best.spent_s), limit=FASTER, better="higher")
         )
     return found

@@ -16,7 +16,7 @@ from scipy.sparse.linalg import splu
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.baselines.normalize import normalize_locations
-from sfm_shapefit.laplacian.operators import LaplacianPattern, assemble, laplacian_pattern
+from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -41,11 +41,10 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
     Returns:
         (n, d) locations, centered and of unit norm.
     """
-    pattern = laplacian_pattern(graph.num_nodes, graph.edges)
     projections = np.eye(graph.dimension) - np.einsum("ea,eb->eab", graph.directions, graph.directions)
     weights = graph.weights
     for left in range(reweightings, -1, -1):
-        t = _smallest_eigenvector(pattern, weights[:, None, None] * projections)
+        t = _smallest_eigenvector(graph, weights[:, None, None] * projections)
         if left:
             lengths = np.linalg.norm(differences(t, graph.edges), axis=1)
             weights = graph.weights / np.maximum(lengths, _SHORTEST * np.median(lengths)) ** 2
@@ -53,11 +52,10 @@ def locate_least_squares(graph: ViewGraph, reweightings: int = 0) -> FloatArray:
     return normalize_locations(graph, t)
 
 
-def _smallest_eigenvector(pattern: LaplacianPattern, blocks: FloatArray) -> FloatArray:
+def _smallest_eigenvector(graph: ViewGraph, blocks: FloatArray) -> FloatArray:
     """Return the eigenvector (n, d) of the smallest eigenvalue of the block Laplacian, shifts aside."""
-    matrix = csc_array(assemble(pattern, blocks))
-    d = blocks.shape[1]
-    n = matrix.shape[0] // d
+    n, d = graph.num_nodes, graph.dimension
+    matrix = csc_array(laplacian_matrix(n, graph.edges, blocks))
     shifts = np.tile(np.eye(d), (n, 1)) / np.sqrt(n)
     size = float(matrix.diagonal().mean())
     if n * d <= _DENSE_UNKNOWNS:

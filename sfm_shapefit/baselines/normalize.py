@@ -11,5 +11,4 @@ def normalize_locations(graph: ViewGraph, locations: FloatArray) -> FloatArray:
     """Return the (n, d) locations centered, of unit norm, and with sum_e w_e <t_i - t_j, v_e> >= 0."""
     centered = locations - locations.mean(axis=0)
     centered = centered / np.linalg.norm(centered)
-    aligned: FloatArray = centered if projected_length(graph, centered) >= 0.0 else -centered
-    return aligned
+    return np.asarray(centered if projected_length(graph, centered) >= 0.0 else -centered)

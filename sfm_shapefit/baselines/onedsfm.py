@@ -35,8 +35,7 @@ def filter_1dsfm(
         threshold: largest mean length, per axis, of the projections that contradict the order.
         seed: of the axes.
     """
-    kept: BoolArray = onedsfm_scores(graph, num_axes, seed) < threshold
-    return kept
+    return np.asarray(onedsfm_scores(graph, num_axes, seed) < threshold)
 
 
 def onedsfm_scores(graph: ViewGraph, num_axes: int = _AXES, seed: int = 0) -> FloatArray:

@@ -130,13 +130,9 @@ def _flag_of(name: str) -> str:
 
 
 def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
-    """Return options from a TOML file and the flags that were given, which win.
+    """Return options from a TOML file, if there is one, and the flags that were given, which win.
 
-    Args:
-        settings: the class of the options.
-        given: what the flags say, None where the user says nothing; what is no field of the class is left
-            to others.
-        config: the TOML file, if there is one.
+    Flags are None where the user says nothing; what is no field of the class is left to others.
 
     Raises:
         InputError: if the file is none that may be read.

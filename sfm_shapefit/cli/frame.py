@@ -33,7 +33,7 @@ class Run(Generic[Options]):
 
     @property
     def writing(self) -> dict[str, Any]:
-        """How the result is written; keywords of `write_result` and its like."""
+        """How the result is written; keywords of `write_result`."""
         flags = self.flags
         how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
         return how | {"protect": self.protect}
@@ -52,11 +52,7 @@ def command_run(
 ) -> Iterator[Run[Options]]:
     """Run a command that makes OUT: errors become one sentence and an exit code, and OUT is whole or absent.
 
-    Args:
-        settings: the class of the command's options.
-        given: the flags of `settings` and of `OutputFlags`, None where the user says nothing.
-        target: OUT.
-        inputs: paths that must stay as they are.
+    Flags of `settings` and of `OutputFlags` are None where the user says nothing. Inputs stay as they are.
     """
     with report_errors(target):
         from sfm_shapefit.atomic_folder import claimed_output

@@ -23,7 +23,6 @@ from sfm_shapefit.options import LocateOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import Inspection
-    from sfm_shapefit.placement.diagnosis import Diagnosis
 
 _INSPECTED = (
     "directions",
@@ -53,7 +52,7 @@ def inspect_command(
     database: Database = None,
     theory: Annotated[
         bool,
-        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centres."),
+        typer.Option("--theory", help="Also compute what the recovery theorems grant at MODEL's centers."),
     ] = False,
     as_json: Json = False,
     **given: Any,
@@ -81,6 +80,12 @@ def _inspection_table(found: "Inspection") -> Rows:
     """Return the diagnosis, label by label."""
     seen = found.diagnosis
     statuses = "\n".join(f"{count} {status}" for status, count in found.statuses.items())
+    sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
+    sizes += ", ..." if len(seen.components) > NAMES_SHOWN else ""
+    pieces = [
+        f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
+        for piece in seen.pieces
+    ]
     left_out = [f"{name}: {reason}" for name, reason in seen.left_out.items()]
     weak = [f"{camera.name}: {'; '.join(camera.reasons)}" for camera in seen.weak]
     return [
@@ -88,8 +93,8 @@ def _inspection_table(found: "Inspection") -> Rows:
         ("pairs", statuses),
         ("points as nodes", found.points),
         ("rigs", found.rigs),
-        ("components", _describe_components(seen)),
-        *([("rigid pieces", shorten(_describe_pieces(seen), SEE_JSON))] if seen.pieces else []),
+        ("components", f"{len(seen.components)} ({sizes} cameras)"),
+        *([("rigid pieces", shorten(pieces, SEE_JSON))] if pieces else []),
         *([("not placed", shorten(left_out, SEE_JSON))] if left_out else []),
         *([("weak cameras", shorten(weak, SEE_JSON))] if weak else []),
         ("wrong pairs", seen.corruption.statement),
@@ -97,18 +102,4 @@ def _inspection_table(found: "Inspection") -> Rows:
         *([("finish", seen.plan.finish)] if seen.plan else []),
         *([("will take", found.expected.statement)] if found.expected else []),
         *([("theory", found.theory.statement)] if found.theory else []),
-    ]
-
-
-def _describe_components(seen: "Diagnosis") -> str:
-    sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
-    more = ", ..." if len(seen.components) > NAMES_SHOWN else ""
-    return f"{len(seen.components)} ({sizes}{more} cameras)"
-
-
-def _describe_pieces(seen: "Diagnosis") -> list[str]:
-    """Say of each rigid piece how large it is and what it hangs by."""
-    return [
-        f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
-        for piece in seen.pieces
     ]

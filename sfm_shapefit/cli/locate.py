@@ -74,12 +74,7 @@ def locate_command(
 
         with open_executor(executor, run.options.num_threads(), scheduler) as workers:
             found = locate(
-                source,
-                database,
-                options=run.options,
-                progress=run.progress,
-                priors=priors,
-                executor=workers,
+                source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
         write_result(found, target, **run.writing)
         title = f"{len(found.model.names)} images of {source}"
@@ -90,6 +85,9 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
     """Return what was placed, what was not and why, how certain it is, and where it is."""
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
+    points = "none"
+    if facts["num_points"]:
+        points = f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
     return [
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
@@ -99,9 +97,9 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
         ("pairs", _describe_pairs(facts)),
         ("objective", describe_objective(found.certified)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
-        ("centres", found.placement.refined.statement()),
+        ("centers", found.placement.refined.statement()),
         ("scale", found.gauge.statement),
-        ("points", _describe_points(facts)),
+        ("points", points),
         *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
         ("time", describe_time(found.timings_s, flags.verbose)),
@@ -128,9 +126,3 @@ def _describe_pairs(facts: dict[str, Any]) -> str:
     return (
         f"{facts['num_pairs']}: {usable} usable ({contradicting} contradict the solution{filtered}){others}"
     )
-
-
-def _describe_points(facts: dict[str, Any]) -> str:
-    if facts["num_points"] == 0:
-        return "none"
-    return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"

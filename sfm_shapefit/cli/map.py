@@ -35,10 +35,10 @@ def map_command(
     target = one_path(out, output_path, "OUT")
     with command_run(MapOptions, given, target, [source]) as run:
         from sfm_shapefit.commands.map import map_database
-        from sfm_shapefit.commands.write import write_map_result
+        from sfm_shapefit.commands.write import write_result
 
         found = map_database(source, run.options, progress=run.progress)
-        write_map_result(found, target, **run.writing)
+        write_result(found, target, **run.writing)
         title = f"{found.num_images} images of {source}"
         run.show(title, found.summary(), lambda: _map_table(found, target, run.flags))
 

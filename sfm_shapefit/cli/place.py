@@ -65,7 +65,8 @@ def place_command(
     target = one_path(out, None, "OUT")
     with command_run(PlacementOptions, given, target, [source, rotations]) as run:
         from sfm_shapefit.commands.place import place_graph_file
-        from sfm_shapefit.commands.write import write_graph_result
+        from sfm_shapefit.commands.write import write_result
+        from sfm_shapefit.results.exports import export_files
 
         found = place_graph_file(
             source,
@@ -75,7 +76,8 @@ def place_command(
             reverse=reverse,
             progress=run.progress,
         )
-        write_graph_result(found, target, g2o=g2o, onedsfm=onedsfm, **run.writing)
+        files = export_files(found, g2o=g2o, onedsfm=onedsfm)
+        write_result(found, target, further_files=files, **run.writing)
         title = f"{found.placement.graph.num_nodes} nodes of {source}"
         run.show(title, found.summary(), lambda: _place_table(found, target, run.flags))
 

@@ -12,8 +12,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions, WorkspaceOptions
 
 Images = Annotated[
-    bool,
-    typer.Option("--images", help="Draw images, and let COLMAP find the keypoints and matches in them."),
+    bool, typer.Option("--images", help="Draw images, and let COLMAP find the keypoints and matches in them.")
 ]
 
 

@@ -64,10 +64,8 @@ UInt64Array = npt.NDArray[np.uint64]
 def check_model_files(folder: Path) -> None:
     """Refuse a model folder that pycolmap must not be given.
 
-    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads.
-
-    Args:
-        folder: holds cameras, images and points3D, and either both or none of rigs and frames.
+    Of a folder that holds both formats the binary one is checked, since that is the one pycolmap reads. It
+    must have cameras, images and points3D, and either both or none of rigs and frames.
 
     Raises:
         InputError: naming the file, and the record or the line, that is missing, truncated, not finite,
@@ -254,39 +252,27 @@ def _check_images(file: _BinaryFile, camera_ids: set[int]) -> _Images:
     names: set[bytes] = set()
     observed = [np.empty(0, dtype=np.uint64)]
     for _ in range(file.take_count(_IMAGE.size + 1 + _U64.size, "images")):
-        image_id, camera_id, name = _take_image_header(file, camera_ids)
+        image_id, *pose, camera_id = file.take(_IMAGE, "an image")
+        label = f"image {image_id}"
+        name = file.take_name(f"the name of {label}")
+        _refuse_pose(file, label, pose)
+        if camera_id not in camera_ids:
+            raise file.fault(f"{label} refers to camera {camera_id}, which cameras.bin does not have")
+        if not name:
+            raise file.fault(f"{label} has no name")
         if image_id in header_of or name in names:
-            raise file.fault(f"image {image_id} ({name.decode(errors='replace')}) stands twice")
-        points = _take_points2d(file, f"image {image_id}")
-        header_of[image_id] = (camera_id, len(points))
+            raise file.fault(f"{label} ({name.decode(errors='replace')}) stands twice")
+        count = file.take_count(_POINT2D.itemsize, f"points of {label}")
+        points = np.frombuffer(file.data, dtype=_POINT2D, count=count, offset=file.offset)
+        file.offset += count * _POINT2D.itemsize
+        if not np.isfinite(points["xy"]).all():
+            raise file.fault(f"{label} has a point whose coordinates are not finite")
+        header_of[int(image_id)] = (int(camera_id), count)
         names.add(name)
         observed.append(points["point3d_id"][points["point3d_id"] != _NO_POINT])
     file.finish()
     table = np.array([(i, *header_of[i]) for i in sorted(header_of)], dtype=np.int64).reshape(-1, 3)
     return _Images(table[:, 0], table[:, 1], table[:, 2], np.concatenate(observed))
-
-
-def _take_image_header(file: _BinaryFile, camera_ids: set[int]) -> tuple[int, int, bytes]:
-    """Read and check one image up to its name; return its id, its camera's id and its name."""
-    image_id, *pose, camera_id = file.take(_IMAGE, "an image")
-    label = f"image {image_id}"
-    name = file.take_name(f"the name of {label}")
-    _refuse_pose(file, label, pose)
-    if camera_id not in camera_ids:
-        raise file.fault(f"{label} refers to camera {camera_id}, which cameras.bin does not have")
-    if not name:
-        raise file.fault(f"{label} has no name")
-    return int(image_id), int(camera_id), name
-
-
-def _take_points2d(file: _BinaryFile, label: str) -> npt.NDArray[np.void]:
-    """Read the points of one image and refuse coordinates that are not finite."""
-    count = file.take_count(_POINT2D.itemsize, f"points of {label}")
-    points = np.frombuffer(file.data, dtype=_POINT2D, count=count, offset=file.offset)
-    file.offset += count * _POINT2D.itemsize
-    if not np.isfinite(points["xy"]).all():
-        raise file.fault(f"{label} has a point whose coordinates are not finite")
-    return points
 
 
 def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
@@ -310,12 +296,7 @@ def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
     repeated = ids[1:][ids[1:] == ids[:-1]]
     if len(repeated):
         raise file.fault(f"3D point {repeated[0]} stands twice")
-    _check_track_elements(file, elements, images)
-    return ids
-
-
-def _check_track_elements(file: _BinaryFile, elements: IntArray, images: _Images) -> None:
-    """Refuse track elements (E, 2) whose image, or whose point of that image, does not exist."""
+    # Each element of a track refers to an image, and to a point of it.
     position = np.searchsorted(images.ids, elements[:, 0])
     is_known = np.append(images.ids, -1)[position] == elements[:, 0]
     bad = elements[~(is_known & (elements[:, 1] < np.append(images.num_points2d, 0)[position]))]
@@ -324,6 +305,7 @@ def _check_track_elements(file: _BinaryFile, elements: IntArray, images: _Images
         raise file.fault(
             f"a track refers to point {point} of image {image_id}, which images.bin does not have"
         )
+    return ids
 
 
 @kernel(exact=True)

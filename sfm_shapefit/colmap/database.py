@@ -90,11 +90,7 @@ def find_database(model_folder: Path) -> Path | None:
 
 @contextmanager
 def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabase"]:
-    """Open a COLMAP database for reading; neither it nor its folder is changed.
-
-    Args:
-        path: the database.
-        model: the posed images whose matches are wanted.
+    """Open a COLMAP database, for the matches of a model's images; neither it nor its folder is changed.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
@@ -196,7 +192,7 @@ class MatchDatabase:
         rows, cols, data = found[0]
         if cols not in (2, 4, 6) or not _is_blob(data, rows, cols, itemsize=4):
             raise InputError(f"{self.path}: the keypoints of image {name} are damaged; extract them again")
-        with np.errstate(invalid="ignore"):  # a signalling NaN
+        with np.errstate(invalid="ignore"):  # a signaling NaN
             xy = np.frombuffer(data, dtype="<f4").reshape(rows, cols)[:, :2].astype(np.float64)
         if np.isfinite(xy).all():
             return xy

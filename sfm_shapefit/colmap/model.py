@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import pycolmap
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE, check_model_files, model_suffix
 from sfm_shapefit.colmap.other_programs import intrinsics_of, make_camera, reconstruction_of
 from sfm_shapefit.colmap.quiet import quiet_log
@@ -191,19 +191,13 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     return normalized(rays @ model.rotations[image])
 
 
-def track_matches(
-    model: PosedModel, min_matches: int, max_matches_per_batch: int = 2_000_000
-) -> Iterator[MatchBatch]:
-    """Yield the pairs of images that share at least `min_matches` of the model's own 3D points.
+def track_matches(model: PosedModel, max_matches_per_batch: int = 2_000_000) -> Iterator[MatchBatch]:
+    """Yield the pairs of images that share any of the model's own 3D points.
 
     The keypoints of a match are the `points2D` indices of the two images. An image that observes the
-    same 3D point with several keypoints gives no match for that point: it is unknown which one is right.
-
-    Args:
-        model: the posed images and their tracks.
-        min_matches: pairs with fewer matches are left out; at least 1.
-        max_matches_per_batch: bounds the memory; a batch holds all pairs (i, j > i) of one or more images
-            i, and only a single image with more matches than that makes it larger.
+    same 3D point with several keypoints gives no match for that point: it is unknown which one is right. A
+    batch holds all pairs (i, j > i) of one or more images i; only of a single image it has more matches than
+    `max_matches_per_batch`.
 
     Raises:
         InputError: if an observed point of an image is not finite.
@@ -211,7 +205,7 @@ def track_matches(
     tracks = _Observations.of(model)
     num_matches = np.bincount(tracks.images, tracks.num_following(), model.num_images)
     for first, last in batch_ranges(num_matches, max_matches_per_batch):
-        batch = _track_batch(tracks, slice(first, last), model.focal_lengths_px, max(min_matches, 1))
+        batch = _track_batch(tracks, slice(first, last), model.focal_lengths_px)
         if len(batch.pairs):
             yield batch
 
@@ -280,7 +274,13 @@ def _posed_model(label: str, reconstruction: pycolmap.Reconstruction) -> PosedMo
 
     cameras = [reconstruction.camera(image.camera_id) for image in images]
     poses = [image.cam_from_world() for image in images]
-    rotations = _check_rotations(label, image_ids, [pose.rotation.quat for pose in poses])
+    quaternions_xyzw = np.array([pose.rotation.quat for pose in poses], dtype=np.float64)
+    with np.errstate(invalid="ignore", over="ignore"):
+        # Quaternions are unit up to rounding in a file.
+        sound = np.abs(np.linalg.norm(quaternions_xyzw, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+    if not sound.all():
+        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
+    rotations = rotation_matrices(quaternions_xyzw[:, [3, 0, 1, 2]])
     translations = np.array([pose.translation for pose in poses], dtype=np.float64)
     absurd = np.abs(translations) > _LARGEST_COORDINATE
     _refuse_not_finite(label, "the position of image", image_ids, np.where(absurd, np.inf, translations))
@@ -315,16 +315,6 @@ def _frame_offset(label: str, image: pycolmap.Image, reconstruction: pycolmap.Re
     assert rig_from_world is not None
     in_rig = -sensor_from_rig.rotation.matrix().T @ sensor_from_rig.translation
     return np.asarray(rig_from_world.rotation.matrix().T @ in_rig)
-
-
-def _check_rotations(label: str, image_ids: list[int], quaternions_xyzw: list[FloatArray]) -> FloatArray:
-    """Return (n, 3, 3) rotation matrices of quaternions that are unit up to rounding in a file."""
-    quaternions = np.array(quaternions_xyzw, dtype=np.float64)
-    with np.errstate(invalid="ignore", over="ignore"):
-        sound = np.abs(np.linalg.norm(quaternions, axis=1) - 1.0) <= UNIT_QUATERNION_TOLERANCE
-    if not sound.all():
-        raise InputError(f"{label}: image {image_ids[int(np.argmin(sound))]} has no valid rotation")
-    return rotation_matrices(quaternions[:, [3, 0, 1, 2]])
 
 
 def rotation_matrices(quaternions_wxyz: FloatArray) -> FloatArray:
@@ -456,10 +446,8 @@ def batch_ranges(sizes: FloatArray | IntArray, limit: int) -> Iterator[tuple[int
         yield first, len(sizes)
 
 
-def _track_batch(
-    tracks: _Observations, images: slice, focal_lengths_px: FloatArray, min_matches: int
-) -> MatchBatch:
-    """Return the matches of all pairs (i, j > i) with i among the images that have enough of them."""
+def _track_batch(tracks: _Observations, images: slice, focal_lengths_px: FloatArray) -> MatchBatch:
+    """Return the matches of all pairs (i, j > i) with i among the images."""
     num_images = len(focal_lengths_px)
     own = tracks.by_image[tracks.image_starts[images.start] : tracks.image_starts[images.stop]]
     follows = tracks.num_following()[own]
@@ -468,15 +456,11 @@ def _track_batch(
     pair = tracks.images[left] * num_images + tracks.images[right]
     order = np.lexsort((tracks.keypoints[left], pair))
     left, right, pair = left[order], right[order], pair[order]
-
     keys, counts = np.unique(pair, return_counts=True)
-    keep: BoolArray = np.repeat(counts >= min_matches, counts)
-    left, right = left[keep], right[keep]
-    kept = counts >= min_matches
-    pairs = np.stack(np.divmod(keys[kept], num_images), axis=1)
+    pairs = np.stack(np.divmod(keys, num_images), axis=1)
     return MatchBatch(
         pairs=pairs,
-        offsets=np.append(0, np.cumsum(counts[kept])),
+        offsets=np.append(0, np.cumsum(counts)),
         keypoints=np.stack([tracks.keypoints[left], tracks.keypoints[right]], axis=1),
         rays_i=tracks.rays[left],
         rays_j=tracks.rays[right],

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile
+from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, model_of_images
 
 
 def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reconstruction:
@@ -29,9 +29,11 @@ def reconstruction_of(scene: PosedModelFile, label: Path | str) -> pycolmap.Reco
         if not made.verify_params():
             raise InputError(f"{label}: camera {k - 1} has parameters that do not fit {camera.model}")
         model.add_camera_with_trivial_rig(made)
-    observed, pixels = _unambiguous(scene)
-    order = np.argsort(observed[:, 1], kind="stable")
-    observed, pixels = observed[order], pixels[order]
+    first = np.sort(np.unique(scene.observed, axis=0, return_index=True)[1])
+    often = np.bincount(scene.observed[first, 0], minlength=1)[scene.observed[first, 0]] >= 2
+    kept = first[often]
+    kept = kept[np.argsort(scene.observed[kept, 1], kind="stable")]
+    observed, pixels = scene.observed[kept], scene.pixels[kept]
     bounds = np.searchsorted(observed[:, 1], np.arange(len(scene.names) + 1))
     for k, name in enumerate(scene.names):
         image = pycolmap.Image(
@@ -51,13 +53,9 @@ def posed_model_of(model: pycolmap.Reconstruction) -> PosedModelFile:
     """Return the posed images of a reconstruction, by id, without points."""
     images = [model.image(i) for i in sorted(i for i, image in model.images.items() if image.has_pose)]
     camera_ids = sorted({image.camera_id for image in images})
-    return PosedModelFile(
-        cameras=tuple(intrinsics_of(model.camera(camera_id)) for camera_id in camera_ids),
-        names=tuple(image.name for image in images),
-        camera_of=np.array([camera_ids.index(image.camera_id) for image in images], dtype=np.int64),
-        rotations=np.array([image.cam_from_world().rotation.matrix() for image in images]).reshape(-1, 3, 3),
-        centers=np.array([image.projection_center() for image in images]).reshape(-1, 3),
-    )
+    poses = [(image.cam_from_world().rotation.matrix(), image.projection_center()) for image in images]
+    posed = [(i.name, camera_ids.index(i.camera_id), *pose) for i, pose in zip(images, poses, strict=True)]
+    return model_of_images((intrinsics_of(model.camera(camera_id)) for camera_id in camera_ids), posed)
 
 
 def relative_poses_of(graph: pycolmap.PoseGraph) -> EpipolarGeometries:
@@ -94,16 +92,6 @@ def intrinsics_of(camera: pycolmap.Camera) -> Intrinsics:
 def make_camera(intrinsics: Intrinsics, camera_id: int) -> pycolmap.Camera:
     """Return a camera of pycolmap's whose focal length is known."""
     return pycolmap.Camera(**intrinsics._asdict(), camera_id=camera_id, has_prior_focal_length=True)
-
-
-def _unambiguous(scene: PosedModelFile) -> tuple[IntArray, FloatArray]:
-    """Return the first observation of each point in each image, of points that two images or more see."""
-    if not len(scene.observed):
-        return scene.observed, scene.pixels
-    first = np.sort(np.unique(scene.observed, axis=0, return_index=True)[1])
-    observed, pixels = scene.observed[first], scene.pixels[first]
-    often = np.bincount(observed[:, 0], minlength=len(scene.points))[observed[:, 0]] >= 2
-    return observed[often], pixels[often]
 
 
 def _add_points(

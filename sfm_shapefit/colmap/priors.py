@@ -18,7 +18,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import is_number, refuse_irregular_file
+from sfm_shapefit.formats.lines import is_number, text_of
 from sfm_shapefit.placement.gauge import PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -38,7 +38,16 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
     """
     found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
     index_of_name = {name: index for index, name in enumerate(model.names)}
-    for name, position, covariance, system in _prior_rows(path):
+    selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
+    by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
+    by_data = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
+    # Of each version of the schema, the newest first, by the columns that it has.
+    queries = {
+        ("corr_data_id", "corr_sensor_type", covariances): selected.format(covariances, by_data),
+        ("image_id", covariances): selected.format(covariances, by_image),
+        ("image_id", "position"): selected.format("NULL", by_image),
+    }
+    for name, position, covariance, system in readonly_rows(path, "pose_priors", queries):
         index = index_of_name.get(name)
         xyz = _numbers(path, name, position, 3)
         if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():
@@ -63,15 +72,10 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
             is one of the model's.
     """
-    refuse_irregular_file(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"the priors {path} cannot be read as text: {error}") from None
     index_of_name = {name: index for index, name in enumerate(model.names)}
     found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
     system, seen, first = _CARTESIAN, set(), True
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = next(csv.reader([line])) if "," in line else line.split()
@@ -89,19 +93,6 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
     if not found:
         raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
     return _priors(found, f"{len(found)} positions of {path}", geodetic=system == _WGS84)
-
-
-def _prior_rows(path: Path) -> list[tuple[str, object, object, object]]:
-    """Return name, position, covariance and coordinate system of all priors, of any schema version."""
-    selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
-    covariance, by_image = "position_covariance", "images.image_id = pose_priors.image_id"
-    by_data = f"images.image_id = corr_data_id WHERE corr_sensor_type = {_SENSOR_IS_CAMERA}"
-    queries = {
-        ("corr_data_id", "corr_sensor_type", covariance): selected.format(covariance, by_data),
-        ("image_id", covariance): selected.format(covariance, by_image),
-        ("image_id", "position"): selected.format("NULL", by_image),
-    }
-    return readonly_rows(path, "pose_priors", queries)
 
 
 def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
@@ -145,7 +136,7 @@ def _priors(
         transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
         positions = np.asarray(transform.ellipsoid_to_enu(positions, latitude, longitude, altitude))
         statement += (
-            f", in metres east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
+            f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
     return PositionPriors(
         cameras=np.array(cameras, dtype=np.int64),

@@ -27,10 +27,10 @@ _heard = ContextVar("pycolmap_is_heard", default=False)
 
 @contextmanager
 def hear_pycolmap(enabled: bool = True) -> Iterator[None]:
-    """Let pycolmap's messages through while the block runs, or silence them as by default.
+    """Let pycolmap's messages through while the block runs.
 
     Args:
-        enabled: let them through.
+        enabled: False silences them, as by default.
     """
     token = _heard.set(enabled)
     try:

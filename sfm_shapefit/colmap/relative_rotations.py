@@ -18,10 +18,9 @@ lengths are known, that is the mark of a false pair. Pairs within 5 degrees of t
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -38,8 +37,7 @@ _CONFIG = pycolmap.TwoViewGeometryConfiguration
 _SOUND_CONFIGS = (_CONFIG.CALIBRATED, _CONFIG.PLANAR, _CONFIG.PANORAMIC, _CONFIG.PLANAR_OR_PANORAMIC)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RelativeRotations:
+class RelativeRotations(NamedTuple):
     """The relative rotations of k pairs of images, in the order of pairs."""
 
     pairs: IntArray
@@ -54,10 +52,7 @@ class RelativeRotations:
     def subset(self, rows: IntArray | BoolArray) -> "RelativeRotations":
         """Return some of the pairs."""
         return RelativeRotations(
-            pairs=self.pairs[rows],
-            rotations=self.rotations[rows],
-            num_matches=self.num_matches[rows],
-            sound=self.sound[rows],
+            self.pairs[rows], self.rotations[rows], self.num_matches[rows], self.sound[rows]
         )
 
 
@@ -85,13 +80,9 @@ def relative_rotations(
     with open_database(path, model) as database:
         if source == "stored":
             poses = database.relative_poses()
-            enough = poses.num_inliers >= min_matches
-            return RelativeRotations(
-                pairs=poses.pairs[enough],
-                rotations=poses.rotations[enough],
-                num_matches=poses.num_inliers[enough],
-                sound=np.ones(int(enough.sum()), dtype=np.bool_),
-            )
+            sound = np.ones(len(poses.pairs), dtype=np.bool_)
+            stored = RelativeRotations(poses.pairs, poses.rotations, poses.num_inliers, sound)
+            return stored.subset(poses.num_inliers >= min_matches)
         with ThreadPoolExecutor(threads) as pool, quiet_stderr():
             rows, before = [], 0
             for batch in database.iter_matches(min_matches):

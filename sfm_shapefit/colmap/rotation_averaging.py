@@ -1,6 +1,6 @@
 """Rotations of cameras from relative rotations of pairs: pycolmap's rotation averaging, on plain arrays.
 
-    minimize  sum_e w_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
+    minimize  sum_e rho( angle( R_ij, R_j R_i^T ) )        R_i = cam_from_world of camera i
 
 from a maximum spanning tree, by an L1 phase and iteratively reweighted least squares. Pairs more than 10
 degrees off the result are left out and what stays connected is averaged once more, as pycolmap's global
@@ -25,7 +25,6 @@ _LOSSES = {
 }
 # Pairs that are farther off after the first averaging are left out of the second; this is pycolmap's default.
 _MAX_ERROR_DEG = 10.0
-_CAMERA_ID = 1
 
 
 def average_rotations(
@@ -35,7 +34,6 @@ def average_rotations(
     weights: npt.ArrayLike | None = None,
     *,
     loss: Loss = "geman-mcclure",
-    count_matches: bool = True,
 ) -> tuple[FloatArray, BoolArray]:
     """Return a rotation for each image that the pairs tie to the largest consistent component.
 
@@ -43,11 +41,9 @@ def average_rotations(
         num_images: n.
         pairs: (k, 2) images (i, j), i != j, each pair once.
         rotations: (k, 3, 3) cam_j_from_cam_i.
-        weights: (k,) numbers of matches, rounded; the spanning tree takes pairs of many, and they count in
-            proportion. All alike if None.
+        weights: (k,) numbers of matches, rounded, of which the spanning tree takes pairs of many; all alike
+            if None. Residuals count alike: so a few false pairs of many matches do less harm.
         loss: of the residual angles; "half-norm" (their square root) is finer, but fails more often.
-        count_matches: False leaves the weights to the spanning tree alone: a few false pairs of many matches
-            then do less harm.
 
     Returns:
         Rotations (n, 3, 3) cam_from_world, the identity where there is none, and (n,) who has one.
@@ -60,15 +56,20 @@ def average_rotations(
         raise InputError("rotations cannot be averaged without relative rotations of pairs")
     if pairs.min() < 0 or pairs.max() >= num_images:
         raise InputError(f"relative rotations join images outside 0..{num_images - 1}")
-    counts = np.ones(len(pairs)) if weights is None else np.asarray(weights, dtype=np.float64)
-    graph = _pose_graph(pairs, rotations, np.maximum(np.rint(counts), 1.0).astype(np.int64))
-    model = _unposed_model(num_images)
+    graph, model = pycolmap.PoseGraph(), pycolmap.Reconstruction()
+    counts = np.maximum(np.rint(np.broadcast_to(1.0 if weights is None else weights, len(pairs))), 1.0)
+    for (i, j), rotation, count in zip(pairs.tolist(), rotations, counts.tolist(), strict=True):
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
+        graph.add_edge(i + 1, j + 1, pycolmap.PoseGraphEdge(cam2_from_cam1=pose, num_matches=int(count)))
+    camera = pycolmap.Camera(camera_id=1, model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0, 0])
+    model.add_camera_with_trivial_rig(camera)
+    for image_id in range(1, num_images + 1):
+        image = pycolmap.Image(name=str(image_id), camera_id=1, image_id=image_id)
+        model.add_image_with_trivial_frame(image)
     options = pycolmap.RotationEstimatorOptions()
     options.random_seed = 0
     options.max_rotation_error_deg = _MAX_ERROR_DEG
     options.weight_type = _LOSSES[loss]
-    if weights is not None and count_matches:
-        options.reweighting = pycolmap.RotationAveragingReweighting.INLIER_MATCH_COUNT
     with quiet_output():
         for again in (False, True):
             options.filter_unregistered = again
@@ -77,26 +78,3 @@ def average_rotations(
                     "pycolmap's rotation averaging failed; check the relative rotations, or give rotations"
                 )
     return rotations_of(model, list(range(1, num_images + 1)))
-
-
-def _pose_graph(pairs: IntArray, rotations: FloatArray, counts: IntArray) -> pycolmap.PoseGraph:
-    """Return the pairs as pycolmap's graph; image k has the id k + 1."""
-    graph = pycolmap.PoseGraph()
-    for (i, j), rotation, count in zip(pairs.tolist(), rotations, counts.tolist(), strict=True):
-        edge = pycolmap.PoseGraphEdge(
-            cam2_from_cam1=pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3)), num_matches=count
-        )
-        graph.add_edge(i + 1, j + 1, edge)
-    return graph
-
-
-def _unposed_model(num_images: int) -> pycolmap.Reconstruction:
-    """Return a model of images without poses, each in a frame of its own."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=_CAMERA_ID, model="SIMPLE_PINHOLE", width=1, height=1, params=[1, 0, 0])
-    )
-    for image_id in range(1, num_images + 1):
-        image = pycolmap.Image(name=str(image_id), camera_id=_CAMERA_ID, image_id=image_id)
-        model.add_image_with_trivial_frame(image)
-    return model

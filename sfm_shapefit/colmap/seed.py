@@ -48,7 +48,7 @@ def build_seed(
         raise ValueError(f"expected placed ({n},) and centers ({n}, 3), got {placed.shape}, {centers.shape}")
     if not np.isfinite(centers[placed]).all():
         worst = int(np.flatnonzero(placed & ~np.isfinite(centers).all(axis=1))[0])
-        raise ValueError(f"the centre of image {model.names[worst]} is not finite")
+        raise ValueError(f"the center of image {model.names[worst]} is not finite")
 
     seed = copy_without_points(model.reconstruction)
     still = np.zeros(n, dtype=np.bool_) if fixed is None else fixed

@@ -20,7 +20,7 @@ primitives are pycolmap's.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -206,24 +206,43 @@ def _triangulate_tracks(
 ) -> None:
     """Add to our own `structure` the points of another model, each triangulated from its own track."""
     registered = sorted(structure.reg_image_ids())
-    observations = _observe(structure, source, registered)
+    parts = []
+    for image_id in registered:
+        image = structure.image(image_id)
+        if image.num_points2D() != source.image(image_id).num_points2D():
+            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
+        keypoints, ids = observed_points(source.image(image_id))
+        parts.append((ids, keypoints, points2d_xy(image)[keypoints]))
+    observations = _Observations(*sort_observations(parts))
     _, firsts, lengths = np.unique(observations.points, return_index=True, return_counts=True)
     is_long = lengths >= options.min_track_length
-    tracks = list(zip(firsts[is_long].tolist(), (firsts + lengths)[is_long].tolist(), strict=True))
-    tasks = _track_tasks(structure, registered, observations, tracks, options)
-    parts = map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
+    tracks = [slice(first, first + k) for first, k in zip(firsts[is_long], lengths[is_long], strict=True)]
+    poses = [structure.image(i).cam_from_world() for i in registered]
+    cameras = [structure.camera(structure.image(i).camera_id) for i in registered]
+    tasks = (
+        TrackTask(
+            poses=poses,
+            cameras=cameras,
+            tracks=[(observations.images[track], observations.xy[track]) for track in chosen],
+            options=options,
+        )
+        for chosen in (tracks[k : k + _TRACKS_A_TASK] for k in range(0, len(tracks), _TRACKS_A_TASK))
+    )
+    answered = (
+        map(triangulate_task, tasks) if executor is None else answers(executor, triangulate_task, tasks)
+    )
     done = 0
-    for part in parts:
-        for (first, _), found in zip(tracks[done : done + len(part)], part, strict=True):
+    for part in answered:
+        for track, found in zip(tracks[done : done + len(part)], part, strict=True):
             if found is None:
                 continue
             xyz, inliers = found
-            seen = np.flatnonzero(inliers) + first
+            seen = np.flatnonzero(inliers) + track.start
             at = zip(observations.images[seen].tolist(), observations.keypoints[seen].tolist(), strict=True)
-            track = pycolmap.Track([pycolmap.TrackElement(registered[i], k) for i, k in at])
-            point_id = int(observations.points[first])
+            elements = pycolmap.Track([pycolmap.TrackElement(registered[i], k) for i, k in at])
+            point_id = int(observations.points[track.start])
             color = source.point3D(point_id).color
-            structure.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=xyz, color=color, track=track))
+            structure.add_point3D_with_id(point_id, pycolmap.Point3D(xyz=xyz, color=color, track=elements))
         done += len(part)
         advance(done, len(tracks))
 
@@ -237,22 +256,6 @@ class TrackTask:
     tracks: list[tuple[IntArray, FloatArray]]
     """Images (k,), as positions in the two lists, and pixels (k, 2) of each."""
     options: StructureOptions
-
-
-def _track_tasks(
-    structure: pycolmap.Reconstruction,
-    registered: list[int],
-    observations: "_Observations",
-    tracks: list[tuple[int, int]],
-    options: StructureOptions,
-) -> Iterator[TrackTask]:
-    """Yield the tracks, in their order, with the poses of all registered images."""
-    poses = [structure.image(i).cam_from_world() for i in registered]
-    cameras = [structure.camera(structure.image(i).camera_id) for i in registered]
-    for start in range(0, len(tracks), _TRACKS_A_TASK):
-        parts = [slice(first, last) for first, last in tracks[start : start + _TRACKS_A_TASK]]
-        seen = [(observations.images[part], observations.xy[part]) for part in parts]
-        yield TrackTask(poses=poses, cameras=cameras, tracks=seen, options=options)
 
 
 def triangulate_task(task: TrackTask) -> list[tuple[FloatArray, BoolArray] | None]:
@@ -281,20 +284,6 @@ class _Observations(NamedTuple):
     """(O,) index into the image's points2D."""
     xy: FloatArray
     """(O, 2) pixels of that point."""
-
-
-def _observe(
-    structure: pycolmap.Reconstruction, source: pycolmap.Reconstruction, image_ids: list[int]
-) -> _Observations:
-    """Return the observations of the `source`, and their pixels in the `structure`."""
-    parts = []
-    for image_id in image_ids:
-        image = structure.image(image_id)
-        if image.num_points2D() != source.image(image_id).num_points2D():
-            raise ValueError(f"image {image_id} has other points2D than the model whose tracks are used")
-        keypoints, ids = observed_points(source.image(image_id))
-        parts.append((ids, keypoints, points2d_xy(image)[keypoints]))
-    return _Observations(*sort_observations(parts))
 
 
 # --- colors ---------------------------------------------------------------------------------------

@@ -4,7 +4,7 @@
     colmap-txt    a folder, text
     nerf          transforms.json             .json           nerfstudio, instant-ngp
     tum           trajectory                  .tum, .txt      evo, SLAM tools
-    csv           name, centre, rotation      .csv
+    csv           name, center, rotation      .csv
 
 Only the COLMAP formats hold points.
 """
@@ -27,13 +27,7 @@ if TYPE_CHECKING:
 
 Format = Literal["colmap", "colmap-txt", "nerf", "tum", "csv"]
 
-_BY_SUFFIX: dict[str, Format] = {
-    "": "colmap",
-    ".json": "nerf",
-    ".tum": "tum",
-    ".txt": "tum",
-    ".csv": "csv",
-}
+_BY_SUFFIX: dict[str, Format] = {"": "colmap", ".json": "nerf", ".tum": "tum", ".txt": "tum", ".csv": "csv"}
 _TEXTS = {"nerf": nerf_text, "tum": tum_text, "csv": poses_csv}
 
 

@@ -1,6 +1,6 @@
 """`inspect`: a view graph diagnosed without solving, by the same steps as `locate` takes."""
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,7 +84,7 @@ def inspect(
         database: as for `locate`; a bare graph has none.
         options: how it would be placed; defaults if None.
         **overrides: single options by name.
-        theory: also compute the constants of the recovery theorems at the model's centres.
+        theory: also compute the constants of the recovery theorems at the model's centers.
         progress: called as stages advance.
 
     Returns:
@@ -99,7 +99,16 @@ def inspect(
     if isinstance(source, Path | str) and Path(source).is_file() and not is_model_file(source):
         if database is not None:
             raise InputError(f"{source} is a bare graph, which has no database; leave out one of the two")
-        return _inspect_graph(Path(source), options, theory=theory)
+        graph = read_graph(source)
+        no_theory = Theory(conditions=None, statement="left out: a bare graph has no centers")
+        return Inspection(
+            directions=f"as given in {source}",
+            num_images=graph.num_nodes,
+            statuses={DirectionStatus.USABLE.value: graph.num_edges},
+            points="no: a bare graph has no matches",
+            diagnosis=diagnose(graph, options),
+            theory=no_theory if theory else None,
+        )
     clock = Clock(progress) if progress else Clock()
     with clock("read"):
         model = read_model(source)
@@ -109,7 +118,7 @@ def inspect(
             directions = measure_directions(matches, options, clock)
         with clock("diagnosis"):
             measured = build_graph(matches, directions, options)
-            measured = measured.with_evidence(collect_evidence(directions))
+            measured = replace(measured, evidence=collect_evidence(directions))
             grouped = group_frames(model, measured)
             work = describe_work(count_work(matches, directions), grouped, options)
             pairs = view_graph(model, directions)
@@ -123,16 +132,3 @@ def inspect(
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),
             )
-
-
-def _inspect_graph(path: Path, options: LocateOptions, *, theory: bool) -> Inspection:
-    """Diagnose the bare graph of a text file."""
-    graph = read_graph(path)
-    return Inspection(
-        directions=f"as given in {path}",
-        num_images=graph.num_nodes,
-        statuses={DirectionStatus.USABLE.value: graph.num_edges},
-        points="no: a bare graph has no matches",
-        diagnosis=diagnose(graph, options),
-        theory=Theory(conditions=None, statement="left out: a bare graph has no centres") if theory else None,
-    )

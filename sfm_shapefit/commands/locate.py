@@ -12,12 +12,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
-from sfm_shapefit.commands.stages.measure import (
-    add_evidence,
-    build_graph,
-    count_work,
-    measure_directions,
-)
+from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts, place_cameras
 from sfm_shapefit.commands.stages.rotations import refine_model_rotations
@@ -30,7 +25,8 @@ from sfm_shapefit.commands.stages.seed import (
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
-from sfm_shapefit.results import LocateResult, match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -56,7 +52,7 @@ def locate(
 
     Args:
         reconstruction: a pycolmap.Reconstruction or a model folder, or a model file of Bundler, openMVG or
-            OpenSfM; nothing of it is changed, and its camera centres never place a camera.
+            OpenSfM; nothing of it is changed, and its camera centers never place a camera.
         database: the COLMAP database with the inlier matches. Without it, `database.db` is looked for in
             the model's folder, its parent and its grandparent; failing that the model's tracks serve.
         options: settings, see `help(LocateOptions)`; defaults if None.

@@ -8,25 +8,25 @@ final adjustment. Images that the averaging drops form components of their own.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import AdjustmentOptions, bundle_adjust
+from sfm_shapefit.colmap.adjustment import bundle_adjust
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images, rotations_of
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
 from sfm_shapefit.commands.locate import locate
-from sfm_shapefit.commands.stages.averaging import averaged
+from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
-from sfm_shapefit.results import LocateResult
 from sfm_shapefit.results.map_result import MappedModel, MapResult
+from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
@@ -65,23 +65,18 @@ def map_database(
     """
     options = merge_options(options, MapOptions, overrides)
     path, clock = Path(database), Clock(progress) if progress else Clock()
-    run = _Run(options, clock)
     with clock("read"):
         images = read_images(path)
         unposed = read_model(images.reconstruction)
     with clock("relative rotations"):
         relative = relative_rotations(
-            path,
-            unposed,
-            LEAST_MATCHES,
-            options.relative_rotations,
-            options.num_threads(),
-            clock.advance,
+            path, unposed, LEAST_MATCHES, options.relative_rotations, options.num_threads(), clock.advance
         )
+    run = _Run(options, clock, path, images, unposed)
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
-    for members, averaging in run.average_components(unposed.num_images, relative, reasons):
+    for members, averaging in run.average_components(relative, reasons):
         try:
-            found = run.locate_component(path, images, unposed, members, averaging)
+            found = run.locate_component(members, averaging)
         except UnsolvableError as error:
             reasons |= dict.fromkeys(members.tolist(), f"its component cannot be placed: {error}")
             continue
@@ -105,20 +100,24 @@ def map_database(
     )
 
 
-@dataclass(slots=True)
-class _Run:
-    """The settings of one run, and the time its stages take, of all components together."""
+class _Run(NamedTuple):
+    """What all components of a run have in common; the clock adds up the time that they take."""
 
     options: MapOptions
     clock: Clock
+    database: Path
+    images: UnposedImages
+    unposed: PosedModel
+    """The images as a model."""
 
     def average_components(
-        self, num_images: int, relative: RelativeRotations, reasons: dict[int, str]
+        self, relative: RelativeRotations, reasons: dict[int, str]
     ) -> Iterator[tuple[IntArray, AveragedRotations]]:
         """Yield the images of each component that got rotations, ascending, and those rotations.
 
         Why an image belongs to none is written to `reasons`.
         """
+        num_images = self.unposed.num_images
         waiting = _group_images(num_images, relative.pairs)
         while waiting:
             members = waiting.pop(0)
@@ -129,9 +128,9 @@ class _Run:
                 continue
             with self.clock("rotation averaging"):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-                local = _renumber(inside, members)
+                local = inside._replace(pairs=np.searchsorted(members, inside.pairs))
                 try:
-                    answer = averaged(len(members), local, self.options.min_matches)
+                    answer = average_consistently(len(members), local, self.options.min_matches)
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
@@ -141,58 +140,45 @@ class _Run:
                 rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
                 among = _group_images(num_images, rest)
                 waiting = [*waiting, *(group for group in among if len(group) > 1)]
-            if answer.registered.sum() >= self.options.min_model_size:
-                yield members[answer.registered], _drop_unregistered(answer)
+            kept = answer.registered
+            if kept.sum() >= self.options.min_model_size:
+                rotations, agreements = answer.rotations[kept], answer.agreements[kept]
+                own = replace(answer, rotations=rotations, registered=kept[kept], agreements=agreements)
+                yield members[kept], own
 
-    def locate_component(
-        self,
-        path: Path,
-        images: UnposedImages,
-        unposed: PosedModel,
-        members: IntArray,
-        averaging: AveragedRotations,
-    ) -> LocateResult:
+    def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
         """Place one component; with bundle adjustment, from the rotations of an adjusted draft."""
-        image_ids = unposed.image_ids[members].tolist()
+        image_ids = self.unposed.image_ids[members].tolist()
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
         known = self.options.known_distance
-        if known is not None and not {*known[:2]} <= {unposed.names[k] for k in members.tolist()}:
+        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
             # The known distance belongs to another component.
             settings |= {"known_distance": None, "scale": "unit"}
         rotations = averaging.rotations
         if self.options.bundle_adjust:
             with self.clock("draft"):
-                rotations = self._refine_by_draft(path, images, image_ids, rotations, settings)
+                rotations = self._refine_by_draft(image_ids, rotations, settings)
             settings["refine_rotations"] = False
         with self.clock("locate"):
-            model = pose_at_origin(images.reconstruction, image_ids, rotations)
-            return locate(model, path, options=LocateOptions(**settings), progress=self.clock.progress)
+            model = pose_at_origin(self.images.reconstruction, image_ids, rotations)
+            return locate(
+                model, self.database, options=LocateOptions(**settings), progress=self.clock.progress
+            )
 
     def _refine_by_draft(
-        self,
-        path: Path,
-        images: UnposedImages,
-        image_ids: list[int],
-        rotations: FloatArray,
-        settings: dict[str, object],
+        self, image_ids: list[int], rotations: FloatArray, settings: dict[str, object]
     ) -> FloatArray:
         """Return rotations (k, 3, 3) from a loose adjustment of a draft, as given for images it lacks."""
-        limit = _DRAFT_WIDENING * self.options.max_reprojection_error_px
         draft_settings = settings | {
             "refine_rotations": False,
             "bundle_adjust": False,
             "min_trust": 0.0,
-            "max_reprojection_error_px": limit,
+            "max_reprojection_error_px": _DRAFT_WIDENING * self.options.max_reprojection_error_px,
         }
-        model = pose_at_origin(images.reconstruction, image_ids, rotations)
-        draft = locate(model, path, options=LocateOptions(**draft_settings))  # type: ignore[arg-type]
+        model = pose_at_origin(self.images.reconstruction, image_ids, rotations)
+        draft = locate(model, self.database, options=LocateOptions(**draft_settings))  # type: ignore[arg-type]
         try:
-            adjusted = bundle_adjust(
-                draft.reconstruction,
-                draft.reconstruction,
-                self.options,
-                AdjustmentOptions(rounds=1),
-            )
+            adjusted = bundle_adjust(draft.reconstruction, draft.reconstruction, self.options, rounds=1)
         except UnsolvableError:
             return rotations
         turned, posed = rotations_of(adjusted.reconstruction, image_ids)
@@ -207,27 +193,6 @@ def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:
     labels = connected_components(num_images, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
-
-
-def _renumber(relative: RelativeRotations, members: IntArray) -> RelativeRotations:
-    """Return pairs among `members` (ascending) as positions in it."""
-    return RelativeRotations(
-        pairs=np.searchsorted(members, relative.pairs),
-        rotations=relative.rotations,
-        num_matches=relative.num_matches,
-        sound=relative.sound,
-    )
-
-
-def _drop_unregistered(answer: AveragedRotations) -> AveragedRotations:
-    """Return the answer for the images that have a rotation."""
-    kept = answer.registered
-    return replace(
-        answer,
-        rotations=answer.rotations[kept],
-        registered=kept[kept],
-        agreements=answer.agreements[kept],
-    )
 
 
 def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int, str]) -> str:

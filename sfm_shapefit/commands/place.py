@@ -1,11 +1,11 @@
 """`place GRAPH`: a bare view graph, or relative poses of pairs, placed by the same steps as `locate`."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.other_programs import relative_poses_of
 from sfm_shapefit.colmap.rotation_averaging import average_rotations
 from sfm_shapefit.commands.stages.clock import Clock, Progress
@@ -16,7 +16,7 @@ from sfm_shapefit.formats.graph_text import read_graph
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries, is_onedsfm, read_onedsfm, read_rotations
 from sfm_shapefit.placement.place import place, place_further
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.results import GraphResult
+from sfm_shapefit.results.result import GraphResult
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -24,14 +24,6 @@ if TYPE_CHECKING:
     import pycolmap
 
 MAX_ROTATION_ERROR_DEG = 10.0
-
-
-class _Rotations(NamedTuple):
-    """Rotations of cameras and where they come from."""
-
-    cam_from_world: FloatArray
-    known: BoolArray
-    statement: str
 
 
 def place_graph_file(
@@ -65,15 +57,14 @@ def place_graph_file(
     """
     options = merge_options(options, PlacementOptions, overrides)
     clock = Clock(progress) if progress else Clock()
-    found, statement = None, "directions as given"
+    cam_from_world, statement = None, "directions as given"
     with clock("read"):
         geometries = _relative_poses(path)
     if geometries is not None:
         if reverse:
             raise InputError(f"{path} holds relative poses, whose sense is known; leave out --reverse")
         with clock("rotations"):
-            found = _rotations(geometries, rotations)
-        graph, statement = _consistent(geometries, found, max_rotation_error_deg)
+            graph, cam_from_world, statement = _orient(geometries, rotations, max_rotation_error_deg)
     else:
         assert isinstance(path, Path | str)
         if rotations is not None:
@@ -94,7 +85,7 @@ def place_graph_file(
         further=further,
         timings_s=clock.seconds,
         geometries=geometries,
-        rotations=None if found is None else found.cam_from_world,
+        rotations=cam_from_world,
     )
 
 
@@ -109,31 +100,26 @@ def _relative_poses(source: "Path | str | pycolmap.PoseGraph") -> EpipolarGeomet
     return read_relative_poses(source) if is_relative_poses(source) else None
 
 
-def _consistent(
-    geometries: EpipolarGeometries, found: _Rotations, max_rotation_error_deg: float
-) -> tuple[ViewGraph, str]:
-    """Return the directions of the pairs that agree with the rotations, and what was left out."""
-    agreeing = np.flatnonzero(geometries.mismatch_deg(found.cam_from_world) <= max_rotation_error_deg)
+def _orient(
+    geometries: EpipolarGeometries, path: Path | str | None, max_rotation_error_deg: float
+) -> tuple[ViewGraph, FloatArray, str]:
+    """Return the directions of the pairs that agree with the rotations, of a file or averaged, and these."""
+    if path is not None:
+        read = read_g2o_rotations if is_g2o(path) else read_rotations
+        (rotations, known), origin = read(path, geometries.names), f"of {path}"
+    else:
+        total = len(geometries.names)
+        rotations, known = average_rotations(total, geometries.pairs, geometries.rotations)
+        origin = "averaged by pycolmap"
+    agreeing = np.flatnonzero(geometries.mismatch_deg(rotations) <= max_rotation_error_deg)
     total, kept = len(geometries.pairs), len(agreeing)
     if kept == 0:
         raise InputError(
             f"none of the {total} relative rotations agrees with those of the cameras; "
             "check that they belong together"
         )
-    graph = geometries.subset(agreeing.tolist()).view_graph(found.cam_from_world, found.known)
-    return graph, (
-        f"{found.statement}; {total - kept} of {total} pairs contradict them by more than "
-        f"{max_rotation_error_deg:g} deg and are left out"
+    statement = (
+        f"{int(np.sum(known))} of {len(known)} rotations {origin}; {total - kept} of {total} pairs "
+        f"contradict them by more than {max_rotation_error_deg:g} deg and are left out"
     )
-
-
-def _rotations(geometries: EpipolarGeometries, path: Path | str | None) -> _Rotations:
-    """Return the rotations of a file, or averaged ones."""
-    total = len(geometries.names)
-    if path is not None:
-        read = read_g2o_rotations if is_g2o(path) else read_rotations
-        given, known = read(path, geometries.names)
-        return _Rotations(given, known, f"{int(np.sum(known))} of {total} rotations of {path}")
-    averaged, known = average_rotations(total, geometries.pairs, geometries.rotations)
-    statement = f"{int(np.sum(known))} of {total} rotations averaged by pycolmap"
-    return _Rotations(averaged, known, statement)
+    return geometries.subset(agreeing.tolist()).view_graph(rotations, known), rotations, statement

@@ -131,5 +131,4 @@ def _tangent_covariance(directions: FloatArray, moments: FloatArray) -> FloatArr
     inverse = (vectors / np.maximum(values, 1.0)[:, None, :]) @ vectors.transpose(0, 2, 1)
     variances, axes = np.linalg.eigh(inverse @ slope_variance @ inverse)
     variances[values[:, 0] <= 1.0, 1] = 1.0
-    covariance: FloatArray = (axes * np.minimum(variances, 1.0)[:, None, :]) @ axes.transpose(0, 2, 1)
-    return covariance
+    return np.asarray((axes * np.minimum(variances, 1.0)[:, None, :]) @ axes.transpose(0, 2, 1))

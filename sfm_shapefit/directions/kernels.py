@@ -1,8 +1,10 @@
-"""The estimator of one direction from the matches of one pair, compiled; the package's header has the maths.
+"""The estimator of one direction from the matches of one pair, compiled; the package's header has the math.
 
 Every kernel works on the matches of one pair: (n, 3) unit rays a and b in world axes and their epipolar
 normals, the cross products in pixels. Lengths and residuals are in pixels.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +37,16 @@ _MIN_VOTE_PX = 2.0
 _VOTE_SIGMAS = 6.0
 
 
+class _Pair(NamedTuple):
+    """The matches of one pair."""
+
+    a: FloatArray
+    b: FloatArray
+    """(n, 3) unit rays of both images."""
+    normals: FloatArray
+    """(n, 3) a x b in pixels."""
+
+
 @kernel(exact=True)
 def estimate_pairs(
     rows: IntArray,
@@ -58,18 +70,26 @@ def estimate_pairs(
         if last - first < MIN_MATCHES:
             continue
         a, b = rays_i[first:last], rays_j[first:last]
-        normals = _epipolar_normals(a, b, pixel_angles[p])
-        d = _best_hypothesis(a, b, normals, np.arange(last - first), threshold_px, num_hypotheses)
+        pair = _Pair(a, b, _epipolar_normals(a, b, pixel_angles[p]))
+        d = _best_hypothesis(pair, np.arange(last - first), threshold_px, num_hypotheses)
         residuals = np.empty(last - first)
-        noise_px, cap_px = _refine(a, b, normals, threshold_px, d, residuals)
-        _fill_moments(a, b, normals, d, residuals, noise_px, cap_px, moments[p])
+        noise_px, cap_px = _refine(pair, threshold_px, d, residuals)
+        _fill_moments(pair, d, residuals, noise_px, cap_px, moments[p])
         vote_px = max(_MIN_VOTE_PX, _VOTE_SIGMAS * noise_px)
         inliers = np.flatnonzero(np.abs(residuals) <= threshold_px)
-        sign = _count_sides(a, b, normals, d, inliers, vote_px, measures[p])
-        _measure(a, b, normals, residuals, inliers, pixel_angles[p], measures[p])
+        sign = _count_sides(pair, d, inliers, vote_px, measures[p])
+        _measure(pair, residuals, inliers, pixel_angles[p], measures[p])
         others = np.flatnonzero(np.abs(residuals) > 2.0 * max(threshold_px, 2.0 * noise_px))
-        _count_rivals(a, b, normals, inliers, others, threshold_px, num_hypotheses, vote_px, measures[p])
+        _count_rivals(pair, inliers, others, threshold_px, num_hypotheses, vote_px, measures[p])
         directions[p] = sign * d
+
+
+@kernel(exact=True)
+def cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
+    """Fill `out` with a x b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 @kernel(exact=True)
@@ -77,10 +97,8 @@ def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> Float
     """Return (a x b) / pixel_angle for every match: its length is the parallax in pixels."""
     normals = np.empty_like(a)
     for k in range(len(a)):
-        normals[k, 0] = (a[k, 1] * b[k, 2] - a[k, 2] * b[k, 1]) / pixel_angle
-        normals[k, 1] = (a[k, 2] * b[k, 0] - a[k, 0] * b[k, 2]) / pixel_angle
-        normals[k, 2] = (a[k, 0] * b[k, 1] - a[k, 1] * b[k, 0]) / pixel_angle
-    return normals
+        cross(a[k], b[k], normals[k])
+    return normals / pixel_angle
 
 
 @kernel(exact=True)
@@ -102,20 +120,15 @@ def _squared_gradient(along_a: float, along_b: float) -> float:
 
 
 @kernel(exact=True)
-def _residual(a: FloatArray, b: FloatArray, normals: FloatArray, d: FloatArray, k: int) -> float:
+def _residual(pair: _Pair, d: FloatArray, k: int) -> float:
     """Return the signed Sampson error of match k in px."""
-    return float(_dot(normals, k, d) / np.sqrt(_squared_gradient(_dot(a, k, d), _dot(b, k, d))))
+    return float(
+        _dot(pair.normals, k, d) / np.sqrt(_squared_gradient(_dot(pair.a, k, d), _dot(pair.b, k, d)))
+    )
 
 
 @kernel(exact=True)
-def _best_hypothesis(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    members: IntArray,
-    threshold_px: float,
-    num_hypotheses: int,
-) -> FloatArray:
+def _best_hypothesis(pair: _Pair, members: IntArray, threshold_px: float, num_hypotheses: int) -> FloatArray:
     """Return the two-match direction of least truncated cost over the members; its draws are fixed."""
     count = np.uint64(len(members))
     best, d = np.zeros(3), np.zeros(3)
@@ -125,19 +138,17 @@ def _best_hypothesis(
     state = np.uint64(0x9E3779B97F4A7C15)
     for _ in range(num_hypotheses):
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        m = normals[members[np.int64((state >> np.uint64(33)) % count)]]
+        m = pair.normals[members[np.int64((state >> np.uint64(33)) % count)]]
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        n = normals[members[np.int64((state >> np.uint64(33)) % count)]]
-        d[0] = m[1] * n[2] - m[2] * n[1]
-        d[1] = m[2] * n[0] - m[0] * n[2]
-        d[2] = m[0] * n[1] - m[1] * n[0]
+        n = pair.normals[members[np.int64((state >> np.uint64(33)) % count)]]
+        cross(m, n, d)
         length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
         if length <= 1e-12:
             continue
         d /= length
         cost = 0.0
         for k in members:
-            cost += min(_residual(a, b, normals, d, k) ** 2, limit)
+            cost += min(_residual(pair, d, k) ** 2, limit)
             if cost >= best_cost:
                 break
         if cost < best_cost:
@@ -147,14 +158,7 @@ def _best_hypothesis(
 
 
 @kernel(exact=True)
-def _refine(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    threshold_px: float,
-    d: FloatArray,
-    residuals: FloatArray,
-) -> tuple[float, float]:
+def _refine(pair: _Pair, threshold_px: float, d: FloatArray, residuals: FloatArray) -> tuple[float, float]:
     """Move d to the nearest minimum of the robust cost; fill its residuals.
 
     Returns:
@@ -162,12 +166,12 @@ def _refine(
     """
     noise_px, cap_px = threshold_px, np.inf
     basis, normal_matrix = np.empty((2, 3)), np.empty(5)
-    _fill_residuals(a, b, normals, d, residuals)
+    _fill_residuals(pair, d, residuals)
     for step in range(_STEPS):
         if step < _RESCALINGS:
-            noise_px, cap_px = _noise(normals, residuals, _width(noise_px))
+            noise_px, cap_px = _noise(pair.normals, residuals, _width(noise_px))
         _fill_basis(d, basis)
-        _fill_normal_matrix(a, b, normals, d, basis, residuals, noise_px, cap_px, normal_matrix)
+        _fill_normal_matrix(pair, d, basis, residuals, noise_px, cap_px, normal_matrix)
         h00, h01, h11, g0, g1 = normal_matrix
         determinant = h00 * h11 - h01 * h01
         if not determinant > 1e-14 * (h00 + h11) ** 2:
@@ -177,7 +181,7 @@ def _refine(
         shorter = min(1.0, _LONGEST_STEP_RAD / max(length, 1e-300))
         d += shorter * (x * basis[0] + y * basis[1])
         d /= np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-        _fill_residuals(a, b, normals, d, residuals)
+        _fill_residuals(pair, d, residuals)
         if step >= _RESCALINGS and length < 1e-10:
             break
     return noise_px, cap_px
@@ -190,12 +194,10 @@ def _width(noise_px: float) -> float:
 
 
 @kernel(exact=True)
-def _fill_residuals(
-    a: FloatArray, b: FloatArray, normals: FloatArray, d: FloatArray, residuals: FloatArray
-) -> None:
+def _fill_residuals(pair: _Pair, d: FloatArray, residuals: FloatArray) -> None:
     """Fill the signed Sampson error of every match in px."""
-    for k in range(len(a)):
-        residuals[k] = _residual(a, b, normals, d, k)
+    for k in range(len(pair.normals)):
+        residuals[k] = _residual(pair, d, k)
 
 
 @kernel(exact=True)
@@ -224,27 +226,19 @@ def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tupl
 
 
 @kernel(exact=True)
-def _leverage_weight(normals: FloatArray, k: int, cap_px: float) -> float:
+def _leverage_weight(pair: _Pair, k: int, cap_px: float) -> float:
     """Return the weight of match k by its parallax alone: (cap / parallax)^2 beyond the cap."""
-    ratio = cap_px / max(_length(normals, k), 1e-300)
+    ratio = cap_px / max(_length(pair.normals, k), 1e-300)
     return float(min(1.0, ratio * ratio))
 
 
 @kernel(exact=True)
-def _slope(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    d: FloatArray,
-    residual: float,
-    k: int,
-    axis: FloatArray,
-) -> float:
+def _slope(pair: _Pair, d: FloatArray, residual: float, k: int, axis: FloatArray) -> float:
     """Return the derivative of the Sampson error of match k as d moves along an axis orthogonal to it."""
-    along_a, along_b = _dot(a, k, d), _dot(b, k, d)
+    along_a, along_b = _dot(pair.a, k, d), _dot(pair.b, k, d)
     square = _squared_gradient(along_a, along_b)
-    turn = along_a * _dot(a, k, axis) + along_b * _dot(b, k, axis)
-    return float(_dot(normals, k, axis) / np.sqrt(square) + residual * turn / square)
+    turn = along_a * _dot(pair.a, k, axis) + along_b * _dot(pair.b, k, axis)
+    return float(_dot(pair.normals, k, axis) / np.sqrt(square) + residual * turn / square)
 
 
 @kernel(exact=True)
@@ -254,16 +248,12 @@ def _fill_basis(d: FloatArray, basis: FloatArray) -> None:
     first = -d[smallest] * d
     first[smallest] += 1.0
     basis[0] = first / np.sqrt(np.sum(first * first))
-    basis[1, 0] = d[1] * basis[0, 2] - d[2] * basis[0, 1]
-    basis[1, 1] = d[2] * basis[0, 0] - d[0] * basis[0, 2]
-    basis[1, 2] = d[0] * basis[0, 1] - d[1] * basis[0, 0]
+    cross(d, basis[0], basis[1])
 
 
 @kernel(exact=True)
 def _fill_normal_matrix(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
+    pair: _Pair,
     d: FloatArray,
     basis: FloatArray,
     residuals: FloatArray,
@@ -274,11 +264,11 @@ def _fill_normal_matrix(
     """Fill the weighted Gauss-Newton equations in the tangent plane: h00, h01, h11, g0, g1."""
     out[:] = 0.0
     width = _width(noise_px)
-    for k in range(len(a)):
+    for k in range(len(pair.normals)):
         r = residuals[k]
-        weight = _leverage_weight(normals, k, cap_px) / (1.0 + (r / width) ** 2) ** 2
-        x = _slope(a, b, normals, d, r, k, basis[0])
-        y = _slope(a, b, normals, d, r, k, basis[1])
+        weight = _leverage_weight(pair, k, cap_px) / (1.0 + (r / width) ** 2) ** 2
+        x = _slope(pair, d, r, k, basis[0])
+        y = _slope(pair, d, r, k, basis[1])
         out[0] += weight * x * x
         out[1] += weight * x * y
         out[2] += weight * y * y
@@ -288,14 +278,7 @@ def _fill_normal_matrix(
 
 @kernel(exact=True)
 def _fill_moments(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    d: FloatArray,
-    residuals: FloatArray,
-    noise_px: float,
-    cap_px: float,
-    moments: FloatArray,
+    pair: _Pair, d: FloatArray, residuals: FloatArray, noise_px: float, cap_px: float, moments: FloatArray
 ) -> None:
     """Fill the expected curvature of the cost (slice 0) and the variance of its slope (slice 1) at d.
 
@@ -308,23 +291,27 @@ def _fill_moments(
     feigned, steep, basis, jacobian = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((2, 3)), np.empty(3)
     _fill_basis(d, basis)
     flat = np.zeros((3, 3))
-    for k in range(len(a)):
-        r, leverage = residuals[k], _leverage_weight(normals, k, cap_px)
+    for k in range(len(pair.normals)):
+        r, leverage = residuals[k], _leverage_weight(pair, k, cap_px)
         u = (r / width) ** 2
         w = 1.0 / (1.0 + u) ** 2
         count += u < 1.0
         total += w
         curved += (1.0 - 3.0 * u) / (1.0 + u) ** 3
         squared += (w * r) ** 2
-        square = _squared_gradient(_dot(a, k, d), _dot(b, k, d))
-        x = _slope(a, b, normals, d, r, k, basis[0])
-        y = _slope(a, b, normals, d, r, k, basis[1])
+        square = _squared_gradient(_dot(pair.a, k, d), _dot(pair.b, k, d))
+        x = _slope(pair, d, r, k, basis[0])
+        y = _slope(pair, d, r, k, basis[1])
         for axis in range(3):
             jacobian[axis] = x * basis[0, axis] + y * basis[1, axis]
         for row in range(3):
             for column in range(3):
                 outer = w * leverage * jacobian[row] * jacobian[column]
-                noise = (2.0 if row == column else 0.0) - a[k, row] * a[k, column] - b[k, row] * b[k, column]
+                noise = (
+                    (2.0 if row == column else 0.0)
+                    - pair.a[k, row] * pair.a[k, column]
+                    - pair.b[k, row] * pair.b[k, column]
+                )
                 flat[row, column] += outer
                 steep[row, column] += leverage * outer
                 feigned[row, column] += leverage * w * r * r * noise / square
@@ -335,29 +322,23 @@ def _fill_moments(
 
 
 @kernel(exact=True)
-def _depth_sign(a: FloatArray, b: FloatArray, d: FloatArray, k: int) -> int:
+def _depth_sign(pair: _Pair, d: FloatArray, k: int) -> int:
     """Return 1 if match k meets in front of both cameras for the baseline +d, -1 if behind both, else 0."""
-    cosine = a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1] + a[k, 2] * b[k, 2]
-    along_a, along_b = _dot(a, k, d), _dot(b, k, d)
+    cosine = _dot(pair.a, k, pair.b[k])
+    along_a, along_b = _dot(pair.a, k, d), _dot(pair.b, k, d)
     depth_i, depth_j = cosine * along_b - along_a, along_b - cosine * along_a
     return int(depth_i > 0.0 and depth_j > 0.0) - int(depth_i < 0.0 and depth_j < 0.0)
 
 
 @kernel(exact=True)
 def _count_sides(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    d: FloatArray,
-    members: IntArray,
-    vote_px: float,
-    measures: FloatArray,
+    pair: _Pair, d: FloatArray, members: IntArray, vote_px: float, measures: FloatArray
 ) -> float:
     """Fill front, behind and voters among the members; return the sign with more points in front."""
     front, behind, voters = 0, 0, 0
     for k in members:
-        if _length(normals, k) > vote_px:
-            side = _depth_sign(a, b, d, k)
+        if _length(pair.normals, k) > vote_px:
+            side = _depth_sign(pair, d, k)
             voters += 1
             front += side == 1
             behind += side == -1
@@ -367,13 +348,7 @@ def _count_sides(
 
 @kernel(exact=True)
 def _measure(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
-    residuals: FloatArray,
-    inliers: IntArray,
-    pixel_angle: float,
-    measures: FloatArray,
+    pair: _Pair, residuals: FloatArray, inliers: IntArray, pixel_angle: float, measures: FloatArray
 ) -> None:
     """Fill the number of inliers and their median residual and parallax."""
     measures[0] = len(inliers)
@@ -382,16 +357,14 @@ def _measure(
     angles = np.empty(len(inliers))
     for row in range(len(inliers)):
         k = inliers[row]
-        cosine = a[k, 0] * b[k, 0] + a[k, 1] * b[k, 1] + a[k, 2] * b[k, 2]
-        angles[row] = np.arctan2(_length(normals, k) * pixel_angle, cosine)
+        cosine = _dot(pair.a, k, pair.b[k])
+        angles[row] = np.arctan2(_length(pair.normals, k) * pixel_angle, cosine)
     measures[6], measures[7] = np.median(np.abs(residuals[inliers])), np.median(angles)
 
 
 @kernel(exact=True)
 def _count_rivals(
-    a: FloatArray,
-    b: FloatArray,
-    normals: FloatArray,
+    pair: _Pair,
     inliers: IntArray,
     others: IntArray,
     threshold_px: float,
@@ -403,9 +376,9 @@ def _count_rivals(
     measures[5] = len(inliers)
     if len(others) < MIN_MATCHES:
         return
-    d = _best_hypothesis(a, b, normals, others, threshold_px, num_hypotheses)
-    residuals = np.empty(len(a))
-    _fill_residuals(a, b, normals, d, residuals)
+    d = _best_hypothesis(pair, others, threshold_px, num_hypotheses)
+    residuals = np.empty(len(pair.normals))
+    _fill_residuals(pair, d, residuals)
     sides = np.zeros(4)
-    _count_sides(a, b, normals, d, others[np.abs(residuals[others]) <= threshold_px], vote_px, sides)
+    _count_sides(pair, d, others[np.abs(residuals[others]) <= threshold_px], vote_px, sides)
     measures[4], measures[5] = sides[1], np.sum(np.abs(residuals[inliers]) > threshold_px)

@@ -26,7 +26,13 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.json_node import is_rotation
 from sfm_shapefit.formats.lines import is_number, text_of
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
+from sfm_shapefit.formats.posed_model import (
+    Intrinsics,
+    PosedImage,
+    PosedModelFile,
+    model_of_images,
+    observation_arrays,
+)
 from sfm_shapefit.geometry import FLIP_YZ
 
 _HEADER = "# Bundle file v0.3"
@@ -57,8 +63,8 @@ def read_bundler(file: Path) -> PosedModelFile:
         raise words.error("the numbers of cameras and points must not be negative")
     all_names = _names(file, num_cameras)
     index_of: dict[int, int] = {}
-    cameras: list[list[float]] = []
-    rotations, centers = [], []
+    lenses: list[list[float]] = []
+    images: list[PosedImage] = []
     for camera in range(num_cameras):
         values = words.numbers(_NUMBERS_PER_CAMERA)
         if values[0] <= 0.0:
@@ -66,26 +72,24 @@ def read_bundler(file: Path) -> PosedModelFile:
         rotation = values[3:12].reshape(3, 3)
         if not is_rotation(rotation):
             raise words.error(f"camera {camera} has no rotation")
-        index_of[camera] = len(cameras)
-        cameras.append(values[:3].tolist())
-        rotations.append(FLIP_YZ @ rotation)
-        centers.append(-rotation.T @ values[12:15])
+        index_of[camera] = len(images)
+        images.append((all_names[camera], len(images), FLIP_YZ @ rotation, -rotation.T @ values[12:15]))
+        lenses.append(values[:3].tolist())
     points, colors, observed, offsets = _points(words, num_points, num_cameras, index_of)
-    n = len(cameras)
-    sizes = _sizes(n, observed, offsets)
-    return PosedModelFile(
-        cameras=tuple(
-            Intrinsics("RADIAL", int(width), int(height), (f, width / 2.0, height / 2.0, k1, k2))
-            for (f, k1, k2), (width, height) in zip(cameras, sizes.tolist(), strict=True)
-        ),
-        names=tuple(all_names[camera] for camera in index_of),
-        camera_of=np.arange(n),
-        rotations=np.array(rotations).reshape(n, 3, 3),
-        centers=np.array(centers).reshape(n, 3),
+    # The smallest even sizes (n, 2) that hold the observations of each image.
+    halves = np.full((len(images), 2), _LEAST_SIZE / 2.0)
+    np.maximum.at(halves, observed[:, 1], np.ceil(np.abs(offsets)))
+    cameras = (
+        Intrinsics("RADIAL", int(2.0 * x), int(2.0 * y), (f, x, y, k1, k2))
+        for (f, k1, k2), (x, y) in zip(lenses, halves.tolist(), strict=True)
+    )
+    return model_of_images(
+        cameras,
+        images,
         points=points,
         colors=colors,
         observed=observed,
-        pixels=(sizes / 2.0)[observed[:, 1]] + offsets * [1.0, -1.0],
+        pixels=halves[observed[:, 1]] + offsets * [1.0, -1.0],
     )
 
 
@@ -159,13 +163,6 @@ def _points(
         np.array(colors).reshape(-1, 3).astype(np.int64),
         *observation_arrays(observed, offsets),
     )
-
-
-def _sizes(num_images: int, observed: IntArray, offsets: FloatArray) -> FloatArray:
-    """Return (n, 2) the smallest even width and height that hold the observations of each image."""
-    halves = np.full((num_images, 2), _LEAST_SIZE / 2.0)
-    np.maximum.at(halves, observed[:, 1], np.ceil(np.abs(offsets)))
-    return 2.0 * halves
 
 
 def _names(file: Path, count: int) -> list[str]:

@@ -21,14 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import (
-    TextTable,
-    first_words,
-    is_repeated,
-    node_indices,
-    read_lines,
-    rotations_by_name,
-)
+from sfm_shapefit.formats.lines import TextTable, first_words, is_repeated, read_lines, rotations_by_name
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
 
@@ -78,14 +71,7 @@ def read_g2o_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatA
     """
     table = _select_tag(Path(path), _POSE)
     values = table.values(first=2, width=_POSE_COLUMNS)
-    ids = [row[1] for row in table.rows]
-    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier vertex a second pose")
-    found, known = rotations_by_name(names, ids, _rotations(table, values[:, 3:]))
-    if not known.any():
-        raise InputError(
-            f"{path} has a pose of none of the {len(names)} vertices of the edges; check its ids"
-        )
-    return found, known
+    return rotations_by_name(table, 1, _rotations(table, values[:, 3:]), names)
 
 
 def g2o_text(names: Sequence[str], locations: FloatArray, rotations: FloatArray | None = None) -> str:

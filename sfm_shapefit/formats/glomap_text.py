@@ -1,4 +1,4 @@
-"""Relative poses as text, one pair a line: read and written. GLOMAP's form, names instead of ids.
+"""Relative poses as text, one pair a line: read. GLOMAP's form, names instead of ids.
 
     NAME1 NAME2 QW QX QY QZ TX TY TZ        # comments and empty lines are skipped
 
@@ -13,7 +13,6 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import UNIT_TOLERANCE, first_numbers, is_repeated, read_lines
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.geometry import normalized
@@ -52,21 +51,3 @@ def read_relative_poses(path: Path | str) -> EpipolarGeometries:
         rotations=rotations,
         to_second=normalized(-np.einsum("kji,kj->ki", rotations, translations)),
     )
-
-
-def relative_poses_text(poses: EpipolarGeometries) -> str:
-    """Return relative poses in the form that `read_relative_poses` takes; t has length 1.
-
-    Raises:
-        InputError: if a name has blanks, or begins a comment.
-    """
-    for name in poses.names:
-        if len(name.split()) != 1 or "#" in name:
-            raise InputError(f"the name {name!r} cannot stand in a file of relative poses; rename the image")
-    quaternions = Rotation.from_matrix(poses.rotations).as_quat(canonical=True)  # x, y, z, w
-    translations = [-rotation @ v for rotation, v in zip(poses.rotations, poses.to_second, strict=True)]
-    values = np.column_stack([np.roll(quaternions, 1, axis=1), np.reshape(translations, (-1, 3))]) + 0.0
-    lines = []
-    for (i, j), numbers in zip(poses.pairs.tolist(), values.tolist(), strict=True):
-        lines.append(" ".join([poses.names[i], poses.names[j], *map(repr, numbers)]))
-    return "".join(f"{line}\n" for line in lines)

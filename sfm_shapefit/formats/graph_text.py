@@ -13,7 +13,6 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import read_lines
 from sfm_shapefit.viewgraph import ViewGraph
@@ -44,7 +43,10 @@ def read_graph(path: Path | str) -> ViewGraph:
         )
     values = table.values(first=2, width=width)
     with np.errstate(over="ignore"):  # a length that overflows is no unit length
-        directions, weights = _directions_and_weights(values)
+        head, last = values[:, :-1], values[:, -1]
+        is_unit = np.abs(np.linalg.norm(head, axis=1) - 1.0) <= _UNIT_TOLERANCE
+        has_weights = width > _MIN_COLUMNS and bool(np.all(is_unit)) and not np.all(last == 0.0)
+        directions, weights = (head, last) if has_weights else (values, np.ones(len(values)))
         lengths = np.linalg.norm(directions, axis=1)
     ids, edges = table.pairs()
     table.refuse(edges[:, 0] == edges[:, 1], "joins a node with itself")
@@ -70,13 +72,3 @@ def graph_text(graph: ViewGraph) -> str:
     for (i, j), numbers in zip(graph.edges.tolist(), values.tolist(), strict=True):
         lines.append(" ".join([ids[i], ids[j], *map(repr, numbers)]))
     return "\n".join(lines) + "\n"
-
-
-def _directions_and_weights(values: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Tell whether the last column is a weight, and split it off if it is."""
-    head, last = values[:, :-1], values[:, -1]
-    if head.shape[1] >= _MIN_COLUMNS - 2:
-        is_unit = np.abs(np.linalg.norm(head, axis=1) - 1.0) <= _UNIT_TOLERANCE
-        if bool(np.all(is_unit)) and not np.all(last == 0.0):
-            return head, last
-    return values, np.ones(len(values))

@@ -135,11 +135,19 @@ def node_indices(words: Sequence[str]) -> tuple[tuple[str, ...], IntArray]:
 
 
 def rotations_by_name(
-    names: Sequence[str], ids: Sequence[str], rotations: FloatArray
+    table: TextTable, column: int, rotations: FloatArray, names: Sequence[str]
 ) -> tuple[FloatArray, BoolArray]:
-    """Return the rotations (n, 3, 3) of names, the identity where the ids have none, and (n,) who has one."""
+    """Return the rotations (n, 3, 3) of names, the identity where a table has none, and (n,) who has one.
+
+    Raises:
+        InputError: if the ids in the table's column repeat one, or none is among the names.
+    """
+    ids = [row[column] for row in table.rows]
+    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
     row_of = {name: row for row, name in enumerate(ids)}
     known = np.array([name in row_of for name in names], dtype=np.bool_)
+    if not known.any():
+        raise InputError(f"{table.file} has a rotation of none of the {len(names)} cameras; check its ids")
     found = np.tile(np.eye(3), (len(names), 1, 1))
     found[known] = rotations[[row_of[name] for name in names if name in row_of]]
     return found, known

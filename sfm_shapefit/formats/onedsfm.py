@@ -28,7 +28,6 @@ from sfm_shapefit.formats.lines import (
     UNIT_TOLERANCE,
     first_numbers,
     is_repeated,
-    node_indices,
     read_lines,
     rotations_by_name,
 )
@@ -54,12 +53,8 @@ class EpipolarGeometries:
 
     def subset(self, rows: Sequence[int]) -> "EpipolarGeometries":
         """Return some of the pairs of the same cameras."""
-        return EpipolarGeometries(
-            names=self.names,
-            pairs=self.pairs[rows],
-            rotations=self.rotations[rows],
-            to_second=self.to_second[rows],
-        )
+        pairs, rotations, to_second = self.pairs[rows], self.rotations[rows], self.to_second[rows]
+        return replace(self, pairs=pairs, rotations=rotations, to_second=to_second)
 
     def mismatch_deg(self, rotations: FloatArray) -> FloatArray:
         """Return (m,) by how many degrees each relative rotation contradicts the cameras' (n, 3, 3)."""
@@ -131,12 +126,7 @@ def read_rotations(path: Path | str, names: tuple[str, ...]) -> tuple[FloatArray
     table = read_lines(Path(path), "i R11 R12 ... R33")
     rotations = table.values(first=1, width=_ROTATION_COLUMNS).reshape(-1, 3, 3)
     table.refuse(_is_no_rotation(rotations), "has no rotation matrix")
-    ids = [row[0] for row in table.rows]
-    table.refuse(is_repeated(node_indices(ids)[1][:, None]), "gives an earlier camera a second rotation")
-    found, known = rotations_by_name(names, ids, FLIP_YZ @ nearest_rotations(rotations))
-    if not known.any():
-        raise InputError(f"{path} has a rotation of none of the {len(names)} cameras; check its ids")
-    return found, known
+    return rotations_by_name(table, 0, FLIP_YZ @ nearest_rotations(rotations), names)
 
 
 def onedsfm_files(

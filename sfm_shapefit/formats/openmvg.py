@@ -24,7 +24,13 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.formats.json_node import JsonNode
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
+from sfm_shapefit.formats.posed_model import (
+    Intrinsics,
+    PosedImage,
+    PosedModelFile,
+    model_of_images,
+    observation_arrays,
+)
 
 # This is openMVG's UndefinedIndexT.
 _NO_POSE = 2**32 - 1
@@ -50,8 +56,7 @@ def read_openmvg(file: Path, content: object) -> PosedModelFile:
     }
     order = {key: k for k, key in enumerate(cameras)}
     index_of: dict[int, int] = {}
-    names: list[str] = []
-    camera_of, rotations, centers = [], [], []
+    images: list[PosedImage] = []
     for _, node in _entries(root, "views"):
         view = _data(node)
         pose = view.get("id_pose").integer()
@@ -61,18 +66,13 @@ def read_openmvg(file: Path, content: object) -> PosedModelFile:
         if intrinsic not in cameras:
             raise view.error(f"has the intrinsic {intrinsic}, which is not among the intrinsics")
         folder = view.get("local_path").value if view.has("local_path") else ""
-        index_of[view.get("id_view").integer()] = len(names)
-        names.append("/".join(part for part in (str(folder).strip("/"), view.get("filename").text()) if part))
-        camera_of.append(order[intrinsic])
-        rotations.append(poses[pose][0])
-        centers.append(poses[pose][1])
+        index_of[view.get("id_view").integer()] = len(images)
+        name = "/".join(part for part in (str(folder).strip("/"), view.get("filename").text()) if part)
+        images.append((name, order[intrinsic], *poses[pose]))
     points, observed, pixels = _structure(root, index_of)
-    return PosedModelFile(
-        cameras=tuple(cameras.values()),
-        names=tuple(names),
-        camera_of=np.array(camera_of, dtype=np.int64),
-        rotations=np.array(rotations).reshape(-1, 3, 3),
-        centers=np.array(centers).reshape(-1, 3),
+    return model_of_images(
+        cameras.values(),
+        images,
         points=points,
         colors=np.full((len(points), 3), 128, dtype=np.int64),
         observed=observed,

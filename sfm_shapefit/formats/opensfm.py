@@ -24,7 +24,13 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.json_node import JsonNode
 from sfm_shapefit.formats.lines import text_of
-from sfm_shapefit.formats.posed_model import Intrinsics, PosedModelFile, observation_arrays
+from sfm_shapefit.formats.posed_model import (
+    Intrinsics,
+    PosedImage,
+    PosedModelFile,
+    model_of_images,
+    observation_arrays,
+)
 
 _TRACKS_FILE = "tracks.csv"
 _MODELS = ("perspective", "brown", "fisheye", "simple_radial", "radial")
@@ -46,30 +52,25 @@ def read_opensfm(file: Path, content: object) -> PosedModelFile:
     chosen = max(reconstructions, key=lambda node: len(node.get("shots").items()))
     cameras = {key: _camera(node) for key, node in chosen.get("cameras").items()}
     order = {key: k for k, key in enumerate(cameras)}
-    names, camera_of, rotations, centers = [], [], [], []
+    images: list[PosedImage] = []
     for name, shot in chosen.get("shots").items():
         key = shot.get("camera").text()
         if key not in cameras:
             raise shot.error(f"has the camera {key!r}, which is not among the cameras")
         rotation = Rotation.from_rotvec(shot.get("rotation").numbers(3)).as_matrix()
-        names.append(name)
-        camera_of.append(order[key])
-        rotations.append(rotation)
-        centers.append(-rotation.T @ np.array(shot.get("translation").numbers(3)))
+        center = -rotation.T @ np.array(shot.get("translation").numbers(3))
+        images.append((name, order[key], rotation, center))
     ids, points, colors = [], [], []
     for key, node in chosen.get("points").items() if chosen.has("points") else []:
         ids.append(key)
         points.append(node.get("coordinates").numbers(3))
         colors.append(node.get("color").numbers(3) if node.has("color") else [0.0, 0.0, 0.0])
-    observed, scaled = _observations(file, ids, names)
+    observed, scaled = _observations(file, ids, [image[0] for image in images])
     sizes = np.array([camera[1:3] for camera in cameras.values()], dtype=np.float64).reshape(-1, 2)
-    of_image = sizes[np.array(camera_of, dtype=np.int64)[observed[:, 1]]]
-    return PosedModelFile(
-        cameras=tuple(cameras.values()),
-        names=tuple(names),
-        camera_of=np.array(camera_of, dtype=np.int64),
-        rotations=np.array(rotations).reshape(-1, 3, 3),
-        centers=np.array(centers).reshape(-1, 3),
+    of_image = sizes[np.array([image[1] for image in images], dtype=np.int64)[observed[:, 1]]]
+    return model_of_images(
+        cameras.values(),
+        images,
         points=np.array(points).reshape(-1, 3),
         colors=np.clip(np.array(colors).reshape(-1, 3), 0, 255).astype(np.int64),
         observed=observed,

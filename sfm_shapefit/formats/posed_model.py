@@ -4,9 +4,9 @@ COLMAP's conventions hold: x_cam = R x_world + t with +z forward and y down, pix
 first one at (0.5, 0.5), camera models and the order of their parameters by COLMAP's names.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,25 @@ class PosedModelFile:
     """(o, 2) point and image of each observation."""
     pixels: FloatArray = field(default_factory=lambda: np.zeros((0, 2)))
     """(o, 2) where."""
+
+
+PosedImage = tuple[str, int, FloatArray, FloatArray]
+"""The name of an image, the index of its camera, its rotation (3, 3) and its center (3,)."""
+
+
+def model_of_images(
+    cameras: Iterable[Intrinsics], images: Sequence[PosedImage], **structure: Any
+) -> PosedModelFile:
+    """Return a model of posed images; points, colors, observations and pixels are passed on as they are."""
+    names, camera_of, rotations, centers = zip(*images, strict=True) if images else ((),) * 4
+    return PosedModelFile(
+        cameras=tuple(cameras),
+        names=names,
+        camera_of=np.array(camera_of, dtype=np.int64),
+        rotations=np.array(rotations).reshape(-1, 3, 3),
+        centers=np.array(centers).reshape(-1, 3),
+        **structure,
+    )
 
 
 def observation_arrays(

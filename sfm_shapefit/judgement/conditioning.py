@@ -8,7 +8,7 @@ all of these. Here its loose cameras are put into groups that move together, wit
     few pairs   two agreeing pairs or fewer
     parallel    the directions of its agreeing pairs span a narrow cone: the camera may slide along it
     on a line   the group lies on a line, along which nothing fixes their spacing
-    together    each camera is held well by its neighbours, the group is not held by the rest
+    together    each camera is held well by its neighbors, the group is not held by the rest
     distance    nothing holds it at any distance: the refinement had thrown it out of the scene
 """
 
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, sum_by
 from sfm_shapefit.geometry import median_spread, normalized
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import connected_components
@@ -42,7 +42,7 @@ class Looseness(enum.Enum):
     PARALLEL = "the directions of its agreeing pairs are nearly parallel"
     ON_A_LINE = "it stands on a straight stretch, along which nothing fixes the spacing"
     DISTANCE = "its directions leave its distance open"
-    TOGETHER = "it moves with its neighbours, which the rest does not hold"
+    TOGETHER = "it moves with its neighbors, which the rest does not hold"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,18 +99,19 @@ def condition(
     largest = sigmas.max(axis=1)
     loose = largest > LOOSE_SHARE * median_spread(locations[:num_cameras])
     loose[num_cameras:] = False
-    labels = _groups(n, used, loose)
+    labels = connected_components(n, used[loose[used].all(axis=1)])
     causes: list[Looseness | None] = [None] * num_cameras
     for camera in np.flatnonzero(loose).tolist():
         causes[camera] = _cause(int(num_pairs[camera]), float(narrowness[camera]), float(largest[camera]))
     groups = []
     for label in np.unique(labels[loose]).tolist():
         members = np.flatnonzero(loose & (labels == label))
-        if _is_straight(locations[members]):
-            for camera in members.tolist():
+        is_straight = _is_straight(locations[members])
+        for camera in members.tolist():
+            if is_undetermined[camera]:
+                causes[camera] = Looseness.DISTANCE
+            elif is_straight:
                 causes[camera] = Looseness.ON_A_LINE
-        for camera in members[is_undetermined[members]].tolist():
-            causes[camera] = Looseness.DISTANCE
         cause = _most_frequent([causes[camera] for camera in members.tolist()])
         groups.append(LooseGroup(cameras=members, cause=cause, sigma=float(largest[members].max())))
     return Conditioning(
@@ -134,17 +135,9 @@ def direction_spread(num_nodes: int, edges: IntArray, directions: FloatArray) ->
     """
     d = directions.shape[1]
     projectors = np.nan_to_num(np.eye(d) - directions[:, :, None] * directions[:, None, :]).reshape(-1, d * d)
-    sums = np.stack(
-        [np.bincount(edges.ravel(), np.repeat(column, 2), minlength=num_nodes) for column in projectors.T],
-        axis=1,
-    )
+    sums = sum_by(edges.ravel(), np.repeat(projectors, 2, axis=0), num_nodes)
     values = np.linalg.eigvalsh(sums.reshape(num_nodes, d, d))
     return np.asarray(np.maximum(values[:, 0], 0.0) / np.maximum(values[:, -1], 1e-300))
-
-
-def _groups(n: int, edges: IntArray, loose: BoolArray) -> IntArray:
-    """Return the connected component of each node among the loose ones."""
-    return connected_components(n, edges[loose[edges].all(axis=1)])
 
 
 def _cause(num_pairs: int, narrowness: float, sigma: float) -> Looseness:

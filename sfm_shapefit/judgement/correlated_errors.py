@@ -25,7 +25,8 @@ from sfm_shapefit.jit import kernel, mix_bits
 
 NUM_SAMPLES = 96
 """Standard deviations from so many samples are right to 7 %."""
-_SIGNS_PER_HASH = 32  # two of the 64 bits of a hash make one sample
+# Two of the 64 bits of a hash make one sample.
+_SIGNS_PER_HASH = 32
 
 
 def sample_direction_errors(
@@ -52,22 +53,13 @@ def sample_direction_errors(
     scores = np.zeros((len(matches.pairs), NUM_SAMPLES, 3))
     known: BoolArray = np.asarray(np.isfinite(directions).all(axis=1))
     v = np.where(known[:, None], directions, [1.0, 0.0, 0.0])
-    _add_scores(
-        matches.pairs,
-        matches.offsets,
-        np.ascontiguousarray(matches.keypoints),
-        np.ascontiguousarray(matches.rays_i),
-        np.ascontiguousarray(matches.rays_j),
-        matches.pixel_angles,
-        known,
-        v,
-        threshold_px,
-        scores,
-    )
+    keypoints = np.ascontiguousarray(matches.keypoints)
+    rays_i, rays_j = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
+    given = matches.pairs, matches.offsets, keypoints, rays_i, rays_j, matches.pixel_angles
+    _add_scores(*given, known, v, threshold_px, scores)
     bases = tangent_bases(v)
     gain = np.nan_to_num(covariances) @ bases.transpose(0, 2, 1) / np.maximum(noise_px, 1e-12)[:, None, None]
-    errors: FloatArray = scores @ gain.transpose(0, 2, 1)
-    return errors
+    return np.asarray(scores @ gain.transpose(0, 2, 1))
 
 
 @kernel(exact=True)

@@ -1,6 +1,6 @@
 """How uncertain the locations of rigid groups are, and how much each direction decides for itself.
 
-As in `uncertainty`, with the centres f of the groups as unknowns and their scale s held: it is the unit in
+As in `uncertainty`, with the centers f of the groups as unknowns and their scale s held: it is the unit in
 which positions are given. The information about f is the Laplacian of the graph of groups, its null space the
 translations alone. C = S K^-1 S^T with S = I - 1 F^T is the covariance with F^T f held fixed: the mean of the
 cameras, or one group that stays where it is. All nodes of a group share its covariance.
@@ -11,17 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.judgement.uncertainty import Uncertainty, scatter
+from sfm_shapefit.judgement.uncertainty import Uncertainty, inform, scatter
 from sfm_shapefit.laplacian.cholesky import CholeskyFactor, analyze, factorize
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
-from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.solver.program import adjoint
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 
 # Share of each block's trace that is added.
 _RIDGE = 1e-12
-# Share of the longest baseline below which a baseline counts as that long.
-_SHORTEST = 1e-12
 
 
 class GroupGauge(NamedTuple):
@@ -57,31 +55,21 @@ def propagate_groups(
     Raises:
         UnsolvableError: if the groups hang loose.
     """
-    (groups, share), d = gauge, locations.shape[1]
-    baselines = differences(locations, edges)
-    lengths = np.linalg.norm(baselines, axis=1)
-    lengths = np.maximum(lengths, _SHORTEST * lengths.max())
-    units = baselines / lengths[:, None]
-    projectors = np.eye(d) - units[:, :, None] * units[:, None, :]
-    across = projectors @ information @ projectors
-    blocks = across / lengths[:, None, None] ** 2
+    groups, share = gauge
+    known = inform(locations, edges, information)
     ends = np.ascontiguousarray(groups.group_of[edges])
     plan = analyze(groups.num_groups, ends)
-    if plan.num_bytes(d) > max_bytes:
+    if plan.num_bytes(locations.shape[1]) > max_bytes:
         return None
-    traces = np.trace(blocks, axis1=1, axis2=2)
-    factor = factorize(plan, blocks + _RIDGE * traces[:, None, None] * np.eye(d))
+    factor = factorize(plan, known.ridged(_RIDGE))
     inverse = selected_inverse(factor, ends)
-    i, j = ends.T
-    relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
-    leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     covariances = _with_fixed_mean(factor, inverse.nodes, share)
     if errors is not None:
-        forces = (across @ errors.transpose(0, 2, 1)) / lengths[:, None, None]
+        forces = (known.across @ errors.transpose(0, 2, 1)) / known.lengths[:, None, None]
         covariances = scatter(_moved(factor, ends, forces, share))
     return Uncertainty(
         covariances=covariances[groups.group_of],
-        leverages=np.clip(leverages, 0.0, 1.0),
+        leverages=known.leverages(inverse, ends),
         gauge=share[groups.group_of] > 0.0,
     )
 
@@ -92,8 +80,7 @@ def _with_fixed_mean(factor: CholeskyFactor, nodes: FloatArray, share: FloatArra
     fixed = share[:, None, None] * np.eye(d)
     product = factor.solve(fixed)
     middle = np.einsum("nak,nal->kl", fixed, product)
-    covariances: FloatArray = nodes - product - product.transpose(0, 2, 1) + middle
-    return covariances
+    return np.asarray(nodes - product - product.transpose(0, 2, 1) + middle)
 
 
 def _moved(factor: CholeskyFactor, ends: IntArray, forces: FloatArray, share: FloatArray) -> FloatArray:

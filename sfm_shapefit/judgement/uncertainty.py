@@ -28,6 +28,7 @@ over d - 1. Where it is 1 no other direction checks it, and its residual is 0 wh
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,8 +66,43 @@ class Uncertainty:
     @property
     def sigmas(self) -> FloatArray:
         """Standard deviations along the axes, (n, d)."""
-        variances: FloatArray = np.diagonal(self.covariances, axis1=1, axis2=2)
-        return np.sqrt(np.maximum(variances, 0.0))
+        return standard_deviations(self.covariances)
+
+
+class Information(NamedTuple):
+    """What the directions of m pairs say of the two ends of each, at given locations."""
+
+    units: FloatArray
+    """(m, d) directions of the baselines."""
+    lengths: FloatArray
+    """(m,) of the baselines."""
+    across: FloatArray
+    """(m, d, d) P Lambda P with P = I - u u^T, rad^-2: the scale stays exactly free."""
+    blocks: FloatArray
+    """(m, d, d) the same per length squared: the blocks of the Laplacian H."""
+
+    def ridged(self, share: float) -> FloatArray:
+        """Return the blocks with a share of the trace of each added to its diagonal."""
+        traces = np.trace(self.blocks, axis1=1, axis2=2)
+        return np.asarray(self.blocks + share * traces[:, None, None] * np.eye(self.blocks.shape[1]))
+
+    def leverages(self, inverse: SelectedInverse, ends: IntArray) -> FloatArray:
+        """Return how much each direction decides for itself, (m,), from the inverse at its ends (m, 2)."""
+        i, j = ends.T
+        relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
+        shares = np.einsum("eab,eba->e", self.blocks, relative) / (self.blocks.shape[1] - 1)
+        return np.asarray(np.clip(shares, 0.0, 1.0))
+
+
+def inform(locations: FloatArray, edges: IntArray, information: FloatArray) -> Information:
+    """Return what directions of information (m, d, d), rad^-2, say of the ends of the pairs (m, 2)."""
+    baselines = differences(locations, edges)
+    lengths = np.linalg.norm(baselines, axis=1)
+    lengths = np.maximum(lengths, _SHORTEST * lengths.max())
+    units = baselines / lengths[:, None]
+    projector = np.eye(units.shape[1]) - units[:, :, None] * units[:, None, :]
+    across = projector @ information @ projector
+    return Information(units, lengths, across, across / lengths[:, None, None] ** 2)
 
 
 def propagate(
@@ -95,32 +131,28 @@ def propagate(
         UnsolvableError: if the information is singular beyond repair: the graph is in pieces.
     """
     n, d = locations.shape
-    baselines = differences(locations, edges)
-    lengths = np.linalg.norm(baselines, axis=1)
-    units = baselines / np.maximum(lengths, _SHORTEST * lengths.max())[:, None]
-    across = _across(information, units)
-    blocks = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None] ** 2
+    known = inform(locations, edges, information)
     plan = analyze(n, edges)
     if plan.num_bytes(d) > max_bytes:
         return None
-    factor = _grounded_factor(plan, blocks, units, lengths)
+    factor = _grounded_factor(plan, known)
     inverse = selected_inverse(factor, edges)
-
-    i, j = edges.T
-    relative = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
-    leverages = np.einsum("eab,eba->e", blocks, relative) / (d - 1)
     is_camera = np.arange(n) < (n if num_cameras is None else num_cameras)
     covariances, gauge = _fix_gauge(factor, inverse, locations, is_camera)
     if errors is not None:
-        pulls = across / np.maximum(lengths, _SHORTEST * lengths.max())[:, None, None]
+        pulls = known.across / known.lengths[:, None, None]
         covariances = scatter(_moved(factor, locations, _right_side(edges, pulls, errors, n), gauge))
-    return Uncertainty(covariances=covariances, leverages=np.clip(leverages, 0.0, 1.0), gauge=gauge)
+    return Uncertainty(covariances=covariances, leverages=known.leverages(inverse, edges), gauge=gauge)
 
 
 def scatter(samples: FloatArray) -> FloatArray:
     """Return the covariances (n, d, d) of samples (n, d, s) of mean zero."""
-    covariances: FloatArray = samples @ samples.transpose(0, 2, 1) / samples.shape[2]
-    return covariances
+    return np.asarray(samples @ samples.transpose(0, 2, 1) / samples.shape[2])
+
+
+def standard_deviations(covariances: FloatArray) -> FloatArray:
+    """Return the roots of the diagonals of covariances (n, d, d), (n, d)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
 
 
 def _right_side(edges: IntArray, pulls: FloatArray, errors: Iterable[FloatArray], n: int) -> FloatArray:
@@ -145,23 +177,12 @@ def _moved(factor: CholeskyFactor, locations: FloatArray, right: FloatArray, gau
     return moved
 
 
-def _across(information: FloatArray, units: FloatArray) -> FloatArray:
-    """Return P Lambda P with P = I - u u^T: the scale stays exactly free."""
-    projector = np.eye(units.shape[1]) - units[:, :, None] * units[:, None, :]
-    product: FloatArray = projector @ information @ projector
-    return product
-
-
-def _grounded_factor(
-    plan: SymbolicFactor, blocks: FloatArray, units: FloatArray, lengths: FloatArray
-) -> CholeskyFactor:
+def _grounded_factor(plan: SymbolicFactor, known: Information) -> CholeskyFactor:
     """Factor H with its last camera grounded and the length of its longest baseline held."""
-    d = units.shape[1]
-    traces = np.trace(blocks, axis1=1, axis2=2)
-    longest = int(np.argmax(lengths))
-    held = traces[longest] * np.outer(units[longest], units[longest])
+    longest = int(np.argmax(known.lengths))
+    held = np.trace(known.blocks[longest]) * np.outer(known.units[longest], known.units[longest])
     for ridge in _RIDGES:
-        regular = blocks + ridge * traces[:, None, None] * np.eye(d)
+        regular = known.ridged(ridge)
         regular[longest] += held
         try:
             return factorize(plan, regular)
@@ -194,8 +215,7 @@ def _is_near(locations: FloatArray, is_camera: BoolArray) -> BoolArray:
     """Return which nodes stand within a few spreads of the cameras' median."""
     cameras = locations[is_camera]
     distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
-    near: BoolArray = distances <= _FAR * median_spread(cameras)
-    return near
+    return np.asarray(distances <= _FAR * median_spread(cameras))
 
 
 def _in_gauge(
@@ -206,10 +226,8 @@ def _in_gauge(
     product = factor.solve(fixed)  # A^-1 F
     middle = np.einsum("nak,nal->kl", fixed, product)
     cross = null @ product.transpose(0, 2, 1)
-    covariances: FloatArray = (
-        inverse.nodes - cross - cross.transpose(0, 2, 1) + null @ middle @ null.transpose(0, 2, 1)
-    )
-    return covariances
+    spread = null @ middle @ null.transpose(0, 2, 1)
+    return np.asarray(inverse.nodes - cross - cross.transpose(0, 2, 1) + spread)
 
 
 def _gauge_pair(locations: FloatArray, gauge: BoolArray) -> tuple[FloatArray, FloatArray]:

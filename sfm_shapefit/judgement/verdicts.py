@@ -26,11 +26,11 @@ from scipy.special import chdtri
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import angle_between_deg, median_spread, normalized, tangent_bases
+from sfm_shapefit.geometry import angle_between_deg, distances_in_spreads, normalized, tangent_bases
 from sfm_shapefit.judgement.conditioning import LooseGroup, condition
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
-from sfm_shapefit.judgement.uncertainty import propagate
+from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.rigidity import parallel_rigid_pieces
@@ -103,7 +103,7 @@ class Assessment:
     @property
     def sigmas(self) -> FloatArray:
         """(n, d) standard deviation of each location along the axes."""
-        return _standard_deviations(self.covariances)
+        return standard_deviations(self.covariances)
 
     def verdict(self, pair: int) -> Verdict:
         """Return what the solution says of a pair."""
@@ -158,7 +158,7 @@ def assess(
     covariances, leverages = propagate_all(measured, locations, holding, information, sampled, max_bytes)
     leverages[inliers & ~holding] = np.nan
     covariances = scale**2 * covariances
-    sigmas = _standard_deviations(covariances)
+    sigmas = standard_deviations(covariances)
     conditioning = condition(locations, graph.edges, inliers, sigmas, k, undetermined_nodes)
     fit = PairFit(angles, sigma_of_pair, leverages)
     judged = judge_cameras(measured, locations, fit, sigmas, conditioning)
@@ -189,17 +189,17 @@ def _tangential_residuals(directions: FloatArray, baselines: FloatArray) -> Floa
 
 
 def _fitted_share(angles: FloatArray, num_unknowns: int, freedom: int) -> tuple[float, bool]:
-    """Return unknowns / equations, and whether the residuals are those of a sum of norms."""
+    """Return unknowns / equations, within limits, and whether the residuals are those of a sum of norms."""
     share = num_unknowns / max(freedom * len(angles), 1)
     middle = float(np.median(angles[angles > 0.0])) if np.any(angles > 0.0) else 0.0
     fitted = float(np.mean(angles <= _EXACTLY_FITTED * middle))
-    return share, fitted > min(_MIN_FITTED_SHARE, 0.5 * share)
+    is_exact = fitted > min(_MIN_FITTED_SHARE, 0.5 * share)
+    return min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE), is_exact
 
 
 def _level(angles: FloatArray, num_unknowns: int, freedom: int) -> float:
     """Return the standard deviation per axis that the (m,) residual angles in radians speak of."""
     share, is_exact = _fitted_share(angles, num_unknowns, freedom)
-    share = min(share, _LARGEST_FITTED_SHARE if is_exact else _LARGEST_SHARE)
     median_length = np.sqrt(chdtri(freedom, 0.5))  # of a vector of unit normal components
     quantile = float(np.quantile(angles, (1.0 + share) / 2.0 if is_exact else 0.5))
     shrunk = 1.0 if is_exact else float(np.sqrt(1.0 - share))
@@ -226,7 +226,6 @@ def _excess(
             break
         used = inliers
     share, is_exact = _fitted_share(angles[inliers], num_unknowns, freedom)
-    share = min(share, _LARGEST_FITTED_SHARE) if is_exact else min(share, _LARGEST_SHARE)
     rank = (1.0 + share) / 2.0 if is_exact else 0.5
     wanted = float(chdtri(freedom, 0.5)) * (1.0 if is_exact else 1.0 - share)
     return _matching_excess(squares[inliers], values[inliers], rank, wanted), inliers
@@ -270,11 +269,6 @@ class _Sampled(NamedTuple):
             yield whole[chosen - start] @ bases / self.scale
 
 
-def _standard_deviations(covariances: FloatArray) -> FloatArray:
-    """Return the roots of the diagonals, (n, d)."""
-    return np.asarray(np.sqrt(np.maximum(np.diagonal(covariances, axis1=1, axis2=2), 0.0)))
-
-
 def _infinite_covariances(locations: FloatArray) -> FloatArray:
     """Return the covariances (n, d, d) of locations that nothing holds."""
     n, d = locations.shape
@@ -295,11 +289,9 @@ def _propagate_nodes(
     baselines of very different lengths make that singular, only its nodes within some radii have any.
     """
     graph, num_cameras = measured.graph, measured.num_cameras
-    unknown = np.full_like(_infinite_covariances(locations), np.nan), np.where(inliers, np.nan, 0.0)
-    distances = _distances(locations, num_cameras)
+    covariances, leverages = _infinite_covariances(locations), np.where(inliers, np.nan, 0.0)
+    distances = distances_in_spreads(locations, locations[:num_cameras])
     for reach in _REACHES:
-        covariances = _infinite_covariances(locations)
-        leverages = np.where(inliers, np.nan, 0.0)
         used = np.flatnonzero(inliers & (distances[graph.edges] <= reach).all(axis=1))
         rows = used[parallel_rigid_pieces(graph.num_nodes, graph.edges[used], graph.dimension) == 0]
         nodes, edges = np.unique(graph.edges[rows], return_inverse=True)
@@ -314,20 +306,13 @@ def _propagate_nodes(
         except UnsolvableError:  # singular in spite of the ridge
             continue
         if found is None:
-            return unknown
+            break
         inside = locations[nodes[distances[nodes] <= _REACHES[-1]]]
-        is_loose = (found.sigmas > _extent(inside)).any(axis=1)
-        covariances[nodes[~is_loose]] = found.covariances[~is_loose]
+        is_held = ~(found.sigmas > _extent(inside)).any(axis=1)
+        covariances[nodes[is_held]] = found.covariances[is_held]
         leverages[rows] = found.leverages
         return covariances, leverages
-    return unknown
-
-
-def _distances(locations: FloatArray, num_cameras: int) -> FloatArray:
-    """Return the distance of each node (n,) from the cameras' median, in their median distances."""
-    cameras = locations[:num_cameras]
-    distances = np.linalg.norm(locations - np.median(cameras, axis=0), axis=1)
-    return np.asarray(distances / max(median_spread(cameras), np.finfo(np.float64).tiny))
+    return np.full_like(covariances, np.nan), leverages
 
 
 def _extent(locations: FloatArray) -> float:
@@ -358,7 +343,8 @@ def _propagate_groups(
     rows = np.flatnonzero(inliers & inside[graph.edges].all(axis=1))
     if len(tied) < 2 or len(rows) == 0:
         return covariances, leverages
-    nodes, edges = np.flatnonzero(inside), np.searchsorted(np.flatnonzero(inside), graph.edges[rows])
+    nodes = np.flatnonzero(inside)
+    edges = np.searchsorted(nodes, graph.edges[rows])
     share = cameras[tied].astype(np.float64) if fixed is None else (tied == fixed).astype(np.float64)
     samples = None if sampled is None else np.concatenate(list(sampled.parts(graph.directions, rows)))
     gauge = GroupGauge(groups.restricted_to(nodes), share / share.sum())
@@ -367,9 +353,8 @@ def _propagate_groups(
     except UnsolvableError:
         found = None
     if found is None:
-        return np.full_like(covariances, np.nan), np.where(inliers, np.nan, 0.0)
-    extent = np.ptp(locations[nodes], axis=0).max()
-    is_loose = (found.sigmas > extent).any(axis=1)
-    covariances[nodes[~is_loose]] = found.covariances[~is_loose]
+        return np.full_like(covariances, np.nan), leverages
+    is_held = ~(found.sigmas > _extent(locations[nodes])).any(axis=1)
+    covariances[nodes[is_held]] = found.covariances[is_held]
     leverages[rows] = found.leverages
     return covariances, leverages

@@ -1,10 +1,8 @@
-"""Laplacians of a graph, assembled by slots or applied by rows; (D t)_e = t_i - t_j for e = (i, j).
+"""Laplacians of a graph, as matrices or applied by rows; (D t)_e = t_i - t_j for e = (i, j).
 
     L = D^T W D                W = diag(w)             graph Laplacian, n x n
     L = D^T diag(B_e) D        B_e symmetric, b x b    block Laplacian, nb x nb
 
-A Laplacian with new weights has the old pattern. `LaplacianPattern` finds once where in the matrix
-each edge goes (its slots); `assemble` then only writes, without sorting or allocation of indices.
 `LaplacianOperator` multiplies without a matrix, by row blocks on several threads.
 """
 
@@ -16,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import bsr_array, csr_array
+from scipy.sparse import bsr_array
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError
@@ -48,12 +46,15 @@ def check_edges(num_nodes: int, edges: npt.ArrayLike) -> IntArray:
     Raises:
         InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    array = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    if array.size and (array.min() < 0 or array.max() >= num_nodes):
-        raise InputError(f"an edge leaves the nodes 0..{num_nodes - 1}; give indices in [0, n)")
-    if (array[:, 0] == array[:, 1]).any():
-        raise InputError("an edge joins a node with itself; remove it")
-    return array
+    checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
+    bad = ((checked < 0) | (checked >= num_nodes)).any(axis=1) | (checked[:, 0] == checked[:, 1])
+    if bad.any():
+        index = int(np.argmax(bad))
+        raise InputError(
+            f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different nodes "
+            f"of 0..{num_nodes - 1}"
+        )
+    return checked
 
 
 def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
@@ -63,109 +64,52 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
         num_nodes: n.
         edges: (m, 2) int64, checked.
     """
-    return Adjacency(*(frozen(part) for part in _adjacency(num_nodes, edges)))
+    ends = edges.ravel()
+    pointers, entries = group_by(ends, num_nodes)
+    neighbors = ends[entries ^ 1].astype(np.int32)  # the other end of the same edge
+    return Adjacency(frozen(pointers), frozen(neighbors), frozen((entries // 2).astype(np.int32)))
 
 
 @kernel()
-def _adjacency(num_nodes: int, edges: Any) -> Any:
-    """Counting sort of both ends of the edges by node."""
-    m = edges.shape[0]
-    pointers = np.zeros(num_nodes + 1, np.int64)
-    for e in range(m):
-        pointers[edges[e, 0] + 1] += 1
-        pointers[edges[e, 1] + 1] += 1
-    for i in range(num_nodes):
-        pointers[i + 1] += pointers[i]
+def group_by(labels: Any, count: int) -> Any:
+    """Sort items by their labels 0..count-1; return where each label begins, (count + 1,), and the items.
+
+    Items of one label stay in their order.
+    """
+    pointers = np.zeros(count + 1, np.int64)
+    for label in labels:
+        pointers[label + 1] += 1
+    pointers = np.cumsum(pointers)
     fill = pointers[:-1].copy()
-    neighbors = np.empty(2 * m, np.int32)
-    edge_of = np.empty(2 * m, np.int32)
-    for e in range(m):
-        i, j = edges[e, 0], edges[e, 1]
-        neighbors[fill[i]], edge_of[fill[i]] = j, e
-        neighbors[fill[j]], edge_of[fill[j]] = i, e
-        fill[i] += 1
-        fill[j] += 1
-    return pointers, neighbors, edge_of
+    items = np.empty(len(labels), np.int64)
+    for k in range(len(labels)):
+        items[fill[labels[k]]] = k
+        fill[labels[k]] += 1
+    return pointers, items
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class LaplacianPattern:
-    """Where each edge stands in the assembled Laplacian: pattern and slots, found once per graph."""
-
-    pointers: IntArray
-    """(n + 1,) row pointers of the compressed (block) rows."""
-    columns: Int32Array
-    """(q,) column of each stored (block) entry, ascending within a row; the diagonal is stored."""
-    diagonal: IntArray
-    """(n,) slot of each diagonal entry."""
-    upper: IntArray
-    """(m,) slot of entry (i, j) of each edge (i, j)."""
-    lower: IntArray
-    """(m,) slot of entry (j, i)."""
-    edges: IntArray
-    """(m, 2) the edges."""
-
-
-def laplacian_pattern(num_nodes: int, edges: npt.ArrayLike) -> LaplacianPattern:
-    """Find the pattern and the slots of the Laplacian of a graph; repeated edges share their slots.
+def block_matrix(diagonal: FloatArray, coupling: FloatArray, edges: IntArray) -> bsr_array:
+    """Return the symmetric matrix (nb, nb) of blocks.
 
     Args:
-        num_nodes: n.
+        diagonal: (n, b, b) the block of each node.
+        coupling: (m, b, b) block (i, j) of each edge; its transpose is block (j, i).
         edges: (m, 2) node indices.
-
-    Raises:
-        InputError: if an edge leaves [0, num_nodes) or joins a node with itself.
     """
-    pairs = check_edges(num_nodes, edges)
-    m = len(pairs)
-    nodes = np.arange(num_nodes)
-    rows = np.concatenate([nodes, pairs[:, 0], pairs[:, 1]])
-    columns = np.concatenate([nodes, pairs[:, 1], pairs[:, 0]])
-    keys, slots = np.unique(rows * num_nodes + columns, return_inverse=True)
-    pointers = np.searchsorted(keys, np.arange(num_nodes + 1) * num_nodes)
-    parts = np.split(slots.astype(np.int64), [num_nodes, num_nodes + m])
-    diagonal, upper, lower = (frozen(part) for part in parts)
-    column = frozen((keys % max(num_nodes, 1)).astype(np.int32))
-    return LaplacianPattern(frozen(pointers.astype(np.int64)), column, diagonal, upper, lower, frozen(pairs))
+    n, b, (i, j) = len(diagonal), diagonal.shape[1], edges.T
+    rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
+    blocks = np.concatenate([coupling, coupling.transpose(0, 2, 1), diagonal])
+    order = np.lexsort((columns, rows))
+    pointers = np.searchsorted(rows[order], np.arange(n + 1))
+    return bsr_array((blocks[order], columns[order], pointers), shape=(b * n, b * n))
 
 
-def assemble(
-    pattern: LaplacianPattern, weights: FloatArray, out: FloatArray | None = None
-) -> csr_array | bsr_array:
-    """Return the Laplacian with the given edge weights as a scipy matrix.
-
-    Args:
-        pattern: from `laplacian_pattern`.
-        weights: (m,) for the graph Laplacian, or (m, b, b) symmetric blocks for the block Laplacian.
-        out: the `data` of a matrix assembled before, (q,) or (q, b, b), overwritten and shared if given.
-
-    Returns:
-        (n, n) csr_array, or (nb, nb) bsr_array, float64.
-    """
-    w = np.ascontiguousarray(weights, dtype=np.float64)
-    shape = (len(pattern.columns), *w.shape[1:])
-    data = np.empty(shape) if out is None else out
-    block = 1 if w.ndim == 1 else w.shape[1]
-    data[...] = 0.0
-    _assemble(
-        pattern.edges, pattern.diagonal, pattern.upper, pattern.lower,
-        w.reshape(len(w), -1), data.reshape(len(data), -1),
-    )  # fmt: skip
-    n = len(pattern.diagonal) * block
-    indices = (data, pattern.columns, pattern.pointers)
-    return csr_array(indices, shape=(n, n)) if w.ndim == 1 else bsr_array(indices, shape=(n, n))
-
-
-@kernel(exact=True)
-def _assemble(edges: Any, diagonal: Any, upper: Any, lower: Any, weights: Any, data: Any) -> None:
-    for e in range(edges.shape[0]):
-        i, j = diagonal[edges[e, 0]], diagonal[edges[e, 1]]
-        for k in range(weights.shape[1]):
-            w = weights[e, k]
-            data[i, k] += w
-            data[j, k] += w
-            data[upper[e], k] -= w
-            data[lower[e], k] -= w
+def laplacian_matrix(num_nodes: int, edges: IntArray, weights: FloatArray) -> bsr_array:
+    """Return the Laplacian of edge weights (m,), (n, n), or of symmetric blocks (m, b, b), (nb, nb)."""
+    blocks = weights.reshape(len(edges), 1, 1) if weights.ndim == 1 else weights
+    diagonal = np.zeros((num_nodes, *blocks.shape[1:]))
+    np.add.at(diagonal, edges.ravel(), np.repeat(blocks, 2, axis=0))
+    return block_matrix(diagonal, -blocks, edges)
 
 
 class Workers:

@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
+from sfm_shapefit.laplacian.operators import Adjacency, Int32Array, group_by
 
 DEFAULT_FACTOR_BYTES = 2_000_000_000
 """What one factor may take if the caller says nothing."""
@@ -480,17 +480,11 @@ def _stacked(parent: Any, below: Any, root: int) -> Any:
 def _edge_slots(edges: Any, inverse: Any, owner: Any, first: Any, row_pointers: Any, rows: Any) -> Any:
     """Group the edges by the supernode of their earlier end and find their row and column in its panel."""
     num, m = len(first) - 1, len(edges)
-    pointers = np.zeros(num + 1, np.int64)
+    entered = np.empty(m, np.int32)
     for e in range(m):
-        pointers[owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])] + 1] += 1
-    for s in range(num):
-        pointers[s + 1] += pointers[s]
-    fill = pointers[:num].copy()
-    index = np.empty(m, np.int32)
-    for e in range(m):
-        s = owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])]
-        index[fill[s]] = e
-        fill[s] += 1
+        entered[e] = owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])]
+    pointers, items = group_by(entered, num)
+    index = items.astype(np.int32)
     edge_row = np.empty(m, np.int32)
     edge_column = np.empty(m, np.int32)
     position = np.empty(len(inverse), np.int64)

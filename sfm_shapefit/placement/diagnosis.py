@@ -20,6 +20,7 @@ right cameras are among those; only the solution tells them from wrong ones (`ju
 """
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -54,74 +55,70 @@ _SMALLEST_CHECKED = 3
 class PieceDiagnosis:
     """A parallel-rigid piece of three cameras or more."""
 
-    num_cameras: int
-    hinges: tuple[str, ...]
-    """Names of the cameras that it shares with other pieces."""
+    num_cameras: Annotated[int, "Cameras of it."]
+    hinges: Annotated[tuple[str, ...], "Names of the cameras that it shares with other pieces."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WeakCamera:
     """A camera that would be placed, and may be placed badly."""
 
-    name: str
-    num_pairs: int
-    """Pairs with a usable direction."""
-    spread: float
-    """How far the directions that hold it are from parallel, in [0, 1]; rays to points count."""
-    reasons: tuple[str, ...]
+    name: Annotated[str, "Of its image."]
+    num_pairs: Annotated[int, "Pairs with a usable direction."]
+    spread: Annotated[
+        float, "How far the directions that hold it are from parallel, in [0, 1]; rays to points count."
+    ]
+    reasons: Annotated[tuple[str, ...], "Why it may be placed badly, in words."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Corruption:
     """An estimate from the directions alone of how many pairs are wrong."""
 
-    share: float | None
-    """Of the pairs in a triangle; None where none is, or where they are too many to look at."""
-    num_checked: int
-    """Pairs in a triangle."""
-    statement: str
+    share: Annotated[
+        float | None, "Of the pairs in a triangle; null where none is, or where they are too many to look at."
+    ]
+    num_checked: Annotated[int, "Pairs in a triangle."]
+    statement: Annotated[str, "The same in words."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedPlacement:
     """What a placement of the largest piece would do."""
 
-    solver: str
-    solver_reason: str
-    second_start: bool
-    """Whether LUD is solved beside ShapeFit."""
-    finish: str
-    """What becomes of the starts, a sentence."""
+    solver: Annotated[str, "The solver that would run."]
+    solver_reason: Annotated[str, "Why it would be chosen."]
+    second_start: Annotated[bool, "Whether LUD is solved beside ShapeFit."]
+    finish: Annotated[str, "What becomes of the starts, a sentence."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Diagnosis:
     """What there is to know of a view graph without solving."""
 
-    dimension: int
-    num_cameras: int
-    num_points: int
-    """3D points that join as further nodes."""
-    num_pairs: int
-    """Pairs of cameras with a usable direction."""
-    components: tuple[int, ...]
-    """Cameras of each connected component, the largest first; single cameras have one of their own."""
-    pieces: tuple[PieceDiagnosis, ...]
-    """Parallel-rigid pieces of three cameras or more, the largest first: that one would be placed, the
-    others written beside it, each with a scale of its own."""
-    left_out: dict[str, str]
-    """Cameras outside the largest piece, and why."""
-    weak: tuple[WeakCamera, ...]
-    corruption: Corruption
-    plan: PlannedPlacement | None
-    """None if nothing can be placed."""
-    obstacle: str
-    """Why nothing can be placed; empty if something can."""
+    dimension: Annotated[int, "Of the locations."]
+    num_cameras: Annotated[int, "Nodes of the graph that are no points."]
+    num_points: Annotated[int, "3D points that join as further nodes."]
+    num_pairs: Annotated[int, "Pairs of cameras with a usable direction."]
+    components: Annotated[
+        tuple[int, ...],
+        "Cameras of each connected component, the largest first; single cameras have one of their own.",
+    ]
+    pieces: Annotated[
+        tuple[PieceDiagnosis, ...],
+        "Parallel-rigid pieces of three cameras or more, the largest first: that one would be placed, the "
+        "others written beside it, each with a scale of its own.",
+    ]
+    left_out: Annotated[dict[str, str], "Cameras outside the largest piece, and why."]
+    weak: Annotated[tuple[WeakCamera, ...], "Cameras that may be placed badly, and why."]
+    corruption: Annotated[Corruption, "How many pairs are wrong, as far as triangles tell."]
+    plan: Annotated[PlannedPlacement | None, "Null if nothing can be placed."]
+    obstacle: Annotated[str, "Why nothing can be placed; empty if something can."]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Theory:
-    """The constants of the recovery theorems for given centres, or why they are left out."""
+    """The constants of the recovery theorems for given centers, or why they are left out."""
 
     conditions: RecoveryConditions | None
     statement: str
@@ -158,7 +155,13 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
         num_points=measured.num_points,
         num_pairs=pairs.num_edges,
         components=tuple(sorted(np.bincount(pairs.components()).tolist(), reverse=True)),
-        pieces=_piece_diagnoses(graph, pieces, n),
+        pieces=tuple(
+            PieceDiagnosis(
+                num_cameras=int(np.sum(piece.nodes < n)),
+                hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < n),
+            )
+            for piece in pieces[: count_large(pieces, n)]
+        ),
         left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
         weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against),
         corruption=_corruption(pairs, scores),
@@ -168,11 +171,11 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
 
 
 def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory:
-    """Return what the paper's theorems grant for the graph of all pairs and given centres.
+    """Return what the paper's theorems grant for the graph of all pairs and given centers.
 
     Args:
         graph: the pairs with usable directions; cameras without any are left aside.
-        centers: (n, d) true, or as good as true, centres of its cameras.
+        centers: (n, d) true, or as good as true, centers of its cameras.
         threads: the result does not depend on it.
     """
     joined, cameras = graph.restricted_to(np.arange(graph.num_edges))
@@ -189,32 +192,15 @@ def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory
     return Theory(conditions=found, statement=_granted_in_words(found))
 
 
-def _piece_diagnoses(
-    graph: ViewGraph, pieces: list[RigidPiece], num_cameras: int
-) -> tuple[PieceDiagnosis, ...]:
-    """Return the pieces of three cameras or more."""
-    return tuple(
-        PieceDiagnosis(
-            num_cameras=int(np.sum(piece.nodes < num_cameras)),
-            hinges=tuple(graph.name_of(k) for k in piece.hinges.tolist() if k < num_cameras),
-        )
-        for piece in pieces[: count_large(pieces, num_cameras)]
-    )
-
-
 def _find_weak_cameras(
     measured: MeasuredGraph, piece: RigidPiece, contradicted: BoolArray, against: IntArray
 ) -> tuple[WeakCamera, ...]:
     """Return the cameras of the largest piece that little holds, or that most triangles contradict.
 
-    Args:
-        measured: cameras and points.
-        piece: its largest piece.
-        contradicted: (m,) pairs that are wrong by their triangles; they hold nothing.
-        against: (q, 2) pairs without a direction because their matches contradict the rotations.
+    Pairs (m,) that their triangles contradict hold nothing; the matches of those `against` (q, 2) contradict
+    the given rotations.
     """
-    graph, num_cameras = measured.graph, measured.num_cameras
-    n = graph.num_nodes
+    graph, n = measured.graph, measured.graph.num_nodes
     ends, is_pair = graph.edges[piece.edges], measured.is_pair[piece.edges]
     wrong = contradicted[piece.edges]
     num_pairs = np.bincount(ends[is_pair].ravel(), minlength=n)
@@ -223,7 +209,7 @@ def _find_weak_cameras(
     spread = direction_spread(n, ends[~wrong], graph.directions[piece.edges[~wrong]])
     num_against = np.bincount(against.ravel(), minlength=n)
     weak = []
-    for camera in piece.nodes[piece.nodes < num_cameras].tolist():
+    for camera in piece.nodes[piece.nodes < measured.num_cameras].tolist():
         reasons = []
         if num_ties[camera] <= FEW_PAIRS and len(piece.nodes) >= _SMALLEST_CHECKED:
             reasons.append("two pairs or fewer hold it")
@@ -268,13 +254,11 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
 
 
 def _in_triangle(graph: ViewGraph) -> BoolArray:
-    """Return which pairs (m,) have a common neighbour."""
+    """Return which pairs (m,) have a common neighbor."""
     i, j = graph.edges.T
-    n = graph.num_nodes
-    half = coo_array((np.ones(len(i)), (i, j)), shape=(n, n)).tocsr()
+    half = coo_array((np.ones(len(i)), (i, j)), shape=(graph.num_nodes, graph.num_nodes)).tocsr()
     adjacency = half + half.T
-    found: BoolArray = np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0
-    return found
+    return np.asarray((adjacency @ adjacency)[i, j]).ravel() > 0.0
 
 
 def _plan_placement(piece: ViewGraph, options: PlacementOptions) -> PlannedPlacement:

@@ -1,7 +1,7 @@
 """Scale, origin and axes of the answer: what directions cannot tell, chosen by the user and stated.
 
 The program leaves scale and shift free (sum_i t_i = 0, L(T) = kappa); rotations are given, so the axes are
-the input's. A gauge is a scale and a shift of the centres and, with position priors alone, a turn of the
+the input's. A gauge is a scale and a shift of the centers and, with position priors alone, a turn of the
 whole model onto their axes.
 """
 
@@ -22,13 +22,18 @@ from sfm_shapefit.geometry import (
 )
 from sfm_shapefit.refinement.options import Scale
 
-_CAP_OF_SIZE = 0.5  # an input centre that is farther off is lost, and must not set the scale
-_ROUGH = 0.1  # median distance of the input's centres from the answer, of their spread
-_COINCIDENT = 1e-9  # spread of centres, relative to their distance from the origin, that counts as none
+# An input center that is farther off, of the spread of all, is lost and must not set the scale.
+_CAP_OF_SIZE = 0.5
+# The scale is rough if the median distance of the input's centers from the answer is more of their spread.
+_ROUGH = 0.1
+# A smaller spread of centers, relative to their distance from the origin, counts as none.
+_COINCIDENT = 1e-9
 _FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
-_FLAT = 5.0  # times their residual: a spread across a line that is smaller says nothing of the turn about it
-_KERNEL_WIDTH = 3.0  # standard deviations at which a prior's weight is half
+# A spread across a line of fewer residuals than this says nothing of the turn about the line.
+_FLAT = 5.0
+# The weight of a prior is half at so many standard deviations.
+_KERNEL_WIDTH = 3.0
 _REWEIGHTINGS = 20
 
 
@@ -79,29 +84,28 @@ class PositionPriors:
 
 
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
-    """Return the gauge of the input's centres: a robust similarity (L1) that keeps the axes.
+    """Return the gauge of the input's centers: a robust similarity (L1) that keeps the axes.
 
-    Without usable input centres it becomes "unit", and says so.
+    Without usable input centers it becomes "unit", and says so.
 
     Args:
         locations: (n, 3) the solver's answer.
-        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
     """
-    spread = np.ptp(input_centers, axis=0).max()
-    if spread <= _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
-        return unit_gauge(locations, "the input's centres coincide, so the scale is free; ")
-    size = median_spread(input_centers) or spread
+    if _coincide(input_centers):
+        return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
+    size = median_spread(input_centers)
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
     if similarity.scale <= 0.0:
-        return unit_gauge(locations, "the input's centres contradict the answer; ")
+        return unit_gauge(locations, "the input's centers contradict the answer; ")
     off = float(np.median(np.linalg.norm(similarity.apply(locations) - input_centers, axis=1))) / size
     warning = ""
     if off > _ROUGH:
         warning = (
-            f"the input's centres are {off:.0%} of their spread off the answer, so the scale taken from them "
+            f"the input's centers are {off:.0%} of their spread off the answer, so the scale taken from them "
             "is rough; use the scale unit if they mean nothing"
         )
-    statement = "input: scale and origin of the input's centres, its axes"
+    statement = "input: scale and origin of the input's centers, its axes"
     return Gauge(similarity=similarity, scale="input", statement=statement, warning=warning)
 
 
@@ -113,7 +117,7 @@ def metric_gauge(
     Args:
         locations: (n, 3) the solver's answer.
         unit: length of the output's unit in theirs.
-        input_centers: (n, 3) the input's centres of the same cameras, in the same axes.
+        input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
         fixed: (n,) the cameras that stay where the input has them.
         has_rigs: whether the scale is that of rigs; else it is that of the fixed cameras.
     """
@@ -121,18 +125,15 @@ def metric_gauge(
     shifts = input_centers - scale * locations
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
-    elif np.ptp(input_centers, axis=0).max() > _COINCIDENT * max(1.0, float(np.abs(input_centers).max())):
-        shift, origin = np.median(shifts, axis=0), "origin of the input's centres"
+    elif not _coincide(input_centers):
+        shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
-    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=shift)
+    statement = f"fixed: scale and {origin}"
     if has_rigs:
-        return Gauge(
-            similarity=similarity,
-            scale="rig",
-            statement=f"rig: the unit of the sensors' offsets in their rigs; {origin}",
-        )
-    return Gauge(similarity=similarity, scale="fixed", statement=f"fixed: scale and {origin}")
+        statement = f"rig: the unit of the sensors' offsets in their rigs; {origin}"
+    name: Literal["rig", "fixed"] = "rig" if has_rigs else "fixed"
+    return Gauge(similarity=_keep_axes(scale, shift), scale=name, statement=statement)
 
 
 def moved_gauge(gauge: Gauge, location: FloatArray, center: FloatArray, name: str) -> Gauge:
@@ -149,9 +150,8 @@ def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:
     """Return the gauge with the centroid (of locations (n, 3)) at 0 and the median distance from it 1."""
     centroid = locations.mean(axis=0)
     scale = 1.0 / float(np.median(np.linalg.norm(locations - centroid, axis=1)))
-    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=-scale * centroid)
     statement = f"unit: {because}the median distance of the cameras from their centroid, the origin, is 1"
-    return Gauge(similarity=similarity, scale="unit", statement=statement)
+    return Gauge(similarity=_keep_axes(scale, -scale * centroid), scale="unit", statement=statement)
 
 
 def distance_gauge(locations: FloatArray, first: int, second: int, distance: float, names: str) -> Gauge:
@@ -170,7 +170,7 @@ def distance_gauge(locations: FloatArray, first: int, second: int, distance: flo
     if apart <= _COINCIDENT * median_spread(locations):
         raise InputError(f"the cameras {names} coincide, so their distance sets no scale; choose two others")
     scale = distance / apart
-    similarity = Similarity(scale=scale, rotation=np.eye(3), translation=-scale * locations.mean(axis=0))
+    similarity = _keep_axes(scale, -scale * locations.mean(axis=0))
     statement = f"distance: {names} are {distance:g} apart; origin: the cameras' centroid, axes: the input's"
     return Gauge(similarity=similarity, scale="distance", statement=statement)
 
@@ -209,14 +209,22 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
             "the position priors contradict the cameras that were found; check that names and axes are right"
         )
     return Gauge(
-        similarity=Similarity(
-            scale=found.scale, rotation=np.eye(3), translation=found.rotation.T @ found.translation
-        ),
+        similarity=_keep_axes(found.scale, found.rotation.T @ found.translation),
         scale="prior",
         axes=found.rotation if turns else None,
         statement=_prior_statement(priors, found, weights, level, turns=turns),
         warning=_prior_warning(level, size, turns=turns),
     )
+
+
+def _coincide(centers: FloatArray) -> bool:
+    """Return whether centers (n, 3) are one point to rounding."""
+    return bool(np.ptp(centers, axis=0).max() <= _COINCIDENT * max(1.0, float(np.abs(centers).max())))
+
+
+def _keep_axes(scale: float, shift: FloatArray) -> Similarity:
+    """Return the map x -> scale x + shift."""
+    return Similarity(scale=scale, rotation=np.eye(3), translation=shift)
 
 
 def _fit_to_priors(
@@ -248,11 +256,9 @@ def _prior_statement(
     priors: PositionPriors, found: Similarity, weights: FloatArray, level: float, *, turns: bool
 ) -> str:
     agreeing = int(np.sum(weights >= 0.5))
-    axes = (
-        f"turned by {float(rotation_angles_deg(found.rotation)):.1f} deg onto theirs"
-        if turns
-        else "axes: the input's"
-    )
+    axes = "axes: the input's"
+    if turns:
+        axes = f"turned by {float(rotation_angles_deg(found.rotation)):.1f} deg onto theirs"
     return (
         f"prior: {priors.statement}; {agreeing} of {len(weights)} agree, to {level:.3g} per axis; "
         f"origin: theirs, {axes}"

@@ -89,7 +89,7 @@ class Placement(Displayed):
 
     @property
     def locations(self) -> FloatArray:
-        """The centres (k, d) of `cameras`, in the solver's units."""
+        """The centers (k, d) of `cameras`, in the solver's units."""
         return self.refined.locations[: len(self.cameras)]
 
     @property
@@ -110,14 +110,13 @@ class Placement(Displayed):
     @property
     def considered(self) -> ViewGraph:
         """The whole graph without the edges that the filter left out."""
-        return _drop_edges(self.graph, self.dropped)
+        return _drop_edges(self.graph, self.dropped)[0]
 
     @property
     def rejected_pairs(self) -> IntArray:
         """The pairs (k, 2) of cameras that contradict the solution."""
         rejected = self.pairs[~self.assessment.inliers[self.pairs]]
-        pairs: IntArray = self.graph.edges[self.edges[rejected]]
-        return pairs
+        return np.asarray(self.graph.edges[self.edges[rejected]])
 
     def summary(self) -> dict[str, Any]:
         """Return the main figures in plain values."""
@@ -239,8 +238,7 @@ def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray
         refuse_options_of_groups(options)
         return np.zeros(0, dtype=np.int64), [find_tied_piece(measured)]
     dropped = _filter_pairs(measured, options.filter)
-    considered = _drop_edges(measured.graph, dropped)
-    edge_of = np.setdiff1d(np.arange(measured.graph.num_edges), dropped)
+    considered, edge_of = _drop_edges(measured.graph, dropped)
     pieces = order_pieces(considered, measured.num_cameras)
     refuse_without_triangle(considered, pieces, measured.num_cameras)
     return dropped, [RigidPiece(piece.nodes, edge_of[piece.edges], piece.hinges) for piece in pieces]
@@ -293,12 +291,10 @@ def _filter_pairs(measured: MeasuredGraph, name: Filter) -> IntArray:
     return dropped
 
 
-def _drop_edges(graph: ViewGraph, dropped: IntArray) -> ViewGraph:
-    """Return a graph of the same nodes without some of its edges."""
-    if len(dropped) == 0:
-        return graph
+def _drop_edges(graph: ViewGraph, dropped: IntArray) -> tuple[ViewGraph, IntArray]:
+    """Return a graph of the same nodes without some of its edges, and the index of each edge that is left."""
     kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
-    return graph.subset(kept)
+    return graph.subset(kept) if len(dropped) else graph, kept
 
 
 def order_pieces(graph: ViewGraph, num_cameras: int) -> list[RigidPiece]:

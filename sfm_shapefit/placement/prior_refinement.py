@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors
 from sfm_shapefit.placement.place import Placement, replace_locations
@@ -40,10 +40,11 @@ def pull_to_priors(
         part.graph, start, metric, levels, anchors, max_bytes=options.factor_memory_mb * 1_000_000
     )
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
+    held = anchors.nodes[anchors.chi2(moved) <= KERNEL_WIDTH**2]
     kept = replace(
         refined,
         locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
-        reset_nodes=np.setdiff1d(refined.reset_nodes, _find_held_nodes(moved, anchors)),
+        reset_nodes=np.setdiff1d(refined.reset_nodes, held),
     )
     return (
         replace_locations(placement, kept, options),
@@ -60,10 +61,3 @@ def _anchor(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anch
     covariances[~np.isfinite(covariances).all(axis=(1, 2))] = level**2 * np.eye(3)
     information = np.linalg.inv(axes.T @ covariances @ axes)
     return Anchors(priors.cameras, positions, np.asarray(information, dtype=np.float64))
-
-
-def _find_held_nodes(locations: FloatArray, anchors: Anchors) -> IntArray:
-    """Return the nodes whose prior agrees with their location (n, 3): it has half its weight or more."""
-    off = locations[anchors.nodes] - anchors.positions
-    chi2 = np.einsum("ka,kab,kb->k", off, anchors.information, off)
-    return np.asarray(anchors.nodes[chi2 <= KERNEL_WIDTH**2])

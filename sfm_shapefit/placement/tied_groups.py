@@ -13,6 +13,7 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
+from sfm_shapefit.solver.rigs.solve import refuse_admm
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
 # The largest offset, of the median baseline, below which the scale of the offsets means nothing.
@@ -25,8 +26,7 @@ def refuse_options_of_groups(options: PlacementOptions) -> None:
         raise InputError(
             "rigs and fixed cameras go with the objectives auto, shapefit and lud, without a filter"
         )
-    if options.solver == "admm":
-        raise InputError("rigs and fixed cameras have no solver admm; choose auto, newton or conic")
+    refuse_admm(options)
 
 
 def is_scaled(groups: RigidGroups, edges: IntArray) -> bool:

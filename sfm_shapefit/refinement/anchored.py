@@ -45,6 +45,15 @@ class Anchors(NamedTuple):
     information: FloatArray
     """(k, d, d) inverse covariances."""
 
+    def off(self, t: FloatArray) -> FloatArray:
+        """Return how far locations (n, d) are off, (k, d)."""
+        return np.asarray(t[self.nodes] - self.positions)
+
+    def chi2(self, t: FloatArray) -> FloatArray:
+        """Return the same in standard deviations, squared, (k,)."""
+        off = self.off(t)
+        return np.asarray(np.einsum("ka,kab,kb->k", off, self.information, off))
+
 
 def refine_anchored(
     graph: ViewGraph,
@@ -98,22 +107,18 @@ class _AnchoredTerms(AngularTerms):
 
     def cost(self, t: FloatArray) -> float:
         """Return the cost at t, (n, d)."""
-        kernels = 0.5 * KERNEL_WIDTH**2 * np.arctan(self._chi2(t) / KERNEL_WIDTH**2)
+        kernels = 0.5 * KERNEL_WIDTH**2 * np.arctan(self._anchors.chi2(t) / KERNEL_WIDTH**2)
         return super().cost(t) + float(np.sum(kernels))
 
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
         blocks, damped, gradient = self.linearize(t)
-        weights = 1.0 / (1.0 + (self._chi2(t) / KERNEL_WIDTH**2) ** 2)
+        weights = 1.0 / (1.0 + (self._anchors.chi2(t) / KERNEL_WIDTH**2) ** 2)
         own = weights[:, None, None] * self._anchors.information
-        pull = np.einsum("kab,kb->ka", own, t[self._anchors.nodes] - self._anchors.positions)
+        pull = np.einsum("kab,kb->ka", own, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
         return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right
 
     def move(self, t: FloatArray, step: FloatArray) -> FloatArray:
         """Return the locations (n, d) after a step (n + 1, d), with the origin where it is."""
         return np.asarray(t + step[:-1] - step[-1])
-
-    def _chi2(self, t: FloatArray) -> FloatArray:
-        off = t[self._anchors.nodes] - self._anchors.positions
-        return np.asarray(np.einsum("ka,kab,kb->k", off, self._anchors.information, off))

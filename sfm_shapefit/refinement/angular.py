@@ -25,7 +25,7 @@ with angles in place of its chords; the kernel and its graduation: Yang, Antonan
 """
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
@@ -41,6 +41,7 @@ from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES, SymbolicFactor
 from sfm_shapefit.refinement.cg_normal_solver import GraphShape, IterativeNormal
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 from sfm_shapefit.solver.program import adjoint, differences
+from sfm_shapefit.solver.splitting.linear import LaplacianFactor
 from sfm_shapefit.viewgraph import ViewGraph
 
 KERNEL_WIDTH = 3.0
@@ -68,16 +69,6 @@ _HOPELESS = 20.0
 _MAX_STEPS = 60
 # One factorization in blocks of so many operations takes about a second, and 15 to 40 are needed.
 _MAX_FLOPS = 3e10
-
-
-class NormalFactor(Protocol):
-    """What solves the normal equations of a step: a factor of the Laplacian, or of that over groups."""
-
-    def refactor(self, weights: FloatArray, /) -> None:
-        """Factor the matrix of edge blocks (m, d, d), or raise UnsolvableError."""
-
-    def solve(self, rhs: FloatArray, /) -> FloatArray:
-        """Return the step of the locations, (n, d), for a right-hand side of that shape."""
 
 
 class Metric(NamedTuple):
@@ -122,7 +113,7 @@ def refine_angles(
     graph: ViewGraph,
     start: FloatArray,
     metric: Metric,
-    plan: SymbolicFactor | NormalFactor,
+    plan: SymbolicFactor | LaplacianFactor,
     other: FloatArray | None = None,
 ) -> AngularResult:
     """Refine locations by robust Levenberg-Marquardt in the angles of the directions.
@@ -213,13 +204,13 @@ class AngularTerms:
         return baselines, graph.directions, graph.weights, self._information, floor, self._steep
 
 
-def allocate_normal(plan: SymbolicFactor | NormalFactor, dimension: int) -> NormalFactor:
+def allocate_normal(plan: SymbolicFactor | LaplacianFactor, dimension: int) -> LaplacianFactor:
     """Return memory for a factor of what `plan_refinement` says."""
     return allocate_factor(plan, dimension) if isinstance(plan, SymbolicFactor) else plan
 
 
 def take_step(
-    terms: AngularTerms, factor: NormalFactor, t: FloatArray, damping: float
+    terms: AngularTerms, factor: LaplacianFactor, t: FloatArray, damping: float
 ) -> tuple[FloatArray, float, float, float]:
     """Take one step that lowers the cost; return locations, damping, and the cost before and after."""
     before = terms.cost(t)

@@ -19,7 +19,7 @@ each tenfold radius is looked at by itself.
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import fit_similarity_l1, median_spread
+from sfm_shapefit.geometry import distances_in_spreads, fit_similarity_l1
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph, connected_components
 
@@ -63,7 +63,7 @@ def find_strays(
 
 def left_scene(start: FloatArray, refined: FloatArray, reach: float = _REACH) -> BoolArray:
     """Return the nodes that ended farther out than `reach` radii of the start, (n,), whatever the scales."""
-    far: BoolArray = _distances(refined) > reach * _distances(start).max()
+    far = distances_in_spreads(refined, refined) > reach * distances_in_spreads(start, start).max()
     return far if np.sum(~far) >= _FEWEST_OTHERS else np.zeros_like(far)
 
 
@@ -124,8 +124,3 @@ def put_back(start: FloatArray, refined: FloatArray, nodes: IntArray) -> FloatAr
     result = refined.copy()
     result[nodes] = similarity.apply(start[nodes])
     return result
-
-
-def _distances(t: FloatArray) -> FloatArray:
-    """Return the distance of each node from the coordinate-wise median, in median distances."""
-    return np.asarray(np.linalg.norm(t - np.median(t, axis=0), axis=1) / median_spread(t))

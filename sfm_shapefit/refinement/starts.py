@@ -20,7 +20,6 @@ from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.refinement.angular import (
     AngularResult,
     Metric,
-    NormalFactor,
     agreeing_pairs,
     plan_refinement,
     refine_angles,
@@ -33,7 +32,7 @@ from sfm_shapefit.solver.options import SolverResult, Status
 from sfm_shapefit.solver.program import differences, normalize_locations, projected_length
 from sfm_shapefit.solver.rigs.lud import lud_over_groups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.solver.splitting.linear import Resources
+from sfm_shapefit.solver.splitting.linear import LaplacianFactor, Resources
 from sfm_shapefit.solver.splitting.lud import LudResult, solve_lud
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -130,7 +129,7 @@ class _Problem(NamedTuple):
 
     measured: MeasuredGraph
     metric: Metric
-    normal_solver: SymbolicFactor | NormalFactor | None
+    normal_solver: SymbolicFactor | LaplacianFactor | None
     """What the refinement solves its steps with; None where the starts are not refined."""
 
     @property
@@ -194,7 +193,7 @@ def refine_starts(
 
 def _plan_normal_solver(
     measured: MeasuredGraph, options: PlacementOptions
-) -> SymbolicFactor | NormalFactor | None:
+) -> SymbolicFactor | LaplacianFactor | None:
     """Return what the refinement solves its steps with; None if its factor would be too large."""
     graph, groups, max_bytes = measured.graph, measured.groups, options.factor_memory_mb * 1_000_000
     if groups is None:

@@ -40,7 +40,7 @@ class Matrix:
 
 
 def residual_histogram(pairs: Pairs) -> Histogram:
-    """Return the residuals at the input's centres, at the convex optimum and at the output's centres.
+    """Return the residuals at the input's centers, at the convex optimum and at the output's centers.
 
     All count the same pairs: those with a residual at the output and, where it is known, at the optimum.
     """
@@ -77,6 +77,5 @@ def view_graph_matrix(pairs: Pairs, num_cameras: int) -> Matrix:
         np.maximum.at(cells, (rows, columns), _UNBINNED_RANK[classes].astype(np.float64))
     else:
         np.add.at(cells, (rows, columns), (classes == PairClass.CONTRADICTS).astype(np.float64))
-    if per_cell > 1:
         cells = cells / np.maximum(counts, 1)
     return Matrix(cells=np.where(counts > 0, cells, np.nan), counts=counts, cameras_per_cell=per_cell)

@@ -8,7 +8,7 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,7 +29,7 @@ MAX_POINTS = 20_000
 # A point is left out if it is farther from the median than this many times the distance within which 90 % of
 # points and cameras lie.
 _FAR_POINT = 4.0
-# The depth of a frustum is a share of the median distance between neighbours, within limits that are shares
+# The depth of a frustum is a share of the median distance between neighbors, within limits that are shares
 # of the extent.
 _FRUSTUM_SHARE = 0.4
 _FRUSTUM_OF_EXTENT = (0.008, 0.05)
@@ -40,7 +40,7 @@ _UPRIGHT = 0.1
 
 
 class PairClass(enum.IntEnum):
-    """What became of a pair, as the page counts and colours it."""
+    """What became of a pair, as the page counts and colors it."""
 
     AGREES = 0
     CONTRADICTS = 1
@@ -92,11 +92,11 @@ class Pairs:
     leverages: FloatArray
     dual_norms: FloatArray
     residuals_deg: FloatArray
-    """(m,) at the output's centres."""
+    """(m,) at the output's centers."""
     certified_deg: FloatArray
     """(m,) at the convex optimum, before any refinement; NaN where it is not known."""
     input_deg: FloatArray
-    """(m,) at the input's centres; NaN where those mean nothing."""
+    """(m,) at the input's centers; NaN where those mean nothing."""
     reasons: tuple[str, ...]
 
     def worst_first(self) -> IntArray:
@@ -132,8 +132,8 @@ class Drawing:
     dimension: int = 3
     """Of the graph; others than 3 are bare graphs."""
     input_is_aligned: bool = False
-    """Whether the input's centres are in the output's units, so that both can be drawn together."""
-    history: tuple[tuple[int, float, float | None], ...] = field(default=())
+    """Whether the input's centers are in the output's units, so that both can be drawn together."""
+    history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
 
     @property
@@ -147,53 +147,35 @@ def build_drawing(
     cameras: Sequence[CameraRow],
     pairs: Sequence[PairRow],
     *,
-    model: "PosedModel | None" = None,
-    original: "PosedModel | None" = None,
-    turn: FloatArray | None = None,
+    poses: Poses | None = None,
     points: "pycolmap.Reconstruction | None" = None,
     certified: FloatArray | None = None,
-    input_is_aligned: bool = False,
-    dimension: int = 3,
-    history: Sequence[tuple[int, float, float | None]] = (),
 ) -> Drawing:
-    """Return the drawing of a result's rows.
+    """Return the drawing of a result's rows; what does not follow from these has its default.
 
     Args:
         cameras, pairs: rows of the tables.
-        model: where rotations and pictures come from; unknown if None.
-        original: the input, for its centres; unknown if None.
-        turn: (3, 3) from the axes of `model` to the output's; None if they are the same.
+        poses: rotations in the output's axes, and the input's centers; unknown if None.
         points: the reconstruction whose 3D points are drawn; none if None.
         certified: (n, d) locations at the convex optimum, NaN where there are none; unknown if None.
-        input_is_aligned: the input's centres are in the output's units.
-        dimension: of the graph.
-        history: iteration, objective and bound of the solve.
     """
-    names = tuple(row.name for row in cameras)
-    known, before = (
-        _unknown_poses(len(names)) if source is None else poses_of(source, names)
-        for source in (model, original)
-    )
-    rotations = known.rotations if turn is None else known.rotations @ turn.T
-    poses = replace(known, rotations=rotations, centers=before.centers)
-    own = _cameras(cameras, names, poses)
+    poses = _unknown_poses(len(cameras)) if poses is None else poses
+    own = _cameras(cameras, poses)
     positions = own.centers[own.placed]
-    drawn = _points(points, positions)
     return Drawing(
         cameras=own,
         pairs=_pairs(pairs, own, certified),
-        points=drawn,
+        points=_points(points, positions),
         axes=view_axes(poses.rotations[own.placed]),
         frustum_depth=_frustum_depth(positions),
-        dimension=dimension,
-        input_is_aligned=input_is_aligned,
-        history=tuple(history),
     )
 
 
-def poses_of(model: "PosedModel", names: Sequence[str]) -> Poses:
-    """Return rotations, centres and pictures of a model's images, by name; NaN for those it has not."""
+def poses_of(model: "PosedModel | None", names: Sequence[str]) -> Poses:
+    """Return rotations, centers and pictures of a model's images, by name; NaN for those it does not have."""
     found = _unknown_poses(len(names))
+    if model is None:
+        return found
     row_of = {name: row for row, name in enumerate(names)}
     sizes: dict[int, tuple[float, float]] = {}
     for k, (image_id, name) in enumerate(zip(model.image_ids.tolist(), model.names, strict=True)):
@@ -259,13 +241,13 @@ def _unknown_poses(n: int) -> Poses:
     )
 
 
-def _cameras(rows: Sequence[CameraRow], names: tuple[str, ...], poses: Poses) -> Cameras:
+def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
     centers = np.full((len(rows), 3), np.nan)
     for k, row in enumerate(rows):
         if row.center:
-            centers[k] = _in_three_dimensions(np.array(row.center))
+            centers[k] = [*row.center, 0.0, 0.0][:3]
     return Cameras(
-        names=names,
+        names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
         reasons=tuple(row.reason for row in rows),
         pieces=np.array([-1 if row.piece is None else row.piece for row in rows], dtype=np.int64),
@@ -275,13 +257,6 @@ def _cameras(rows: Sequence[CameraRow], names: tuple[str, ...], poses: Poses) ->
         sigmas=np.array([max(row.sigma, default=np.nan) for row in rows], dtype=np.float64),
         poses=poses,
     )
-
-
-def _in_three_dimensions(points: FloatArray) -> FloatArray:
-    """Return points (..., d) with coordinates added or left out to make three."""
-    missing = max(3 - points.shape[-1], 0)
-    widths = [(0, 0)] * (points.ndim - 1) + [(0, missing)]
-    return np.pad(points, widths)[..., :3]
 
 
 def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
@@ -346,7 +321,7 @@ def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArra
 
 
 def _frustum_depth(positions: FloatArray) -> float:
-    """Return how deep frusta are drawn: well below the distance between neighbours."""
+    """Return how deep frusta are drawn: well below the distance between neighbors."""
     if len(positions) < 2:
         return 1.0
     low, high = np.quantile(positions, [0.05, 0.95], axis=0)

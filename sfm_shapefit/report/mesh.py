@@ -1,4 +1,4 @@
-"""scene.glb and scene.ply, for any viewer: cameras coloured by trust, points, pairs. The door to trimesh.
+"""scene.glb and scene.ply, for any viewer: cameras colored by trust, points, pairs. The door to trimesh.
 
     scene.ply    the output's own axes and units, as the seeded model: it overlays other exports of it
     scene.glb    turned so that y is up, as viewers of glTF expect, the cameras' median at the origin
@@ -72,7 +72,7 @@ def write_meshes(drawing: Drawing, folder: Path) -> None:
 
 
 def trust_colors(trust: FloatArray) -> Colors:
-    """Return the colours (n, 3) of trusts in [0, 1], as on the page; grey where it is not known."""
+    """Return the colors (n, 3) of trusts in [0, 1], as on the page; gray where it is not known."""
     known = np.nan_to_num(trust)
     colors = np.stack([np.interp(known, _TRUST_STOPS, _TRUST_COLORS[:, c]) for c in range(3)], axis=1)
     colors[np.isnan(trust)] = 128.0
@@ -80,7 +80,7 @@ def trust_colors(trust: FloatArray) -> Colors:
 
 
 def _camera_mesh(drawing: Drawing) -> tuple[FloatArray, IntArray, Colors]:
-    """Return vertices, faces and vertex colours of all placed cameras: pyramids, or octahedra for nodes."""
+    """Return vertices, faces and vertex colors of all placed cameras: pyramids, or octahedra for nodes."""
     cameras = drawing.cameras
     rows = np.flatnonzero(cameras.placed)
     has_picture = np.isfinite(cameras.poses.rotations[rows]).all(axis=(1, 2))
@@ -102,7 +102,7 @@ def _camera_mesh(drawing: Drawing) -> tuple[FloatArray, IntArray, Colors]:
 
 
 def _lines(drawing: Drawing) -> tuple[FloatArray, Colors]:
-    """Return the ends (k, 2, 3) and colours (k, 3) of the pairs whose cameras are placed, at most 20,000."""
+    """Return the ends (k, 2, 3) and colors (k, 3) of the pairs whose cameras are placed, at most 20,000."""
     worst = drawing.pairs.worst_first()
     ends = drawing.pairs.cameras[worst]
     drawn = drawing.cameras.placed[ends].all(axis=1) & (

@@ -45,18 +45,12 @@ _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
 
 def write_report(drawing: Drawing, facts: dict[str, Any], path: Path) -> None:
-    """Write the report of a result.
-
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-        path: the file.
-    """
+    """Write the report of a result; the facts are those of locate.json."""
     path.write_text(report_html(drawing, facts), encoding="utf-8", newline="\n")
 
 
 def report_html(drawing: Drawing, facts: dict[str, Any]) -> str:
-    """Return the page; arguments as of `write_report`."""
+    """Return the page; the facts are those of locate.json."""
     data = page_data(drawing, facts)
     plotly, script = _plotly(), _asset("page.js")
     values = {
@@ -308,9 +302,9 @@ def _histogram_note(medians_deg: dict[str, float]) -> str:
     if not medians_deg:
         return "No pair has a residual."
     where = {
-        "input": "at the input's centres",
+        "input": "at the input's centers",
         "optimum": "at the convex optimum",
-        "output": "at the output's centres",
+        "output": "at the output's centers",
     }
     medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
     return f"Angle between each measured direction and its baseline; medians: {medians}."
@@ -319,10 +313,10 @@ def _histogram_note(medians_deg: dict[str, float]) -> str:
 def _matrix_note(cameras_per_cell: int) -> str:
     if cameras_per_cell > 1:
         return (
-            f"{cameras_per_cell} cameras share a cell; its colour is the share of its pairs that contradict "
+            f"{cameras_per_cell} cameras share a cell; its color is the share of its pairs that contradict "
             "the solution."
         )
-    return "Blue agrees, red contradicts, yellow cannot be judged, grey has no direction."
+    return "Blue agrees, red contradicts, yellow cannot be judged, gray has no direction."
 
 
 def _support_note(drawing: Drawing) -> str:

@@ -18,6 +18,7 @@ MAX_TEXT = 160
 _FAR_DEG = 1.0
 # Below this trust, reasons are given.
 _LOW_TRUST = 0.75
+_SOLVER_SCALE = "the solver's own units, the centroid at the origin"
 # So many items of a kind are among the first things to look at.
 _SHOWN = 3
 
@@ -42,18 +43,13 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
 
 
 def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
-    """Return what was placed and how certain it is, a sentence each.
-
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-    """
+    """Return what was placed and how certain it is, a sentence each; the facts are those of locate.json."""
     return [
         _placed(drawing),
         _pairs(drawing, facts),
         *_certainty(drawing),
         _optimum(facts["solve"]),
-        f"Scale and origin: {shorten(_scale(facts), 2 * MAX_TEXT)}.",
+        f"Scale and origin: {shorten(facts.get('scale') or _SOLVER_SCALE, 2 * MAX_TEXT)}.",
     ]
 
 
@@ -69,18 +65,15 @@ def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     ]
 
 
-def _noun(drawing: Drawing) -> str:
-    return "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
-
-
 def _placed(drawing: Drawing) -> str:
     placed, total = int(drawing.cameras.placed.sum()), len(drawing.cameras.names)
+    noun = "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
     if placed == total:
-        return f"All {total:,} {_noun(drawing)} were placed."
+        return f"All {total:,} {noun} were placed."
     elsewhere = int(np.sum(~drawing.cameras.placed & (drawing.cameras.pieces > 0)))
     note = f" ({elsewhere:,} in smaller pieces)" if elsewhere else ""
     missing = f"{total - placed:,} {'is' if total - placed == 1 else 'are'} not in this model"
-    return f"{placed:,} of {total:,} {_noun(drawing)} were placed; {missing}{note}."
+    return f"{placed:,} of {total:,} {noun} were placed; {missing}{note}."
 
 
 def _pairs(drawing: Drawing, facts: dict[str, Any]) -> str:
@@ -116,20 +109,12 @@ def _optimum(solve: dict[str, Any]) -> str:
     """Say what the certificate proves."""
     if solve["status"] == "not_solved":
         return f"Nothing certifies these positions as a whole ({solve['method']}: {solve['method_reason']})."
-    unique = {
-        True: ", and no other placement is as good",
-        False: ", but others may be as good",
-        None: "",
-    }[solve["unique"]]
+    others = {True: ", and no other placement is as good", False: ", but others may be as good", None: ""}
     certified = "is certified" if solve["status"] == "converged" else "is not certified to the tolerance"
     return (
         f"The convex optimum {certified}: its objective {solve['objective']:.4g} is within "
-        f"{max(solve['gap'], 0.0):.1e} of the least possible{unique}."
+        f"{max(solve['gap'], 0.0):.1e} of the least possible{others[solve['unique']]}."
     )
-
-
-def _scale(facts: dict[str, Any]) -> str:
-    return str(facts.get("scale") or "the solver's own units, the centroid at the origin")
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

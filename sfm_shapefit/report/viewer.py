@@ -23,12 +23,12 @@ if TYPE_CHECKING:
 
 _EDGES = np.array([[0, 1], [0, 2], [0, 3], [0, 4], [1, 2], [2, 3], [3, 4], [4, 1]])
 """Of a pyramid: apex, then corners."""
-_GREY = (140, 140, 140)
+_GRAY = (140, 140, 140)
 _CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
 _FEWEST_FITTED = 3
-# A click means the camera whose centre is at most this far off.
+# A click means the camera whose center is at most this far off.
 _PICKED_DEG = 2.0
 # The slider is logarithmic, from here to 180 degrees.
 _LEAST_DEG = 0.01
@@ -48,17 +48,8 @@ class Thresholds:
     """Only its pairs are drawn; all if None."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class SelectedPairs:
-    """The pairs that some thresholds leave."""
-
-    rows: IntArray
-    contradicts: BoolArray
-    """By the threshold, not by the verdict."""
-
-
-def select_pairs(drawing: Drawing, thresholds: Thresholds) -> SelectedPairs:
-    """Return which pairs are drawn and how, the worst first."""
+def select_pairs(drawing: Drawing, thresholds: Thresholds) -> tuple[IntArray, BoolArray]:
+    """Return the rows of the pairs that are drawn, the worst first, and which contradict by the threshold."""
     cameras, pairs = drawing.cameras, drawing.pairs
     shown = cameras.placed & ~(cameras.trust < thresholds.min_trust)
     kept = shown[pairs.cameras].all(axis=1) & np.isfinite(pairs.residuals_deg)
@@ -67,11 +58,11 @@ def select_pairs(drawing: Drawing, thresholds: Thresholds) -> SelectedPairs:
         kept &= (pairs.cameras == thresholds.camera).any(axis=1)
     worst = pairs.worst_first()
     rows = worst[kept[worst]][:_MAX_PAIRS]
-    return SelectedPairs(rows=rows, contradicts=pairs.residuals_deg[rows] > thresholds.residual_deg)
+    return rows, pairs.residuals_deg[rows] > thresholds.residual_deg
 
 
 def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> int | None:
-    """Return the placed camera whose centre is nearest to a ray in angle, within 2 degrees; None if none is.
+    """Return the placed camera whose center is nearest to a ray in angle, within 2 degrees; None if none is.
 
     Args:
         drawing: what is drawn.
@@ -88,13 +79,9 @@ def camera_at(drawing: Drawing, origin: FloatArray, direction: FloatArray) -> in
 
 
 def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "viser.ViserServer":
-    """Start the viewer; it runs until its `stop` is called.
+    """Start the viewer; it runs until its `stop` is called. The facts are those of locate.json.
 
-    Args:
-        drawing: what is drawn.
-        facts: the contents of locate.json.
-        host: the address to listen on; 127.0.0.1 can be reached from this machine only.
-        port: the port; the next free one if it is taken.
+    At the host 127.0.0.1 it can be reached from this machine only. If the port is taken, it is the next one.
 
     Raises:
         InputError: if viser is not installed.
@@ -140,12 +127,12 @@ class _View:
             )
 
     def _add_input(self) -> None:
-        """Draw the input's cameras in grey where they can be brought into the output's units."""
+        """Draw the input's cameras in gray where they can be brought into the output's units."""
         self._input = None
         centers = input_centers(self._drawing)
         if centers is not None:
             rows = np.flatnonzero(np.isfinite(centers).all(axis=1))
-            self._input = self._frusta("/input", rows, centers[rows], np.tile(_GREY, (len(rows), 1)))
+            self._input = self._frusta("/input", rows, centers[rows], np.tile(_GRAY, (len(rows), 1)))
 
     def _add_controls(self, facts: dict[str, Any]) -> None:
         gui, drawing = self._server.gui, self._drawing
@@ -164,7 +151,7 @@ class _View:
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
         self._counts = gui.add_text("pairs drawn", "", disabled=True)
         if self._input is not None:
-            handle, shown = self._input, gui.add_checkbox("input's poses (grey)", True)
+            handle, shown = self._input, gui.add_checkbox("input's poses (gray)", True)
             shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
         for control in (self._residual, self._support, self._trust, self._picked):
             control.on_update(lambda _event: self._draw())
@@ -191,12 +178,11 @@ class _View:
         colors = trust_colors(drawing.cameras.trust[rows])
         colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
         self._frusta("/cameras", rows, drawing.cameras.centers[rows], colors)
-        drawn = select_pairs(drawing, thresholds)
-        kinds = np.where(drawn.contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
-        ends = drawing.cameras.centers[drawing.pairs.cameras[drawn.rows]]
-        self._lines("/pairs", ends, PAIR_COLORS[kinds])
-        against = int(drawn.contradicts.sum())
-        self._counts.value = f"{len(drawn.rows):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
+        drawn, contradicts = select_pairs(drawing, thresholds)
+        kinds = np.where(contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
+        self._lines("/pairs", drawing.cameras.centers[drawing.pairs.cameras[drawn]], PAIR_COLORS[kinds])
+        against = int(contradicts.sum())
+        self._counts.value = f"{len(drawn):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
 
     def _frusta(
         self, name: str, rows: IntArray, centers: FloatArray, colors: Any
@@ -212,7 +198,7 @@ class _View:
         return self._lines(name, segments, shades)
 
     def _lines(self, name: str, ends: FloatArray, colors: Any) -> "viser.LineSegmentsHandle | None":
-        """Draw lines (k, 2, 3) in colours (k, 3); nothing is left of the name if there are none."""
+        """Draw lines (k, 2, 3) in colors (k, 3); nothing is left of the name if there are none."""
         if len(ends) == 0:
             self._server.scene.remove_by_name(name)
             return None
@@ -224,9 +210,9 @@ class _View:
 
 
 def input_centers(drawing: Drawing) -> FloatArray | None:
-    """Return the input's centres (n, 3) in the output's units and axes, brought there by a fit if need be.
+    """Return the input's centers (n, 3) in the output's units and axes, brought there by a fit if need be.
 
-    None where the input has no centres, or they all coincide.
+    None where the input has no centers, or they all coincide.
     """
     before, after = drawing.cameras.poses.centers, drawing.cameras.centers
     common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)

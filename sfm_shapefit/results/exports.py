@@ -8,15 +8,26 @@ from sfm_shapefit.formats.onedsfm import EpipolarGeometries, onedsfm_files
 from sfm_shapefit.results.result import GraphResult
 
 
-def positions_g2o(found: GraphResult) -> str:
-    """Return the placed nodes as g2o vertices."""
-    placement = found.placement
-    names = [placement.graph.name_of(camera) for camera in placement.cameras.tolist()]
-    rotations = None if found.rotations is None else found.rotations[placement.cameras]
-    return g2o_text(names, placement.locations, rotations)
+def export_files(found: GraphResult, *, g2o: bool, onedsfm: bool) -> dict[str, str]:
+    """Return the texts of the formats that are wanted, by their path in the output folder.
+
+    `positions.g2o` has the placed nodes as vertices, the folder `1dsfm` the pairs that agree and the cameras.
+
+    Raises:
+        InputError: if a format has no such dimension.
+    """
+    files: dict[str, str] = {}
+    if g2o:
+        cameras = found.placement.cameras
+        names = [found.placement.graph.name_of(camera) for camera in cameras.tolist()]
+        rotations = None if found.rotations is None else found.rotations[cameras]
+        files["positions.g2o"] = g2o_text(names, found.placement.locations, rotations)
+    if onedsfm:
+        files |= {f"1dsfm/{name}": text for name, text in _agreeing_onedsfm(found).items()}
+    return files
 
 
-def agreeing_onedsfm(found: GraphResult) -> dict[str, str]:
+def _agreeing_onedsfm(found: GraphResult) -> dict[str, str]:
     """Return the 1DSfM files of what agrees with the solution; world axes serve where there are no others."""
     placement, graph = found.placement, found.placement.graph
     if graph.dimension != 3:

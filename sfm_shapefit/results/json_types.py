@@ -28,12 +28,12 @@ class LooseGroup(TypedDict):
 
 
 class Piece(TypedDict):
-    """A parallel-rigid piece of the view graph, most cameras first."""
+    """A parallel-rigid piece of three cameras or more."""
 
-    num_cameras: int
+    num_cameras: Annotated[int, "Cameras of it, placed or not."]
     scale: Annotated[str, "Its gauge, in words, or why it has none."]
     hinges: Annotated[list[str], "Cameras that it shares with other pieces."]
-    folder: Annotated[str, "Where it stands in OUT; empty if it was not solved."]
+    folder: Annotated[str, 'Where it stands in OUT, "." for the largest; empty if it was not solved.']
     num_placed: Annotated[int, "Cameras of it that are in the output; the others are not trusted."]
 
 
@@ -48,8 +48,8 @@ class Solve(TypedDict):
         float | None, "Violation of the dual's equality, relative to the largest weighted degree."
     ]
     unique: Annotated[bool | None, "Whether the certificate proves the optimum unique; null if not examined."]
-    iterations: int
-    seconds: float
+    iterations: Annotated[int, "Of the solver that ran."]
+    seconds: Annotated[float, "Wall-clock time of the solve."]
     method: Annotated[str, "The solver that ran."]
     method_reason: Annotated[str, "Why it was chosen."]
 
@@ -57,17 +57,17 @@ class Solve(TypedDict):
 class Lud(TypedDict):
     """The LUD start and its own dual bound, in its own units."""
 
-    objective: float
-    dual_bound: float | None
-    equality_residual: float | None
-    iterations: int
+    objective: Annotated[float, "Value of the LUD program at its start."]
+    dual_bound: Annotated[float | None, "No placement has a lower objective."]
+    equality_residual: Annotated[float | None, "Violation of the dual's equality, as in `Solve`."]
+    iterations: Annotated[int, "Of the solver."]
 
 
 class Finish(TypedDict):
-    """From the certified optimum to the centres."""
+    """From the certified optimum to the centers."""
 
     start: Annotated[str, "The convex start that was kept."]
-    refined: bool
+    refined: Annotated[bool, "Whether the angular refinement moved the start."]
     reason: Annotated[str, "Why this start was kept."]
     disagreement: Annotated[float | None, "How far the two starts disagree about lengths, as a share."]
     costs: Annotated[dict[str, float], "Robust angular cost of each start after refinement."]
@@ -75,41 +75,41 @@ class Finish(TypedDict):
     moved_median: Annotated[
         float,
         "Median move of cameras and points from the start that is kept, as a share of their median distance "
-        "from the centre.",
+        "from the center.",
     ]
-    moved_max: float
+    moved_max: Annotated[float, "The largest such move."]
     num_turned_pairs: Annotated[
         int,
         "Directions, those to points too, that fit the start and not the refined locations, or the other way "
         "round.",
     ]
     num_put_back: Annotated[int, "Cameras that had left the scene and were put back."]
-    lud: Lud | None
+    lud: Annotated[Lud | None, "The second start; null if it was not solved."]
 
 
 class RotationRefinement(TypedDict):
     """What --refine-rotations changed."""
 
-    num_updated: int
-    num_kept: int
-    median_change_deg: float
-    max_change_deg: float
+    num_updated: Annotated[int, "Cameras that turned."]
+    num_kept: Annotated[int, "Cameras that keep the rotation of the input."]
+    median_change_deg: Annotated[float, "By how much those that turned did."]
+    max_change_deg: Annotated[float, "By how much the camera turned that did most."]
 
 
 class BundleAdjustment(TypedDict):
     """What --bundle-adjust reached; mean reprojection errors."""
 
-    converged: bool
-    iterations: int
-    initial_error_px: float
-    final_error_px: float
+    converged: Annotated[bool, "Whether the last round met its tolerance."]
+    iterations: Annotated[int, "Steps of all rounds together."]
+    initial_error_px: Annotated[float, "At the seed's poses."]
+    final_error_px: Annotated[float, "At the adjusted poses."]
 
 
 class RigidGroups(TypedDict):
     """Cameras that move together: frames of rigs, and fixed cameras."""
 
-    num_groups: int
-    num_placed: int
+    num_groups: Annotated[int, "Groups of the input."]
+    num_placed: Annotated[int, "Groups with a camera in the output."]
     num_fixed: Annotated[int, "Cameras that stay where the input has them."]
     num_inner_pairs: Annotated[int, "Pairs inside one group, which say nothing."]
 
@@ -117,113 +117,104 @@ class RigidGroups(TypedDict):
 class ModelInputs(TypedDict):
     """What `locate` worked from."""
 
-    model: str
-    database: str | None
+    model: Annotated[str, "The model's folder or file."]
+    database: Annotated[str | None, "The database whose matches were used, if any."]
     directions: Annotated[str, "Where the directions came from."]
 
 
-class LocateSummary(TypedDict):
-    """locate.json, and what `sfm-shapefit locate --json` prints."""
+class PlacementSummary(TypedDict):
+    """What stands in the locate.json of a model and of a bare graph."""
 
     schema_version: Version
-    inputs: ModelInputs
     options: Options
-    num_images: Annotated[int, "Of the input, posed or not."]
-    num_placed: int
-    not_trusted: Annotated[dict[str, str], "Images that are left out because they are not trusted, and why."]
+    num_images: Annotated[int, "Images of the input, posed or not; nodes of a bare graph."]
+    num_placed: Annotated[int, "Of these, how many are in the output."]
     num_pairs: Annotated[int, "Pairs that were looked at."]
     num_pairs_rejected: Annotated[
         int, "Pairs without a usable direction, and those that contradict the solution."
     ]
+    num_pairs_filtered: Annotated[int, "Pairs that --filter left out."]
+    residual_level_deg: Annotated[float, "Level of the agreeing pairs' residuals."]
+    residuals_deg: Residuals
+    loose_groups: Annotated[list[LooseGroup], "Groups of cameras that hang loose."]
+    pieces: Annotated[list[Piece], "Parallel-rigid pieces, most cameras first."]
+    solve: Annotated[Solve, "The certified solve."]
+    finish: Annotated[Finish, "What became of its optimum."]
+    timings_s: Timings
+    warnings: Warnings
+    versions: Versions
+
+
+class LocateSummary(PlacementSummary):
+    """locate.json, and what `sfm-shapefit locate --json` prints."""
+
+    inputs: Annotated[ModelInputs, "What was read."]
+    not_trusted: Annotated[dict[str, str], "Images that are left out because they are not trusted, and why."]
     pairs: Annotated[
         dict[str, int],
         "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",
     ]
-    num_points: int
-    mean_reprojection_error_px: float | None
+    num_points: Annotated[int, "Triangulated 3D points."]
+    mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
-    num_pairs_filtered: Annotated[int, "Pairs that --filter left out."]
-    residual_level_deg: Annotated[float, "Level of the agreeing pairs' residuals."]
-    residuals_deg: Residuals
-    loose_groups: list[LooseGroup]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
-    rigid_groups: RigidGroups | None
-    pieces: list[Piece]
-    solve: Solve
-    finish: Finish
-    rotation_refinement: RotationRefinement | None
-    bundle_adjustment: BundleAdjustment | None
-    timings_s: Timings
-    warnings: Warnings
-    versions: Versions
+    rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
+    rotation_refinement: Annotated[RotationRefinement | None, "Null if it was not asked for."]
+    bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
 
 
 class GraphInputs(TypedDict):
     """What `place` worked from."""
 
-    graph: str
+    graph: Annotated[str, "The file or folder of the graph."]
     directions: Annotated[str, "As given, or from which rotations."]
 
 
-class GraphSummary(TypedDict):
+class GraphSummary(PlacementSummary):
     """locate.json of a bare graph, and what `sfm-shapefit place --json` prints."""
 
-    schema_version: Version
-    inputs: GraphInputs
-    options: Options
+    inputs: Annotated[GraphInputs, "What was read."]
     dimension: Annotated[int, "Of the locations."]
-    num_images: Annotated[int, "Nodes of the graph."]
-    num_placed: int
-    num_pairs: Annotated[int, "Pairs that were looked at."]
-    num_pairs_rejected: Annotated[int, "Pairs that contradict the solution."]
-    num_pairs_filtered: Annotated[int, "Pairs that --filter left out."]
-    residual_level_deg: Annotated[float, "Level of the agreeing pairs' residuals."]
-    residuals_deg: Residuals
-    loose_groups: list[LooseGroup]
-    pieces: list[Piece]
-    solve: Solve
-    finish: Finish
-    timings_s: Timings
-    warnings: Warnings
-    versions: Versions
 
 
 class DatabaseInputs(TypedDict):
     """What `map` worked from."""
 
-    database: str
+    database: Annotated[str, "The database's path."]
 
 
 class Averaging(TypedDict):
     """How rotations were averaged, and how well they agree with the pairs."""
 
-    statement: str
-    num_registered: int
-    min_matches: int
-    loss: str
-    known_focal_lengths_only: bool
-    agreeing_share: float
-    num_tried: int
+    statement: Annotated[str, "How the rotations were found, in words."]
+    num_registered: Annotated[int, "Images that have a rotation."]
+    min_matches: Annotated[int, "Pairs with fewer matches were left out."]
+    loss: Annotated[str, "Of the residual angles."]
+    known_focal_lengths_only: Annotated[
+        bool, "Whether pairs that contradict known focal lengths were left out."
+    ]
+    agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
+    num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
 
 
 class Model(TypedDict):
     """One connected component of the images."""
 
-    folder: str
-    num_images: int
-    num_placed: int
-    averaging: Averaging
-    located: LocateSummary
+    folder: Annotated[str, "Where it stands in OUT."]
+    num_images: Annotated[int, "Images that have an averaged rotation."]
+    num_placed: Annotated[int, "Cameras in the output."]
+    averaging: Annotated[Averaging, "Where its rotations come from."]
+    located: Annotated[LocateSummary, "What stands in the model's own locate.json."]
 
 
 class MapSummary(TypedDict):
     """map.json, and what `sfm-shapefit map --json` prints."""
 
     schema_version: Version
-    inputs: DatabaseInputs
+    inputs: Annotated[DatabaseInputs, "What was read."]
     options: Options
-    num_images: int
-    num_placed: int
+    num_images: Annotated[int, "Images of the database."]
+    num_placed: Annotated[int, "Cameras in all models."]
     num_pairs: Annotated[int, "Pairs with a relative rotation."]
     models: Annotated[list[Model], "One per connected component, most cameras first."]
     left_out: Annotated[dict[str, str], "Images in no model, and why."]
@@ -235,45 +226,45 @@ class Expected(TypedDict):
     """The memory that `locate` will take."""
 
     memory_mb: Annotated[dict[str, float], "Peak of each stage in millions of bytes."]
-    peak_mb: float
+    peak_mb: Annotated[float, "The largest of these."]
 
 
 class InspectSummary(TypedDict):
     """What `sfm-shapefit inspect --json` prints."""
 
     directions: Annotated[str, "Where they come from, and why."]
-    num_images: int
+    num_images: Annotated[int, "Images or nodes of the input, with a rotation or without."]
     statuses: Annotated[dict[str, int], "Pairs by the sentence that says what became of them."]
     points: Annotated[str, "Whether 3D points join the graph, and why."]
-    diagnosis: Diagnosis
+    diagnosis: Annotated[Diagnosis, "What the view graph says before anything is solved."]
     theory: Annotated[dict[str, Any] | None, "Constants of the recovery theorems, if asked for."]
     expected: Annotated[Expected | None, "What locate will take; null for a bare graph."]
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
 
 
 class Alignment(TypedDict):
-    """The robust similarity of the centres."""
+    """The robust similarity of the centers: scale * rotation @ center + translation."""
 
-    scale: float
-    rotation: list[list[float]]
-    translation: list[float]
+    scale: Annotated[float, "The reference's units in one of the model."]
+    rotation: Annotated[list[list[float]], "3 rows."]
+    translation: Annotated[list[float], "In the reference's units."]
 
 
 class EvaluateSummary(TypedDict):
     """What `sfm-shapefit evaluate --json` prints."""
 
-    num_reference: int
-    num_model: int
-    num_common: int
-    num_missing: int
-    num_extra: int
-    missing: list[str]
-    extra: list[str]
+    num_reference: Annotated[int, "Cameras of the reference."]
+    num_model: Annotated[int, "Cameras of the model."]
+    num_common: Annotated[int, "Cameras of both, by name."]
+    num_missing: Annotated[int, "Cameras that the model lacks."]
+    num_extra: Annotated[int, "Cameras that the reference lacks."]
+    missing: Annotated[list[str], "Names of the cameras that the model lacks."]
+    extra: Annotated[list[str], "Names of the cameras that the reference lacks."]
     extent: Annotated[float, "Diagonal of the reference's cameras."]
     position_error: Annotated[ErrorSummary, "In the reference's units."]
-    rotation_error_deg: ErrorSummary
-    recall: list[Recall]
-    ref_from_model: Alignment
-    rotation_ref_from_model: list[list[float]]
-    degenerate: Annotated[bool, "Whether the centres lie on a line."]
+    rotation_error_deg: Annotated[ErrorSummary, "What remains after the best global rotation."]
+    recall: Annotated[list[Recall], "At shares of the extent, then at the thresholds that were asked for."]
+    ref_from_model: Annotated[Alignment, "From the model's world to the reference's."]
+    rotation_ref_from_model: Annotated[list[list[float]], "The rotations' own alignment, 3 rows."]
+    degenerate: Annotated[bool, "Whether the centers lie on a line."]
     warnings: Warnings

@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.options import MapOptions
-from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
+from sfm_shapefit.results.json_types import LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -62,7 +62,15 @@ class MapResult(Displayed):
                     "folder": str(number),
                     "num_images": len(model.names),
                     "num_placed": int(model.located.kept.sum()),
-                    "averaging": _summarize_averaging(model.averaging),
+                    "averaging": {
+                        "statement": model.averaging.statement,
+                        "num_registered": int(model.averaging.registered.sum()),
+                        "min_matches": model.averaging.min_matches,
+                        "loss": model.averaging.loss,
+                        "known_focal_lengths_only": model.averaging.sound_only,
+                        "agreeing_share": model.averaging.share,
+                        "num_tried": model.averaging.num_tried,
+                    },
                     "located": cast("LocateSummary", model.located.summary()),
                 }
                 for number, model in enumerate(self.models)
@@ -75,15 +83,3 @@ class MapResult(Displayed):
 
     def _headline(self) -> str:
         return f"{self.num_placed} of {self.num_images} images placed in {len(self.models)} models"
-
-
-def _summarize_averaging(averaging: AveragedRotations) -> Averaging:
-    return {
-        "statement": averaging.statement,
-        "num_registered": int(averaging.registered.sum()),
-        "min_matches": averaging.min_matches,
-        "loss": averaging.loss,
-        "known_focal_lengths_only": averaging.sound_only,
-        "agreeing_share": averaging.share,
-        "num_tried": averaging.num_tried,
-    }

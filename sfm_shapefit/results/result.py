@@ -66,7 +66,7 @@ class LocateResult(Displayed):
     gauge: Gauge
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
-    """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncoloured."""
+    """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
     warnings: tuple[str, ...]
@@ -125,7 +125,7 @@ class LocateResult(Displayed):
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
-        """Return the centres of images in the output that no pair placed: fixed ones, and rest of a frame."""
+        """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""
         ids = self.model.image_ids
         judged = set(self.placement.cameras[self.kept].tolist())
         return {
@@ -232,7 +232,7 @@ class GraphResult(Displayed):
 def _centers_of(
     reconstruction: "pycolmap.Reconstruction", image_ids: IntArray, kept: BoolArray
 ) -> FloatArray:
-    """Return the centres (k, 3) of images, NaN for those that are not kept."""
+    """Return the centers (k, 3) of images, NaN for those that are not kept."""
     centers = np.full((len(kept), 3), np.nan)
     centers[kept] = [reconstruction.image(i).projection_center() for i in image_ids[kept].tolist()]
     return centers

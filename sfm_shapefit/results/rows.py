@@ -10,7 +10,8 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import Placement, count_large
-from sfm_shapefit.results.tables import CameraRow, PairRow, PieceRow
+from sfm_shapefit.results.json_types import Piece
+from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import left_out_reasons
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -32,15 +33,28 @@ def camera_rows(
 
     Args:
         placement: the graph and its solution.
-        centers: (k, d) centres of the placed cameras in the output's units; NaN for those that are left out
+        centers: (k, d) centers of the placed cameras in the output's units; NaN for those that are left out
             because they are not trusted.
         scale: the output's units in one unit of the solver.
         further: the other pieces that are solved; the rows of their cameras say where they stand.
         axes: (d, d) rotation from the input's axes to the output's; the same if None.
     """
     graph = placement.graph
-    homes = _home_pieces(placement)
-    reasons = _with_folders(left_out_reasons(placement.considered, placement.pieces), further)
+    # Each camera's home is the first piece of three cameras or more that holds it, or the largest.
+    homes: list[int | None] = [None] * graph.num_nodes
+    for k in reversed(range(max(count_large(placement.pieces, placement.num_cameras), 1))):
+        for camera in placement.pieces[k].nodes.tolist():
+            homes[camera] = k
+    reasons = left_out_reasons(placement.considered, placement.pieces)
+    folders: dict[int, list[str]] = {}
+    for piece in further:
+        for camera in piece.cameras.tolist():
+            folders.setdefault(camera, []).append(folder_of(piece.piece))
+    reasons |= {
+        camera: f"{reasons[camera]}; see {', '.join(names)}"
+        for camera, names in folders.items()
+        if camera in reasons
+    }
     degrees = np.bincount(graph.edges[: placement.num_pairs].ravel(), minlength=placement.num_cameras)
     rows = [
         CameraRow(
@@ -139,8 +153,8 @@ def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placeme
     return rows
 
 
-def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[PieceRow]:
-    """Return one row per parallel-rigid piece of three cameras or more, and for the largest.
+def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> list[Piece]:
+    """Return what locate.json says of each parallel-rigid piece of three cameras or more, and of the largest.
 
     Args:
         placement: the graph and its largest piece.
@@ -148,18 +162,18 @@ def piece_rows(placement: Placement, solved: Sequence[tuple[int, str, int]]) -> 
     """
     facts = {number: (scale, num_placed) for number, scale, num_placed in solved}
     large = max(count_large(placement.pieces, placement.num_cameras), 1)
-    rows = []
+    rows: list[Piece] = []
     for k, piece in enumerate(placement.pieces[:large]):
         scale, num_placed = facts.get(k, (_NOT_SOLVED, 0))
         hinges = piece.hinges[piece.hinges < placement.num_cameras]
         rows.append(
-            PieceRow(
-                num_cameras=int(np.sum(piece.nodes < placement.num_cameras)),
-                scale=scale,
-                hinges=[placement.graph.name_of(hinge) for hinge in hinges.tolist()],
-                folder=folder_of(k) if k in facts else "",
-                num_placed=num_placed,
-            )
+            {
+                "num_cameras": int(np.sum(piece.nodes < placement.num_cameras)),
+                "scale": scale,
+                "hinges": [placement.graph.name_of(hinge) for hinge in hinges.tolist()],
+                "folder": folder_of(k) if k in facts else "",
+                "num_placed": num_placed,
+            }
         )
     return rows
 
@@ -182,25 +196,3 @@ def without_direction(directions: PairDirections, graph: ViewGraph) -> dict[int,
 def folder_of(piece: int) -> str:
     """Return where a piece stands in the output."""
     return f"pieces/{piece}" if piece else "."
-
-
-def _with_folders(reasons: dict[int, str], further: Sequence[Placement]) -> dict[int, str]:
-    """Add to the reason for which a camera is left out in which further pieces it stands."""
-    homes: dict[int, list[str]] = {}
-    for placement in further:
-        for camera in placement.cameras.tolist():
-            homes.setdefault(camera, []).append(folder_of(placement.piece))
-    return {
-        camera: f"{reason}; see {', '.join(homes[camera])}" if camera in homes else reason
-        for camera, reason in reasons.items()
-    }
-
-
-def _home_pieces(placement: Placement) -> list[int | None]:
-    """Return the first piece of three cameras or more that holds each camera, or the largest."""
-    homes: list[int | None] = [None] * placement.graph.num_nodes
-    large = max(count_large(placement.pieces, placement.num_cameras), 1)
-    for k in reversed(range(large)):
-        for camera in placement.pieces[k].nodes.tolist():
-            homes[camera] = k
-    return homes

@@ -54,8 +54,7 @@ def _schema_of(kind: Any, definitions: dict[str, Any], names: dict[Any, str]) ->
             definitions[name] = {}
             hints = get_type_hints(kind, include_extras=True)
             if is_dataclass(kind):
-                # The number may not be finite, and stands as null then.
-                hints = {key: float | None if hint is float else hint for key, hint in hints.items()}
+                hints = {key: _or_null(hint) for key, hint in hints.items()}
             definitions[name] |= {
                 "type": "object",
                 "description": (kind.__doc__ or "").split("\n")[0],
@@ -73,6 +72,13 @@ def _schema_of(kind: Any, definitions: dict[str, Any], names: dict[Any, str]) ->
         if get_origin(kind) is not Literal and one is not ...
     ]
     return _plain_schema_of(kind, inner)
+
+
+def _or_null(hint: Any) -> Any:
+    """Return the type of a field, where a number may be not finite, and stands as null then."""
+    if get_origin(hint) is Annotated:
+        return Annotated[_or_null(hint.__origin__), *hint.__metadata__]
+    return float | None if hint is float else hint
 
 
 def _plain_schema_of(kind: Any, inner: list[dict[str, Any]]) -> dict[str, Any]:

@@ -7,13 +7,14 @@ columns and keys may be added, never renamed.
 import csv
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.lines import refuse_irregular_file
 from sfm_shapefit.judgement.verdicts import Verdict
 
 SCHEMA_VERSION: Literal[1] = 1
@@ -33,7 +34,7 @@ class CameraRow:
     """The parallel-rigid piece it belongs to, 0 the largest, which is the output; N stands in pieces/N with
     a scale of its own. None outside every piece of 3 cameras."""
     center: tuple[float, ...] = ()
-    """Centre in the output's units, d numbers; empty when not placed. Columns x, y, z."""
+    """Center in the output's units, d numbers; empty when not placed. Columns x, y, z."""
     degree: int = 0
     """Number of its pairs with a usable direction."""
     trust: float = math.nan
@@ -41,7 +42,7 @@ class CameraRow:
     agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
     `judgement.trust`."""
     sigma: tuple[float, ...] = ()
-    """Standard deviation of the solved centre, in the output's units, with centroid and scale held fixed.
+    """Standard deviation of the solved center, in the output's units, with centroid and scale held fixed.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
 
 
@@ -69,20 +70,17 @@ class PairRow:
     """Why it is undetermined."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PieceRow:
-    """A parallel-rigid piece of three cameras or more."""
-
-    num_cameras: int
-    scale: str
-    """The gauge of a solved piece; pieces that the solver refuses have none."""
-    hinges: list[str]
-    """Names of the cameras that it shares with other pieces."""
-    folder: str
-    """Where it stands in the output: "." for the largest piece, "pieces/1" and so on; empty if it is not
-    solved."""
-    num_placed: int
-    """Cameras of it that are in the output; the others are not trusted."""
+Row = TypeVar("Row", CameraRow, PairRow)
+_PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v"}
+"""Of the columns of a vector, one per axis."""
+_PARSERS: dict[Any, Callable[[str], Any]] = {
+    str: str.__str__,
+    bool: "true".__eq__,
+    int: int,
+    float: lambda cell: float(cell or "nan"),
+    int | None: lambda cell: int(cell) if cell else None,
+}
+"""How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
 
 
 def write_rows(
@@ -90,11 +88,7 @@ def write_rows(
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
     axes = axis_names(dimension)
-    per_axis = {
-        "center": axes,
-        "sigma": [f"sigma_{axis}" for axis in axes],
-        "direction": [f"v{axis}" for axis in axes],
-    }
+    per_axis = {name: [prefix + axis for axis in axes] for name, prefix in _PREFIXES.items()}
     names = [field.name for field in fields(row_type)]
     values_of, nothing = attrgetter(*names), ("",) * dimension
     is_vector = [name in per_axis for name in names]
@@ -112,17 +106,36 @@ def write_rows(
     _write_csv(columns, map(cells, rows), path)
 
 
+def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
+    """Return the rows that `write_rows` wrote.
+
+    Raises:
+        InputError: if it is no ordinary file.
+        OSError, ValueError, KeyError, TypeError: if it cannot be read, or a cell is not as it should be.
+    """
+    refuse_irregular_file(path)
+    axes = axis_names(dimension)
+
+    def value(cells: dict[str, str], name: str, kind: Any) -> Any:
+        if name not in _PREFIXES:
+            return _PARSERS[kind](cells[name])
+        numbers = [cells[_PREFIXES[name] + axis] for axis in axes]
+        return tuple(map(float, numbers)) if all(numbers) else ()
+
+    with path.open(newline="", encoding="utf-8") as stream:
+        return [
+            row_type(**{item.name: value(cells, item.name, item.type) for item in fields(row_type)})
+            for cells in csv.DictReader(stream)
+        ]
+
+
 def axis_names(dimension: int) -> list[str]:
     """Return x, y, z up to three dimensions, and x1, x2, ... beyond."""
     return list("xyz"[:dimension]) if dimension <= len("xyz") else [f"x{k + 1}" for k in range(dimension)]
 
 
 def write_records(records: Sequence[Mapping[str, object]], path: Path) -> None:
-    """Write records as CSV; numbers round-trip, NaN and None are empty fields.
-
-    Args:
-        records: one mapping per row, at least one; the columns are those of the first.
-        path: the file.
+    """Write records as CSV, at least one; numbers round-trip, NaN and None are empty fields.
 
     Raises:
         InputError: if the file cannot be written.

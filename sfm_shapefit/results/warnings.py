@@ -9,7 +9,6 @@ from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionSta
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
-from sfm_shapefit.refinement.starts import RefinedPlacement
 from sfm_shapefit.solver.options import Status
 
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
@@ -38,25 +37,20 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     level = placement.assessment.level_deg
     if level > _ALARMING_LEVEL_DEG:
         yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
-    yield from _collapse(placement.refined)
+    refined = placement.refined
+    if refined.collapsed:
+        assert refined.disagreement is not None
+        yield (
+            f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long "
+            f"chains and under heavy corruption; kept: {refined.start}"
+            + ("" if refined.is_refined else ", unrefined; --objective auto refines both and compares")
+        )
     yield from _uncertain_cameras(placement)
     share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
     if share > _ALARMING_SHARE:
         yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
     if placement.second_configuration is not None:
         yield placement.second_configuration.statement()
-
-
-def _collapse(refined: RefinedPlacement) -> Iterator[str]:
-    """Yield a warning where the two convex programs disagree about lengths."""
-    if not refined.collapsed:
-        return
-    assert refined.disagreement is not None
-    yield (
-        f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long chains "
-        f"and under heavy corruption; kept: {refined.start}"
-        + ("" if refined.is_refined else ", unrefined; --objective auto refines both and compares")
-    )
 
 
 def _uncertain_cameras(placement: Placement) -> Iterator[str]:
@@ -89,7 +83,7 @@ def match_warnings(directions: PairDirections) -> Iterator[str]:
         yield (
             f"the matches of {twofold} pairs agree on two directions each, those of {usable} on one: things "
             "move, or a facade repeats, which may shift whole groups of cameras by its period and leave no "
-            "contradiction behind; compare images of neighbouring cameras before trusting them"
+            "contradiction behind; compare images of neighboring cameras before trusting them"
         )
     against = sum(counts.get(status, 0) for status in CONTRADICTIONS)
     if against > _ALARMING_SHARE * len(directions.pairs):

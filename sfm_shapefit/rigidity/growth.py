@@ -10,6 +10,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.operators import group_by
 
 # A later round rarely unites anything; the pebble game is exact anyway.
 _GROWTH_ROUNDS = 4
@@ -58,20 +59,11 @@ def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
         degree[edges[e, 0]] += 1
         degree[edges[e, 1]] += 1
     tail = np.empty(m, np.int64)
-    start = np.zeros(num_nodes + 1, np.int64)
     for e in range(m):
         i, j = edges[e, 0], edges[e, 1]
         tail[e] = i if (degree[i], i) < (degree[j], j) else j
-        start[tail[e] + 1] += 1
-    start = np.cumsum(start)
-    fill = start[:-1].copy()
-    edge_of = np.empty(m, np.int64)
-    head_of = np.empty(m, np.int64)
-    for e in range(m):
-        slot = fill[tail[e]]
-        fill[tail[e]] += 1
-        edge_of[slot] = e
-        head_of[slot] = edges[e, 0] + edges[e, 1] - tail[e]
+    start, edge_of = group_by(tail, num_nodes)
+    head_of = (edges[:, 0] + edges[:, 1] - tail)[edge_of]
 
     parent = np.arange(m)
     seen_from = np.full(num_nodes, -1, np.int64)
@@ -98,19 +90,9 @@ def incidence(
 ) -> tuple[IntArray, IntArray, IntArray, IntArray]:
     """Return which nodes each set has, and which sets each node, as two (start, items) lists."""
     m = len(edges)
-    edge_start = np.zeros(num_sets + 1, np.int64)
-    for e in range(m):
-        edge_start[set_of[e] + 1] += 1
-    edge_start = np.cumsum(edge_start)
-    fill = edge_start[:-1].copy()
-    edge_of = np.empty(m, np.int64)
-    for e in range(m):
-        edge_of[fill[set_of[e]]] = e
-        fill[set_of[e]] += 1
-
+    edge_start, edge_of = group_by(set_of, num_sets)
     start = np.zeros(num_sets + 1, np.int64)
-    nodes = np.empty(2 * m, np.int64)
-    back_start = np.zeros(num_nodes + 1, np.int64)
+    nodes, owner = np.empty(2 * m, np.int64), np.empty(2 * m, np.int64)
     last = np.full(num_nodes, -1, np.int64)
     count = 0
     for b in range(num_sets):
@@ -119,18 +101,11 @@ def incidence(
                 node = edges[edge_of[s], side]
                 if last[node] != b:
                     last[node] = b
-                    nodes[count] = node
-                    back_start[node + 1] += 1
+                    nodes[count], owner[count] = node, b
                     count += 1
         start[b + 1] = count
-    back_start = np.cumsum(back_start)
-    fill = back_start[:-1].copy()
-    rigid_sets = np.empty(count, np.int64)
-    for b in range(num_sets):
-        for s in range(start[b], start[b + 1]):
-            rigid_sets[fill[nodes[s]]] = b
-            fill[nodes[s]] += 1
-    return start, nodes[:count].copy(), back_start, rigid_sets
+    back_start, entries = group_by(nodes[:count], num_nodes)
+    return start, nodes[:count].copy(), back_start, owner[entries]
 
 
 def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:

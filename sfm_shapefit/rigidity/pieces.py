@@ -8,7 +8,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.laplacian.operators import Int32Array, adjacency
+from sfm_shapefit.laplacian.operators import Int32Array, adjacency, check_edges
 from sfm_shapefit.rigidity.game import contract, play
 from sfm_shapefit.rigidity.growth import compact, grow_sets, incidence, triangle_sets
 from sfm_shapefit.viewgraph import ViewGraph
@@ -156,16 +156,7 @@ def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
     """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
-    checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
-    outside = ((checked < 0) | (checked >= num_nodes)).any(axis=1)
-    bad = outside | (checked[:, 0] == checked[:, 1])
-    if bad.any():
-        index = int(np.argmax(bad))
-        raise InputError(
-            f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different cameras "
-            f"of 0..{num_nodes - 1}"
-        )
-    return checked
+    return check_edges(num_nodes, edges)
 
 
 def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:

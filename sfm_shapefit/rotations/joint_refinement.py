@@ -22,18 +22,19 @@ Levenberg-Marquardt with robust weights: Triggs et al., "Bundle Adjustment - A M
 section 6; Cauchy weights: Zhang, "Parameter estimation techniques", IVC 1997, table 1.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import bsr_array
 from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.directions.kernels import cross
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.laplacian.dense import one_blas_thread
+from sfm_shapefit.laplacian.operators import block_matrix
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
 
 _STEPS = 12
@@ -65,49 +66,6 @@ class State(NamedTuple):
 
 
 @kernel(exact=True)
-def _add_pair(
-    a: FloatArray,
-    b: FloatArray,
-    turn_i: FloatArray,
-    turn_j: FloatArray,
-    baseline: FloatArray,
-    pixel_angle: float,
-    scale_px: float,
-    matrix: FloatArray,
-    vector: FloatArray,
-) -> float:
-    """Add a pair's matches to its normal matrix (9, 9) and gradient (9,); return the sum of Cauchy losses."""
-    length = np.sqrt(baseline[0] ** 2 + baseline[1] ** 2 + baseline[2] ** 2)
-    d = baseline / max(length, 1e-300)
-    jacobian, p, q, work = np.empty(9), np.empty(3), np.empty(3), np.empty((3, 3))
-    cost = 0.0
-    for k in range(len(a)):
-        for c in range(3):
-            p[c] = turn_i[c, 0] * a[k, 0] + turn_i[c, 1] * a[k, 1] + turn_i[c, 2] * a[k, 2]
-            q[c] = turn_j[c, 0] * b[k, 0] + turn_j[c, 1] * b[k, 1] + turn_j[c, 2] * b[k, 2]
-        residual = _residual_and_gradient(p, q, d, length, pixel_angle, jacobian, work)
-        loss = 1.0 + (residual / scale_px) ** 2
-        cost += 0.5 * scale_px**2 * np.log(loss)
-        for row in range(9):
-            weighted = jacobian[row] / loss
-            vector[row] += weighted * residual
-            for column in range(row + 1):
-                matrix[row, column] += weighted * jacobian[column]
-    for row in range(9):
-        for column in range(row):
-            matrix[column, row] = matrix[row, column]
-    return cost
-
-
-@kernel(exact=True)
-def _cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with a x b."""
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@kernel(exact=True)
 def _residual_and_gradient(
     p: FloatArray,
     q: FloatArray,
@@ -122,13 +80,13 @@ def _residual_and_gradient(
     along_q = q[0] * d[0] + q[1] * d[1] + q[2] * d[2]
     square = max(2.0 - along_p * along_p - along_q * along_q, 1e-12)
     normal, q_d, d_p = work[0], work[1], work[2]
-    _cross(p, q, normal)
-    _cross(q, d, q_d)
-    _cross(d, p, d_p)
+    cross(p, q, normal)
+    cross(q, d, q_d)
+    cross(d, p, d_p)
     value = normal[0] * d[0] + normal[1] * d[1] + normal[2] * d[2]
     ratio, size = value / square, 1.0 / (pixel_angle * np.sqrt(square))
-    _cross(p, q_d, jacobian[0:3])
-    _cross(q, d_p, jacobian[3:6])
+    cross(p, q_d, jacobian[0:3])
+    cross(q, d_p, jacobian[3:6])
     for c in range(3):
         jacobian[c] = size * (jacobian[c] - ratio * along_p * d_p[c])
         jacobian[3 + c] = size * (jacobian[3 + c] + ratio * along_q * q_d[c])
@@ -149,24 +107,33 @@ def _add_pairs(
     baselines: FloatArray,
     pixel_angles: FloatArray,
     scale_px: float,
-    matrices: FloatArray,
-    vectors: FloatArray,
-    costs: FloatArray,
+    found: Any,
 ) -> None:
-    """Fill the (k, 9, 9) normal matrices, (k, 9) gradients and (k,) costs of all pairs."""
-    for p in range(len(baselines)):
-        first, last = offsets[p], offsets[p + 1]
-        costs[p] = _add_pair(
-            rays_i[first:last],
-            rays_j[first:last],
-            turns_i[p],
-            turns_j[p],
-            baselines[p],
-            pixel_angles[p],
-            scale_px,
-            matrices[p],
-            vectors[p],
-        )
+    """Fill the `NormalEquations` of all pairs, which hold zeros."""
+    jacobian, p, q, work = np.empty(9), np.empty(3), np.empty(3), np.empty((3, 3))
+    for pair in range(len(baselines)):
+        baseline, turn_i, turn_j = baselines[pair], turns_i[pair], turns_j[pair]
+        matrix, vector = found.matrices[pair], found.vectors[pair]
+        length = np.sqrt(baseline[0] ** 2 + baseline[1] ** 2 + baseline[2] ** 2)
+        d = baseline / max(length, 1e-300)
+        cost = 0.0
+        for k in range(offsets[pair], offsets[pair + 1]):
+            a, b = rays_i[k], rays_j[k]
+            for c in range(3):
+                p[c] = turn_i[c, 0] * a[0] + turn_i[c, 1] * a[1] + turn_i[c, 2] * a[2]
+                q[c] = turn_j[c, 0] * b[0] + turn_j[c, 1] * b[1] + turn_j[c, 2] * b[2]
+            residual = _residual_and_gradient(p, q, d, length, pixel_angles[pair], jacobian, work)
+            loss = 1.0 + (residual / scale_px) ** 2
+            cost += 0.5 * scale_px**2 * np.log(loss)
+            for row in range(9):
+                weighted = jacobian[row] / loss
+                vector[row] += weighted * residual
+                for column in range(row + 1):
+                    matrix[row, column] += weighted * jacobian[column]
+        for row in range(9):
+            for column in range(row):
+                matrix[column, row] = matrix[row, column]
+        found.costs[pair] = cost
 
 
 class NormalEquations(NamedTuple):
@@ -195,7 +162,7 @@ def normal_equations(
     found = NormalEquations(np.zeros((k, 9, 9)), np.zeros((k, 9)), np.zeros(k))
     turns_i, turns_j, baselines = map(np.ascontiguousarray, (*turns, baselines))
     rays = matches.offsets, matches.rays_i, matches.rays_j
-    _add_pairs(*rays, turns_i, turns_j, baselines, matches.pixel_angles, scale_px, *found)
+    _add_pairs(*rays, turns_i, turns_j, baselines, matches.pixel_angles, scale_px, found)
     return found
 
 
@@ -297,12 +264,7 @@ def _step(system: Blocks, pairs: IntArray, free: BoolArray, damping: float) -> F
 
 def _solve_blocks(diagonal: FloatArray, coupling: FloatArray, pairs: IntArray, rhs: FloatArray) -> FloatArray:
     """Solve the symmetric positive definite block system; right-hand side and answer (n, 6)."""
-    n, (i, j) = len(diagonal), pairs.T
-    rows, columns = np.concatenate([i, j, np.arange(n)]), np.concatenate([j, i, np.arange(n)])
-    blocks = np.concatenate([coupling, coupling.transpose(0, 2, 1), diagonal])
-    order = np.lexsort((columns, rows))
-    pointers = np.searchsorted(rows[order], np.arange(n + 1))
-    matrix = bsr_array((blocks[order], columns[order], pointers), shape=(6 * n, 6 * n))
+    n, matrix = len(diagonal), block_matrix(diagonal, coupling, pairs)
     with one_blas_thread():
         if 6 * n <= _DENSE_UNKNOWNS:
             return np.asarray(cho_solve(cho_factor(matrix.toarray()), rhs.ravel())).reshape(n, 6)

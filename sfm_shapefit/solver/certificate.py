@@ -254,8 +254,7 @@ class _Repair(NamedTuple):
             return lambda: _apply(self.metric, cuts[k], cuts[k + 1], x, self.parts[k])
 
         self.workers.run([job(k) for k in range(blocks)])
-        total: FloatArray = self.parts.sum(axis=0)
-        return total
+        return np.asarray(self.parts.sum(axis=0))
 
 
 def _repair(graph: ViewGraph, t: FloatArray, y: FloatArray, resources: Resources) -> _Repair:

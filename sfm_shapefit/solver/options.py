@@ -101,7 +101,7 @@ class SolverOptions(Settings):
     )
     uniqueness: bool = option(
         True,
-        "Also examine whether the certificate proves the optimum unique; costs one sparse factorisation.",
+        "Also examine whether the certificate proves the optimum unique; costs one sparse factorization.",
     )
     factor_memory_mb: int = option(
         2000,
@@ -167,18 +167,9 @@ class SolverResult(Displayed):
 
     def summary(self) -> dict[str, Any]:
         """Return the `solve` object of locate.json."""
-        return {
-            "status": self.status.name.lower(),
-            "objective": self.objective,
-            "dual_bound": self.dual_bound,
-            "gap": self.gap,
-            "equality_residual": self.equality_residual,
-            "unique": self.unique,
-            "iterations": self.iterations,
-            "seconds": self.seconds,
-            "method": self.method,
-            "method_reason": self.method_reason,
-        }
+        figures = ("objective", "dual_bound", "gap", "equality_residual", "unique", "iterations", "seconds")
+        found = {name: getattr(self, name) for name in (*figures, "method", "method_reason")}
+        return {"status": self.status.name.lower(), **found}
 
     def _headline(self) -> str:
         found = f"{len(self.locations)} locations, {self.status.name.lower()}, objective {self.objective:.6g}"

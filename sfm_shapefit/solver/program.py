@@ -43,8 +43,7 @@ def adjoint(y: FloatArray, edges: IntArray, num_nodes: int) -> FloatArray:
 
 def along(x: FloatArray, v: FloatArray) -> FloatArray:
     """Return <x_e, v_e> for every edge, shape (m,)."""
-    lengths: FloatArray = np.einsum("ed,ed->e", x, v)
-    return lengths
+    return np.asarray(np.einsum("ed,ed->e", x, v))
 
 
 def across(x: FloatArray, v: FloatArray) -> FloatArray:
@@ -59,9 +58,7 @@ def across(x: FloatArray, v: FloatArray) -> FloatArray:
 
 def scale_functional(graph: ViewGraph) -> FloatArray:
     """Return c = D^T (w v), so that L(T) = <c, T>, shape (n, d)."""
-    total = np.zeros((graph.num_nodes, graph.dimension))
-    _add_scale(graph.edges, graph.directions, graph.weights, total)
-    return total
+    return adjoint(graph.weights[:, None] * graph.directions, graph.edges, graph.num_nodes)
 
 
 def projected_length(graph: ViewGraph, t: FloatArray) -> float:
@@ -101,14 +98,6 @@ def _add_adjoint(y: Any, edges: Any, out: Any) -> None:
         for k in range(y.shape[1]):
             out[edges[e, 0], k] += y[e, k]
             out[edges[e, 1], k] -= y[e, k]
-
-
-@kernel(exact=True)
-def _add_scale(edges: Any, v: Any, w: Any, out: Any) -> None:
-    for e in range(len(edges)):
-        for k in range(v.shape[1]):
-            out[edges[e, 0], k] += w[e] * v[e, k]
-            out[edges[e, 1], k] -= w[e] * v[e, k]
 
 
 @kernel(exact=True)

@@ -45,7 +45,8 @@ class Choice(NamedTuple):
     """A method and the reason for it."""
 
     method: str
-    run: Callable[..., Run]
+    solve: Callable[[ViewGraph, float, int, OnIteration | None], tuple[Any, ...]]
+    """Takes the graph, the tolerance, the limit of iterations and a callback; returns what makes a `Run`."""
     reason: str
 
 
@@ -106,7 +107,7 @@ def run_choice(
     """
     limit = options.max_iterations or _ITERATION_LIMITS[choice.method]
     watch = Watch(on_iteration, limit=limit)
-    run = choice.run(graph, options, limit, watch if on_iteration else None)
+    run = Run(*choice.solve(graph, options.tol, limit, watch if on_iteration else None))
     locations = normalize_locations(graph, run.locations)
     certificate = prove(locations, run.dual)
     status = Status.MAX_ITERATIONS if run.iterations >= limit else Status.INACCURATE
@@ -133,9 +134,10 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     """Pick the solver by the size of the problem and the predicted fill of its factor, without solving."""
     asked = options.solver != "auto"
     if options.solver == "conic":
-        return Choice("conic", _run_conic, "asked for")
+        return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit), "asked for")
+    resources = Resources(options.num_threads(), options.factor_memory_mb * 1_000_000)
     if options.solver == "admm":
-        return Choice("admm", partial(_run_admm, None), "asked for")
+        return Choice("admm", partial(_split, resources, None), "asked for")
     predict = cache(partial(predict_factor, graph))
 
     def flops() -> float:
@@ -144,40 +146,28 @@ def choose_method(graph: ViewGraph, options: SolverOptions) -> Choice:
     if prefers_dense_factor(graph, flops):
         unknowns = graph.num_nodes * graph.dimension
         reason = f"{unknowns} unknowns{': dense' if unknowns <= FEW_UNKNOWNS else ', dense graph'}"
-        return Choice("newton", _run_dense, "asked for" if asked else reason)
+        return Choice("newton", solve_newton_dense, "asked for" if asked else reason)
     predicted = "no order would keep a factor sparse"
     if flops() < np.inf:
         predicted = f"{flops() / 1e9:.2g} Gflop for a sparse factor"
     if asked or flops() <= _LARGEST_NEWTON_FLOPS:
-        return Choice("newton", partial(_run_sparse, predict()), "asked for" if asked else predicted)
-    return Choice("admm", partial(_run_admm, predict()), f"{predicted}: splitting is faster")
+        sparse = partial(solve_newton_sparse, plan=predict().tree)
+        return Choice("newton", sparse, "asked for" if asked else predicted)
+    return Choice("admm", partial(_split, resources, predict()), f"{predicted}: splitting is faster")
 
 
-def _run_dense(graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None) -> Run:
-    return Run(*solve_newton_dense(graph, options.tol, limit, watch))
-
-
-def _run_sparse(
-    prediction: Prediction, graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None
-) -> Run:
-    return Run(*solve_newton_sparse(graph, options.tol, limit, watch, plan=prediction.tree))
-
-
-def _run_admm(
+def _split(
+    resources: Resources,
     prediction: Prediction | None,
     graph: ViewGraph,
-    options: SolverOptions,
+    tol: float,
     limit: int,
     watch: OnIteration | None,
 ) -> Run:
-    resources = Resources(options.num_threads(), options.factor_memory_mb * 1_000_000)
-    found = solve_hybrid(graph, options.tol, limit, resources, prediction, watch)
+    """Solve by splitting, and say how it ended."""
+    found = solve_hybrid(graph, tol, limit, resources, prediction, watch)
     note = "" if found.stop is HybridStop.CERTIFIED else found.stop.value
     return Run(found.locations, found.certificate.dual, found.iterations, note)
-
-
-def _run_conic(graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None) -> Run:
-    return Run(*solve_conic(graph, options.tol, limit))
 
 
 def _refuse_undetermined(graph: ViewGraph) -> None:

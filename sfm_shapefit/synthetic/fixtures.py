@@ -56,13 +56,7 @@ from sfm_shapefit.arrays import FloatArray
 if TYPE_CHECKING:
     import pycolmap
 
-    from sfm_shapefit.synthetic import (
-        GraphProblem,
-        RenderedScene,
-        Scene,
-        StreetProblem,
-        WorkspaceOptions,
-    )
+    from sfm_shapefit.synthetic import GraphProblem, RenderedScene, Scene, StreetProblem, WorkspaceOptions
 
 __all__ = ["assert_locations_near", "assert_reconstruction_near"]
 

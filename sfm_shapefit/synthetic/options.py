@@ -56,7 +56,7 @@ class SceneOptions(Settings):
     image_width: int = option(1200, "In pixels.")
     image_height: int = option(900, "In pixels.")
     focal_length_px: float = option(
-        1000.0, "One for both axes; the principal point is the centre of the image."
+        1000.0, "One for both axes; the principal point is the center of the image."
     )
     seed: int = option(0, "Decides every random draw.")
 
@@ -110,7 +110,7 @@ class RenderOptions(Settings):
         -0.05, "First radial distortion coefficient of the lens, as OpenCV and COLMAP define it."
     )
     radial_k2: float = option(0.01, "Second radial distortion coefficient.")
-    gray_noise: float = option(2.0, "Standard deviation of the sensor's noise, in grey levels of 255.")
+    gray_noise: float = option(2.0, "Standard deviation of the sensor's noise, in gray levels of 255.")
     exposure_spread: float = option(0.05, "Standard deviation of the brightness factor from image to image.")
     jpeg_quality: int = option(92, "Of the image files, 1 to 100.")
 
@@ -131,7 +131,7 @@ class WorkspaceOptions(Settings):
     model: ModelContent = option(
         "full",
         'What sparse/0 states: "full" is poses and points with their tracks; "rotations" keeps the '
-        "rotations only, as from an inertial sensor: all centres at the origin, no points.",
+        "rotations only, as from an inertial sensor: all centers at the origin, no points.",
     )
     database: bool = option(
         True, "Write database.db; without it the model's own tracks are the only source of directions."

@@ -8,7 +8,7 @@
 Nothing about keypoints and matches is made up: they err, miss and mistake one house for another as they do
 for photographs. What is known is the truth: the surface point under every keypoint, and so of every match
 whether it is right (`judge_matches`). The points of the exact model are those surface points, joined along
-right matches. On the CPU and with a seed, all of it is the same on every run and for any number of threads.
+right matches. On the CPU and with a seed, all of it is the same on every run, byte by byte.
 """
 
 from pathlib import Path
@@ -33,6 +33,14 @@ from sfm_shapefit.viewgraph import connected_components
 # A right match is off by no more: this is COLMAP's own limit for inliers.
 _LARGEST_ERROR_PX = 4.0
 _POINT_GRAY = 160
+_NO_MATCHES = MatchBatch(
+    pairs=np.empty((0, 2), dtype=np.int64),
+    offsets=np.zeros(1, dtype=np.int64),
+    keypoints=np.empty((0, 2), dtype=np.int64),
+    rays_i=np.empty((0, 3)),
+    rays_j=np.empty((0, 3)),
+    pixel_angles=np.empty(0),
+)
 
 
 class JudgedMatches(NamedTuple):
@@ -92,7 +100,8 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
     """
     with open_database(database, read_model(_parts(scene, None).model(scene.rotations))) as opened:
         keypoints = [opened.keypoints(k) for k in range(scene.num_images)]
-        joined = _join(list(opened.iter_matches(min_matches)))
+        batches = opened.iter_matches(min_matches, max_matches_per_batch=opened.num_matches)
+        joined = next(batches, _NO_MATCHES)
     surface = [surface_points(scene, k, xy) for k, xy in enumerate(keypoints)]
     is_right = np.zeros(len(joined.keypoints), dtype=np.bool_)
     wrong = np.zeros(len(joined.pairs), dtype=np.bool_)
@@ -106,24 +115,6 @@ def judge_matches(scene: RenderedScene, database: Path, min_matches: int = 1) ->
         is_right[rows] = errors < _LARGEST_ERROR_PX
         wrong[e] = 2 * is_right[rows].sum() < len(a)
     return JudgedMatches(keypoints, surface, joined, is_right, wrong)
-
-
-def _join(batches: list[MatchBatch]) -> MatchBatch:
-    """Return batches as one."""
-
-    def joined(name: str, empty: np.ndarray) -> np.ndarray:
-        return np.concatenate([empty, *(getattr(batch, name) for batch in batches)])
-
-    no_pair, no_ray = np.empty((0, 2), dtype=np.int64), np.empty((0, 3))
-    counts = [np.diff(batch.offsets) for batch in batches]
-    return MatchBatch(
-        pairs=joined("pairs", no_pair),
-        offsets=np.cumsum(np.concatenate([[0], *counts]), dtype=np.int64),
-        keypoints=joined("keypoints", no_pair),
-        rays_i=joined("rays_i", no_ray),
-        rays_j=joined("rays_j", no_ray),
-        pixel_angles=joined("pixel_angles", np.empty(0)),
-    )
 
 
 def _transfer_error_px(scene: RenderedScene, image: int, points: FloatArray, xy: FloatArray) -> FloatArray:
@@ -144,6 +135,8 @@ def _match_images(scene: RenderedScene, workspace: Path, *, relative_poses: bool
     reader.camera_params = ",".join(repr(value) for value in _camera(scene).params.tolist())
     extraction = pycolmap.FeatureExtractionOptions()
     extraction.sift.max_num_features = scene.options.max_keypoints_per_image
+    # Images get their ids in the order in which threads finish; one thread keeps that of their names.
+    extraction.num_threads = 1
     verification = pycolmap.TwoViewGeometryOptions()
     verification.min_num_inliers = scene.options.min_matches
     verification.compute_relative_pose = relative_poses

@@ -75,7 +75,12 @@ def make_rendered_scene(options: SceneOptions, render: RenderOptions | None = No
         InputError: if the shape has no surfaces, if the lens folds the image over itself, or if an option of
             made-up keypoints is given: a rendered scene's are detected, and err as they do.
     """
-    _refuse_point_options(options)
+    for name in _OF_POINTS_ONLY:
+        if getattr(options, name) != getattr(SceneOptions, name):
+            raise InputError(
+                f"{name} belongs to made-up keypoints and pairs, but those of images are found by COLMAP;"
+                " leave it out, or make the scene without images"
+            )
     render = render or RenderOptions()
     rngs = np.random.default_rng(options.seed).spawn(6)  # the streams of `make_scene`
     layout = LAYOUTS[options.shape](options.num_images, options.num_points, rngs[0])
@@ -137,17 +142,6 @@ def project_distorted(scene: RenderedScene, image: int, points: FloatArray) -> F
 
 
 # --- options -----------------------------------------------------------------------------------------------
-
-
-def _refuse_point_options(options: SceneOptions) -> None:
-    """Raise InputError for an option that a rendered scene cannot obey."""
-    default = SceneOptions()
-    for name in _OF_POINTS_ONLY:
-        if getattr(options, name) != getattr(default, name):
-            raise InputError(
-                f"{name} belongs to made-up keypoints and pairs, but those of images are found by COLMAP;"
-                " leave it out, or make the scene without images"
-            )
 
 
 def _refuse_folding(scene: RenderedScene) -> None:

@@ -87,7 +87,11 @@ def make_rig_drive(options: SceneOptions) -> RigScene:
     sensor_of_image = np.tile(np.arange(NUM_SENSORS), num_frames)
     rig_of_frame = np.arange(num_frames) % NUM_RIGS
     rotations, centers = _frames(num_frames, rig_of_frame, layout_rng)
-    turns = _sensor_rotations()
+    # These sensor_from_rig turn about the rig's y axis, which points down.
+    yaw = np.radians(_YAW_DEG)
+    cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
+    rows = [[cosine, zero, sine], [zero, one, zero], [-sine, zero, cosine]]
+    turns = np.tile(np.moveaxis(np.array(rows), 2, 0), (NUM_RIGS, 1, 1, 1))
     rig_of_image, frame_rotations = rig_of_frame[frame_of_image], rotations[frame_of_image]
     offsets = _OFFSETS_M[rig_of_image, sensor_of_image]
     layout = replace(
@@ -114,11 +118,3 @@ def _frames(
     centers = road + (_LANES_M[rig_of_frame] + 0.1 * rng.standard_normal(num_frames))[:, None] * left
     centers[:, 2] = _HEIGHTS_M[rig_of_frame] + 0.05 * rng.standard_normal(num_frames)
     return looking_along(normalized(ahead + 0.02 * rng.standard_normal((num_frames, 3)))), centers
-
-
-def _sensor_rotations() -> FloatArray:
-    """Return sensor_from_rig (rigs, sensors, 3, 3): turns about the rig's y axis, which points down."""
-    yaw = np.radians(_YAW_DEG)
-    cosine, sine, zero, one = np.cos(yaw), np.sin(yaw), np.zeros_like(yaw), np.ones_like(yaw)
-    rows = [[cosine, zero, sine], [zero, one, zero], [-sine, zero, cosine]]
-    return np.tile(np.moveaxis(np.array(rows), 2, 0), (NUM_RIGS, 1, 1, 1))

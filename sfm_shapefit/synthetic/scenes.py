@@ -110,13 +110,7 @@ def make_scene(options: SceneOptions) -> Scene:
 
 
 def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generator]) -> Scene:
-    """Photograph, pair and corrupt a layout; `make_scene` says what it raises.
-
-    Args:
-        layout: cameras and surfaces.
-        options: `shape` is not read.
-        rngs: five streams, one for each kind of draw.
-    """
+    """Photograph, pair and corrupt a layout with five streams of draws; raises what `make_scene` does."""
     pixel_rng, corruption_rng, match_rng, pose_rng, rotation_rng = rngs
     thinning_rng = match_rng.spawn(1)[0]  # which leaves the stream itself as it is
     candidates = _candidates(layout, options)
@@ -127,7 +121,10 @@ def scene_of(layout: Layout, options: SceneOptions, rngs: list[np.random.Generat
 
     false_lists = _false_lists(layout, keypoint_points, pairs, options, corruption_rng)
     lists = _match_lists(keypoints, keypoint_points, pairs, false_lists)
-    lists = [_thin(rows, options.max_matches_per_pair, thinning_rng) for rows in lists]
+    most = options.max_matches_per_pair
+    for k, rows in enumerate(lists):
+        if most is not None and len(rows) > most:
+            lists[k] = rows[np.sort(thinning_rng.choice(len(rows), most, replace=False))]
     scrambled = [_scramble(rows, options.wrong_match_fraction, match_rng) for rows in lists]
     ray_noise_rad = options.pixel_noise_px / options.focal_length_px
     relative = _relative_poses(layout, pairs, false_lists, ray_noise_rad, pose_rng)
@@ -295,13 +292,6 @@ def _shared_keypoints(points_i: IntArray, points_j: IntArray) -> IntArray:
     """Return the (k, 2) keypoints of two images that show the same point."""
     _, in_i, in_j = np.intersect1d(points_i, points_j, assume_unique=True, return_indices=True)
     return np.stack([in_i, in_j], axis=1).astype(np.int64)
-
-
-def _thin(matches: IntArray, most: int | None, rng: np.random.Generator) -> IntArray:
-    """Return a random share of the matches, in their order; all, if they are few enough."""
-    if most is None or len(matches) <= most:
-        return matches
-    return matches[np.sort(rng.choice(len(matches), most, replace=False))]
 
 
 def _scramble(matches: IntArray, fraction: float, rng: np.random.Generator) -> tuple[IntArray, BoolArray]:

@@ -26,7 +26,7 @@ _HOUSE_DEPTH_M = 4.0
 _HOUSE_WIDTH_M = 8.0
 # Each side has a picture of its own.
 _TOWER_SIDES = 8
-_STOREY_M = 2.6
+_STORY_M = 2.6
 # The ground's picture has at most so many texels along either side.
 _MOST_TEXELS = 2048
 _TEXELS_PER_M = 64.0
@@ -51,11 +51,6 @@ class Surfaces:
     """(t,) factor to the picture's colors."""
     textures: tuple[ByteArray, ...]
     """The pictures, (height, width, 3): red, green, blue."""
-
-    def mesh(self) -> trimesh.Trimesh:
-        """Return the geometry as a trimesh mesh, its triangles in this order and not joined."""
-        faces = np.arange(3 * len(self.corners)).reshape(-1, 3)
-        return trimesh.Trimesh(vertices=self.corners.reshape(-1, 3), faces=faces, process=False)
 
 
 class _Part(NamedTuple):
@@ -85,11 +80,7 @@ _ALONG_X = np.array([1.0, 0.0, 0.0])
 def make_surfaces(shape: Shape, num_images: int, repeated: float, rng: np.random.Generator) -> Surfaces:
     """Return the surfaces that the cameras of a layout look at.
 
-    Args:
-        shape: of the layout.
-        num_images: of the layout; it decides how long a facade or a street is.
-        repeated: fraction of the houses, or of the tower's sides, that are one and the same.
-        rng: every draw comes from it.
+    The fraction `repeated` of the houses, or of the tower's sides, are one and the same.
 
     Raises:
         InputError: if the shape has no surfaces.
@@ -210,7 +201,7 @@ def _house_maker(
     size = (round(height_m * _TEXELS_PER_M), round(width * _TEXELS_PER_M))
 
     def drawn() -> tuple[ByteArray, FloatArray, FloatArray]:
-        picture = facade_texture(*size, round(_STOREY_M * _TEXELS_PER_M), rng)
+        picture = facade_texture(*size, round(_STORY_M * _TEXELS_PER_M), rng)
         count = round(width * height_m / 12.0)
         low = rng.uniform([0.2, 0.0, 1.0], [width - 1.2, 0.0, height_m - 1.5], (count, 3))
         extent = rng.uniform([0.5, 0.2, 0.3], [1.0, 0.7, 0.9], (count, 3))

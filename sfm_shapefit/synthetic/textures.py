@@ -21,15 +21,15 @@ def ground_texture(height_px: int, width_px: int, rng: np.random.Generator) -> B
     return picture
 
 
-def facade_texture(height_px: int, width_px: int, storey_px: int, rng: np.random.Generator) -> ByteArray:
-    """Return a picture (height, width, 3) of a wall with a window about every `storey_px`, both ways."""
+def facade_texture(height_px: int, width_px: int, story_px: int, rng: np.random.Generator) -> ByteArray:
+    """Return a picture (height, width, 3) of a wall with a window about every `story_px`, both ways."""
     picture = ground_texture(height_px, width_px, rng)
-    rows, columns = max(round(height_px / storey_px), 1), max(round(width_px / storey_px), 1)
+    rows, columns = max(round(height_px / story_px), 1), max(round(width_px / story_px), 1)
     for row in range(rows):
         for column in range(columns):
             top = int((row + rng.uniform(0.15, 0.25)) * height_px / rows)
             left = int((column + rng.uniform(0.15, 0.25)) * width_px / columns)
-            height, width = (rng.uniform(0.45, 0.6, 2) * storey_px).astype(int).tolist()
+            height, width = (rng.uniform(0.45, 0.6, 2) * story_px).astype(int).tolist()
             _draw_window(picture[top : top + height, left : left + width], rng)
     return picture
 

@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.synthetic import models
 from sfm_shapefit.synthetic.models import ModelParts, Points
@@ -110,7 +109,9 @@ def _write_images(scene: Scene, rigs: Rigs, database: pycolmap.Database) -> None
 
 def _write_pairs(scene: Scene, database: pycolmap.Database, *, relative_poses: bool) -> None:
     """Write the matches of every pair, all of which pass as inliers of its two-view geometry."""
-    essential = _cross_product_matrices(scene.relative_translations) @ scene.relative_rotations
+    # Each translation t as the matrix [t]_x with [t]_x y = t x y, (m, 3, 3).
+    crosses = np.cross(scene.relative_translations[:, None, :], np.eye(3)).swapaxes(1, 2)
+    essential = crosses @ scene.relative_rotations
     img_inverse = np.linalg.inv(scene.calibration)
     fundamental = img_inverse.T @ essential @ img_inverse
     for e, (i, j) in enumerate((scene.pairs + 1).tolist()):
@@ -125,8 +126,3 @@ def _write_pairs(scene: Scene, database: pycolmap.Database, *, relative_poses: b
             )
         database.write_matches(i, j, matches)
         database.write_two_view_geometry(i, j, geometry)
-
-
-def _cross_product_matrices(vectors: FloatArray) -> FloatArray:
-    """Return [t]_x (m, 3, 3) with [t]_x y = t x y for each row t."""
-    return np.cross(vectors[:, None, :], np.eye(3)).swapaxes(1, 2)

@@ -117,7 +117,7 @@ def test_a_flag_that_leaves_no_direction_is_refused(tmp_path):
     assert "none of the" in run_refused("locate", COURTYARD / "truth", tmp_path / "out", *few, code=4)
 
 
-@pytest.mark.parametrize("text", ["scale = ", "colour = 3", "min_inliers = 'many'", "scale = 'metric'"])
+@pytest.mark.parametrize("text", ["scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'"])
 def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     (tmp_path / "options.toml").write_text(text)
     run("locate", FACADE_MODEL, tmp_path / "out", "--config", tmp_path / "options.toml", code=2)

@@ -56,7 +56,7 @@ def test_rotations_and_intrinsics_are_the_inputs(courtyard):
         assert ours.name == image.name
 
 
-def test_the_inputs_centres_place_nothing(tmp_path):
+def test_the_inputs_centers_place_nothing(tmp_path):
     scene = copied(RING, tmp_path)
     model = pycolmap.Reconstruction(scene / "sparse" / "0")
     rng = np.random.default_rng(0)
@@ -91,7 +91,7 @@ def test_tracks_serve_where_there_is_no_database_and_points_keep_their_colors():
     found = sfm_shapefit.locate(FACADE / "sparse" / "0")
     assert found.inputs.source == "tracks"
     errors = sfm_shapefit.evaluate(found.reconstruction, FACADE / "sparse" / "0")
-    assert errors.position.max < 0.05  # metres, on a grid of 9 cameras before a wall
+    assert errors.position.max < 0.05  # meters, on a grid of 9 cameras before a wall
     assert found.reconstruction.num_points3D() > 300
     truth = pycolmap.Reconstruction(FACADE / "sparse" / "0")
     for point_id, point in found.reconstruction.points3D.items():
@@ -209,7 +209,7 @@ def test_bundle_adjustment_from_the_seed_converges_and_stays_there(courtyard):
     assert adjusted.adjusted.final_error_px < adjusted.adjusted.initial_error_px
     before = sfm_shapefit.evaluate(courtyard.reconstruction, COURTYARD / "truth").position.mean
     after = sfm_shapefit.evaluate(adjusted.reconstruction, COURTYARD / "truth").position.mean
-    # The given rotations are exact; adjusting them too costs some of the accuracy of the centres.
+    # The given rotations are exact; adjusting them too costs some of the accuracy of the centers.
     assert after < 1.5 * before
 
 

@@ -1,7 +1,6 @@
 """`map`: from a database alone to models, one for each component, with rotations the matches agree with."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,7 @@ import sfm_shapefit
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
-from sfm_shapefit.commands.stages.averaging import averaged
+from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from tests.program import run
@@ -170,9 +169,9 @@ def worst_error_deg(answer, truth):
 
 def test_the_most_consistent_of_several_averagings_is_kept():
     truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    misled = averaged(14, relative, min_matches=15)
+    misled = average_consistently(14, relative, min_matches=15)
     assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
-    answer = averaged(14, relative)
+    answer = average_consistently(14, relative)
     assert answer.registered.all()
     assert answer.min_matches == 20
     assert worst_error_deg(answer, truth) < 0.5
@@ -190,7 +189,8 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_
         rotations = relative.rotations.copy()
         rng = np.random.default_rng(1)
         rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
-        answers.append(averaged(14, replace(relative, rotations=rotations, sound=sound)))
+        part = relative._replace(rotations=rotations, sound=sound)
+        answers.append(average_consistently(14, part))
     assert answers[0].agreements[3] < 0.25
     assert np.delete(answers[0].agreements, 3).min() > 0.8
     assert answers[1].sound_only

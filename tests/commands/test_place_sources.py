@@ -16,7 +16,7 @@ from sfm_shapefit.formats.onedsfm import is_onedsfm, read_onedsfm, read_rotation
 from sfm_shapefit.geometry import fit_similarity, normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.results import pair_rows
+from sfm_shapefit.results.rows import pair_rows
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.formats.test_onedsfm_format import egs_text, folder_with, rots_text, scene, write_scene

@@ -38,8 +38,8 @@ def found(workspace):
     return sfm_shapefit.locate(workspace / "sparse" / "0")
 
 
-def centres(reconstruction):
-    """Ids and centres of the posed images, ascending."""
+def centers_of(reconstruction):
+    """Ids and centers of the posed images, ascending."""
     ids = sorted(i for i, image in reconstruction.images.items() if image.has_pose)
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
 
@@ -48,7 +48,7 @@ def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_wor
     model = read_model(workspace / "truth")
     truth = model.reconstruction
     assert (truth.num_rigs(), truth.num_frames(), truth.num_cameras()) == (2, 12, 6)
-    np.testing.assert_allclose(centres(truth)[1], rigs.scene.centers, atol=1e-12)
+    np.testing.assert_allclose(centers_of(truth)[1], rigs.scene.centers, atol=1e-12)
     assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
     with pycolmap.Database.open(workspace / "database.db") as database:
         assert (database.num_rigs(), database.num_frames()) == (2, 12)
@@ -75,7 +75,7 @@ def test_a_seed_moves_frames_and_keeps_their_sensors(workspace):
     placed = model.frame_ids != 5
     placed[1:3] = False  # of a frame whose first image is placed: they come with it
     seed = build_seed(model, placed, centers)
-    ids, found = centres(seed)
+    ids, found = centers_of(seed)
     expected = model.frame_ids != 5
     assert ids == model.image_ids[expected].tolist()
     np.testing.assert_allclose(found, centers[expected], atol=1e-12)
@@ -89,16 +89,16 @@ def assert_rigs_equal(a, b, atol=0.0):
     for rig_id, rig in a.rigs.items():
         for sensor, pose in rig.non_ref_sensors.items():
             other = b.rig(rig_id).sensor_from_rig(sensor)
-            # Bundle adjustment normalises quaternions anew; nothing else changes a bit.
+            # Bundle adjustment normalizes quaternions anew; nothing else changes a bit.
             np.testing.assert_allclose(pose.matrix(), other.matrix(), rtol=0.0, atol=atol)
 
 
 def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wrong(rigs, found):
-    ids, centers = centres(found.reconstruction)
+    ids, own = centers_of(found.reconstruction)
     assert ids == list(range(1, 37))
-    fit = fit_similarity(centers, rigs.scene.centers, rotate=False)
+    fit = fit_similarity(own, rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
-    errors = np.linalg.norm(fit.apply(centers) - rigs.scene.centers, axis=1)
+    errors = np.linalg.norm(fit.apply(own) - rigs.scene.centers, axis=1)
     assert np.median(errors) < 0.01  # half a pixel at 10 m is 5 mm in a single match
     assert found.certified.gap <= 1e-8
     assert found.gauge.statement.startswith("rig: ")
@@ -148,7 +148,7 @@ def test_an_image_without_pairs_comes_with_its_frame(rigs, workspace, found):
 def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
     located = sfm_shapefit.locate(workspace / "sparse" / "0", bundle_adjust=True, points="never")
     assert_rigs_equal(located.reconstruction, located.model.reconstruction, atol=1e-12)
-    fit = fit_similarity(centres(located.reconstruction)[1], rigs.scene.centers, rotate=False)
+    fit = fit_similarity(centers_of(located.reconstruction)[1], rigs.scene.centers, rotate=False)
     assert abs(fit.scale - 1.0) < 1e-3
 
 
@@ -212,8 +212,8 @@ def test_fixed_cameras_keep_their_poses_to_the_bit_and_the_rest_finds_its_place(
     after = poses(found.reconstruction)
     for name in all_names[:5]:
         np.testing.assert_array_equal(after[name], given[name])
-    errors = np.linalg.norm(centres(found.reconstruction)[1] - centers, axis=1) * 0.37
-    assert errors.max() < 0.02  # metres; half a pixel at 4 m is 2 mm
+    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - centers, axis=1) * 0.37
+    assert errors.max() < 0.02  # meters; half a pixel at 4 m is 2 mm
     assert found.summary()["rigid_groups"]["num_fixed"] == 5
     assert found.gauge.statement == "fixed: scale and origin of the fixed cameras"
     assert found.certified.gap <= 1e-8
@@ -226,7 +226,7 @@ def test_a_single_fixed_camera_keeps_its_place_and_the_scale_is_chosen_as_withou
     options = LocateOptions(fix=str(names), scale="unit")
     found = sfm_shapefit.locate(model, RING / "database.db", options=options)
     np.testing.assert_array_equal(poses(found.reconstruction)[all_names[2]], given)
-    own = centres(found.reconstruction)[1]
+    own = centers_of(found.reconstruction)[1]
     assert np.median(np.linalg.norm(own - own.mean(axis=0), axis=1)) == pytest.approx(1.0)
     assert f"shifted so that {all_names[2]} stays where it is" in found.gauge.statement
 
@@ -260,7 +260,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
             found.reconstruction.image(image_id).cam_from_world().matrix(),
             model.image(image_id).cam_from_world().matrix(),
         )
-    errors = np.linalg.norm(centres(found.reconstruction)[1] - rigs.scene.centers, axis=1)
+    errors = np.linalg.norm(centers_of(found.reconstruction)[1] - rigs.scene.centers, axis=1)
     assert np.median(errors) < 0.02  # grows with the distance from the frame that is held
 
 
@@ -269,7 +269,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     [
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
-        (None, "cannot be read; give a text file"),
+        (None, "is not a readable text file"),
         ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
 )

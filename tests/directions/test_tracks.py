@@ -19,7 +19,7 @@ NUM_POINTS = 60
 
 
 def scene(cameras=6, seed=0, noise=0.0, wrong=0.0):
-    """Cameras that all see all points, keypoint k of every image point k; centres, points and matches."""
+    """Cameras that all see all points, keypoint k of every image point k; centers, points and matches."""
     rng = np.random.default_rng(seed)
     centers = rng.standard_normal((cameras, 3))
     points = rng.standard_normal((NUM_POINTS, 3)) + np.array([0.0, 0.0, 8.0])

@@ -5,7 +5,7 @@ camera axes (x right, y down, z forward) right is -y and down is -z:
 
     cam_from_world = [[0, -1, 0], [0, 0, -1], [1, 0, 0]]
 
-Camera 0 stands at (1, 2, 3), camera 1 at (1, 0, 3). With f = 100 px and the centre at (50, 40), the point
+Camera 0 stands at (1, 2, 3), camera 1 at (1, 0, 3). With f = 100 px and the center at (50, 40), the point
 (11, 1, 5) is at (1, -2, 10) in camera 0 and at (-1, -2, 10) in camera 1: at pixels (60, 20) and (40, 20).
 """
 
@@ -23,10 +23,9 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.other_programs import posed_model_of, reconstruction_of, relative_poses_of
 from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.glomap_text import read_relative_poses, relative_poses_text
+from sfm_shapefit.formats.glomap_text import read_relative_poses
 from sfm_shapefit.formats.models import read_model_file
 from sfm_shapefit.formats.nerf import nerf_text
-from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.formats.tum import poses_csv, tum_text
 from sfm_shapefit.geometry import rotation_angles_deg
 from tests.program import run
@@ -155,7 +154,7 @@ def test_distortion_is_taken_over_in_colmaps_order(tmp_path):
 
 
 def bundler_text(model):
-    """Write a reconstruction as Bundler has it: y up, looking along -z, pixels from the centre."""
+    """Write a reconstruction as Bundler has it: y up, looking along -z, pixels from the center."""
     flip = np.diag([1.0, -1.0, -1.0])
     lines = ["# Bundle file v0.3", f"{model.num_images} {model.reconstruction.num_points3D()}"]
     index = {image_id: k for k, image_id in enumerate(model.image_ids.tolist())}
@@ -199,7 +198,12 @@ def test_a_model_that_goes_through_bundlers_file_is_located_like_the_original(tm
         ("bundler", "0 0 1\n-1 0 0\n2", "0 0 2\n-1 0 0\n2", r"camera 0 has no rotation"),
         ("bundler", "1 8 -10 20", "9 8 -10 20", r"point 0 is seen by camera 9 of 2"),
         ("bundler", "1 8 -10 20", "1 8 -10", r"ends early, in line 15"),
-        ("openmvg", '"center": [1.0, 2.0, 3.0]', '"centre": 0', r"extrinsics\[0\]/value has no key 'center'"),
+        (
+            "openmvg",
+            '"center": [1.0, 2.0, 3.0]',
+            '"centroid": 0',
+            r"extrinsics\[0\]/value has no key 'center'",
+        ),
         ("openmvg", '"focal_length": 100.0', '"focal_length": NaN', r"value0/focal_length is not finite"),
         ("openmvg", '"id_intrinsic": 0', '"id_intrinsic": 3', r"has the intrinsic 3, which is not among"),
         ("openmvg", "[[0.0, -1.0", "[[0.5, -1.0", r"extrinsics\[0\]/value/rotation is no rotation"),
@@ -296,8 +300,12 @@ def relative_poses_of_ring():
 
 def test_relative_poses_come_back_and_are_solved(tmp_path):
     model, pairs, rotations, units = relative_poses_of_ring()
-    poses = EpipolarGeometries(names=model.names, pairs=pairs, rotations=rotations, to_second=units)
-    (tmp_path / "relpose.txt").write_text(relative_poses_text(poses))
+    quaternions = Rotation.from_matrix(rotations).as_quat()[:, [3, 0, 1, 2]]
+    rows = np.column_stack([quaternions, -np.einsum("kab,kb->ka", rotations, units)]).tolist()
+    text = (
+        f"{model.names[i]} {model.names[j]} {row}" for (i, j), row in zip(pairs.tolist(), rows, strict=True)
+    )
+    (tmp_path / "relpose.txt").write_text("\n".join(text).translate(str.maketrans("", "", "[],")))
     back = read_relative_poses(tmp_path / "relpose.txt")
     assert back.names == model.names
     np.testing.assert_array_equal(back.pairs, pairs)

@@ -16,7 +16,7 @@ GOOD = f"3 7 {IDENTITY} 1 0 0\n3 12 {IDENTITY} 0 1 0\n7 12 {IDENTITY} 0 0 1\n"
 
 
 def scene(n=6, seed=4):
-    """Bundler cameras: world-to-camera rotations (n, 3, 3), y up, looking along -z, and centres (n, 3)."""
+    """Bundler cameras: world-to-camera rotations (n, 3, 3), y up, looking along -z, and centers (n, 3)."""
     rng = np.random.default_rng(seed)
     return Rotation.random(n, random_state=rng).as_matrix(), rng.standard_normal((n, 3))
 
@@ -44,7 +44,7 @@ def folder_with(path, **files):
 
 
 def write_scene(path, n=6, num_rotations=None):
-    """Write a scene as a 1DSfM folder, and return it with the rotations and centres."""
+    """Write a scene as a 1DSfM folder, and return it with the rotations and centers."""
     rotations, centers = scene(n)
     rots = rots_text(rotations[:num_rotations])
     return folder_with(path, EGs=egs_text(rotations, centers), rots=rots), rotations, centers
@@ -153,7 +153,7 @@ def test_g2o_has_the_camera_in_the_world_and_numbers_nodes_that_have_names():
 
 
 def edges_text(cam_from_world, centers, information=""):
-    """All pairs as a pose-graph tool writes them: the pose of j in the axes of i, in metres."""
+    """All pairs as a pose-graph tool writes them: the pose of j in the axes of i, in meters."""
     lines = []
     for i in range(len(centers)):
         for j in range(i + 1, len(centers)):
@@ -221,8 +221,8 @@ def test_vertices_that_are_none_twice_or_of_others_are_refused(tmp_path):
     file = tmp_path / "graph.g2o"
     vertex = "VERTEX_SE3:QUAT 0 1 2 3 0 0 0 1\n"
     for text, words in [
-        (vertex * 2, "line 2: gives an earlier vertex a second pose"),
-        (vertex, "has a pose of none of the 1 vertices"),
+        (vertex * 2, "line 2: gives an earlier camera a second rotation"),
+        (vertex, "has a rotation of none of the 1 cameras"),
         ("VERTEX_SE2 0 1 2 0\n", "has no VERTEX_SE3:QUAT"),
     ]:
         file.write_text(text)

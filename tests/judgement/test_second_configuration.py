@@ -5,7 +5,7 @@ import pytest
 
 from sfm_shapefit.judgement.second_configuration import find_second_configuration
 from sfm_shapefit.placement.place import place
-from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.synthetic import box_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
 

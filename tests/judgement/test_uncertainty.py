@@ -7,7 +7,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import normalized, tangent_bases
 from sfm_shapefit.judgement.correlated_errors import sample_direction_errors
 from sfm_shapefit.judgement.uncertainty import propagate
-from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
+from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import SceneOptions, box_graph_problem, make_scene
 
@@ -24,7 +24,7 @@ def dense_covariance(t, edges, information):
     u = normalized(baselines)
     across = np.eye(t.shape[1]) - u[:, :, None] * u[:, None, :]
     blocks = across @ information @ across / np.sum(baselines**2, axis=1)[:, None, None]
-    hessian = assemble(laplacian_pattern(len(t), edges), blocks).toarray()
+    hessian = laplacian_matrix(len(t), edges, blocks).toarray()
     return np.linalg.pinv(hessian, rcond=1e-10, hermitian=True)
 
 
@@ -137,7 +137,7 @@ def test_sampled_errors_of_pairs_that_share_keypoints_are_correlated_as_real_one
     scale = np.sqrt(np.repeat(np.trace(covariances, axis1=1, axis2=2) / 2, 2))
     predicted = (sampled / scale).T @ (sampled / scale) / len(sampled)
     measured = (np.array(real) / scale).T @ (np.array(real) / scale) / len(real)
-    # Away from the image's centre a pixel is a smaller angle, in a real scene a smaller noise.
+    # Away from the image's center a pixel is a smaller angle, in a real scene a smaller noise.
     measured /= np.mean(np.diag(measured))
     assert np.mean(np.diag(predicted)) == pytest.approx(1.0, abs=0.05)
     # Entries scatter by 0.10 (96 samples) and 0.05 (400 draws); independent pairs have 0 off the blocks.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.laplacian.cholesky import analyze, factorize
-from sfm_shapefit.laplacian.operators import assemble, laplacian_pattern
+from sfm_shapefit.laplacian.operators import laplacian_matrix
 from sfm_shapefit.laplacian.selected import selected_inverse
 from sfm_shapefit.synthetic import box_graph_problem, trajectory_graph_problem
 from tests.graph_families import random_blocks
@@ -20,7 +20,7 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     factor = factorize(analyze(n, edges), weights, ground=7.0)
     found = selected_inverse(factor, edges)
 
-    matrix = assemble(laplacian_pattern(n, edges), weights).toarray().reshape(n, b, n, b)
+    matrix = laplacian_matrix(n, edges, weights).toarray().reshape(n, b, n, b)
     last = factor.symbolic.permutation[-1]
     matrix[last, :, last, :] += 7.0 * np.eye(b)
     whole = np.linalg.inv(matrix.reshape(n * b, n * b)).reshape(n, b, n, b)

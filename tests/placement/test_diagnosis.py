@@ -178,7 +178,7 @@ def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_pa
     graph.write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
     result = run("inspect", graph, "--theory", code=0)
     assert "5: pendant" in result.stdout
-    assert "no centres" in result.stdout
+    assert "no centers" in result.stdout
     run("inspect", graph, "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)

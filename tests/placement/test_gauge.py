@@ -1,4 +1,4 @@
-"""Scale, origin and axes: of the input's centres, of a known distance, of position priors."""
+"""Scale, origin and axes: of the input's centers, of a known distance, of position priors."""
 
 import json
 import sqlite3

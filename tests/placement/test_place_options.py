@@ -13,7 +13,7 @@ from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.refinement import starts
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.groups import separate

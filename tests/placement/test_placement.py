@@ -9,7 +9,8 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place, place_further
-from sfm_shapefit.results import camera_rows, pair_rows, quality_warnings
+from sfm_shapefit.results.rows import camera_rows, pair_rows
+from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph

@@ -11,7 +11,7 @@ from sfm_shapefit.refinement import angular
 from sfm_shapefit.refinement import starts as finishing
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refine_starts
-from sfm_shapefit.results import quality_warnings
+from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph

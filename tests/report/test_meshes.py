@@ -69,7 +69,7 @@ def test_the_ply_is_in_the_axes_of_the_model_colored_by_trust_with_a_ribbon_for_
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 
-def test_trust_is_red_at_0_green_at_1_and_grey_where_unknown():
+def test_trust_is_red_at_0_green_at_1_and_gray_where_unknown():
     low, high, unknown = trust_colors(np.array([0.0, 1.0, np.nan])).astype(int)
     assert low[0] > 3 * low[1]
     assert high[1] > 3 * high[0]

@@ -38,7 +38,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
     assert drawn == ["scene", "histogram", "trust", "matrix", "support", "convergence"]
 
 
-def test_a_click_on_a_row_highlights_and_centres_its_camera(driver, report):
+def test_a_click_on_a_row_highlights_and_centers_its_camera(driver, report):
     before = driver.execute_script(HIGHLIGHT), driver.execute_script(CENTER)
     row = driver.find_element("css selector", "#cameras tbody tr:nth-child(3)")
     k = int(row.get_attribute("data-row"))
@@ -80,7 +80,7 @@ def test_a_click_in_the_scene_leads_to_the_row_and_a_pair_shows_its_two_cameras_
 def test_the_mouse_over_a_camera_tells_of_it_and_a_click_selects_it(driver, report):
     from selenium.webdriver import ActionChains
 
-    driver.execute_script("document.querySelector('#cameras tbody tr').click()")  # which centres it
+    driver.execute_script("document.querySelector('#cameras tbody tr').click()")  # which centers it
     chosen = driver.execute_script(SELECTED)
     plot = driver.find_element("id", "scene")
     driver.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", plot)

@@ -11,13 +11,13 @@ from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import DirectionStatus
-from sfm_shapefit.results import match_warnings
+from sfm_shapefit.results.warnings import match_warnings
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.scenes import project_points
 from sfm_shapefit.synthetic.workspace import write_workspace
 
 NO_DIRECTION = DirectionOptions(min_inliers=200)
-PERIOD = np.array([2.0, 0.0, 0.0])  # along the wall, in metres
+PERIOD = np.array([2.0, 0.0, 0.0])  # along the wall, in meters
 
 
 def statuses(**counts):

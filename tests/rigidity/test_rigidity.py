@@ -234,7 +234,7 @@ def test_growth_from_the_first_pair_takes_in_whoever_is_joined_twice(seed):
 
 
 def test_a_triangle_free_graph_of_thousands_of_cameras_agrees_with_counting():
-    """A flat grid of squares, in 3D: each square is a rigid 4-cycle, and neighbours share two cameras."""
+    """A flat grid of squares, in 3D: each square is a rigid 4-cycle, and neighbors share two cameras."""
     side = 40
     number = np.arange(side * side).reshape(side, side)
     across = np.column_stack([number[:, :-1].ravel(), number[:, 1:].ravel()])

@@ -23,7 +23,7 @@ N = 10
 def turned_scene(errors_deg, pairs=None, noise_px=0.0, matches=60, seed=0):
     """Cameras on a ball around a cloud of points; camera k's rays are turned by a rotation of errors_deg[k].
 
-    Returns the matches, the true centres, and the turns (n, 3, 3) that undo the errors.
+    Returns the matches, the true centers, and the turns (n, 3, 3) that undo the errors.
     """
     rng = np.random.default_rng(seed)
     n = len(errors_deg)
@@ -96,7 +96,7 @@ def test_right_rotations_stay_as_right_as_the_noise_allows():
     matches, centers, truth = turned_scene(np.zeros(N), noise_px=0.5)
     found = refine_rotations(matches, centers)
     # 9 pairs of 60 matches at 0.5 px: 0.5 PIXEL / sqrt(540) = 0.0012 deg about the viewing axis. Turns about
-    # the others are nearly undone by moving the centre: they show by the square of the cloud's apparent size,
+    # the others are nearly undone by moving the center: they show by the square of the cloud's apparent size,
     # 1 / 6, as 36 times that, 0.045 deg; the worst of 10 cameras is at 2 sigma.
     assert relative_errors_deg(found.turns, truth).max() < 0.1
 

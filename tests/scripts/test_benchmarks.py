@@ -14,7 +14,7 @@ from peers import on_graphs, on_scenes
 from tests.scenes import RING, ROOT, fingerprint
 
 SCRIPTS = ROOT / "scripts"
-PARTS = {"weights", "answer_cases", "answer_differences", "answer_inputs"}
+PARTS = {"answer_cases", "answer_differences", "answer_inputs"}
 """Modules that belong to another one."""
 SECTIONS = sorted(set(INDEX) - {"answers", "reliability"})
 
@@ -54,16 +54,13 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
             monkeypatch.setattr(module, "call", call_here)
     before = fingerprint(RING)
     out = tmp_path / "section.md"
-    plot = ["--plot", str(tmp_path / "scale.png")] if name == "scale" else []
-    assert benchmark.main([name, "--quick", "--out", str(out), *plot]) == 0
+    assert benchmark.main([name, "--quick", "--out", str(out)]) == 0
     text = out.read_text()
     assert f"- Command: `python scripts/benchmark.py {name} --quick`" in text
     assert "\n## What the columns mean\n" in text
     assert "failed" not in text
     assert str(ROOT) not in text
     assert fingerprint(RING) == before
-    if name == "scale":
-        assert (tmp_path / "scale.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_missing_data_is_a_sentence_per_case_and_no_failure(tmp_path, capsys):

@@ -288,7 +288,7 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
-def test_newton_started_from_a_certified_point_needs_fewer_factorisations(sigma):
+def test_newton_started_from_a_certified_point_needs_fewer_factorizations(sigma):
     graph = draw_family("geo", 400, 24, sigma=sigma)
     split = solve_admm(graph, 1e-7, 400)
     certificate = certify(graph, split.locations, split.dual)

@@ -82,10 +82,10 @@ def test_other_labels_and_another_order_of_the_pairs_change_nothing(name, proble
     nodes, pairs = rng.permutation(graph.num_nodes), rng.permutation(graph.num_edges)
     where = np.argsort(nodes)
     names = rng.permutation(groups.num_groups)
-    relabelled = problem.with_pairs(
+    relabeled = problem.with_pairs(
         nodes[graph.edges[pairs]], graph.directions[pairs], graph.weights[pairs]
     )._replace(groups=RigidGroups(group_of=names[groups.group_of[where]], offsets=groups.offsets[where]))
-    check(answers, name, relabelled, lambda t: t[nodes])
+    check(answers, name, relabeled, lambda t: t[nodes])
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -50,7 +50,7 @@ def test_groups_with_fixed_nodes_become_one_whole_frames_with_them():
     centers = np.array([[5.0, 0, 0], [6.0, 0, 0], [9.0, 9, 9], [8.0, 1, 0], [7.0, 7, 7]])
     joined = groups.with_fixed(np.array([True, False, False, True, False]), centers)
     np.testing.assert_array_equal(joined.group_of, [0, 0, 0, 0, 1])
-    # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own centre.
+    # Node 2 is not fixed itself: it stands by its offset from node 3, not at its own center.
     expected = np.array([[5.0, 0, 0], [6, 0, 0], [8, 0, 0], [8, 1, 0]])
     np.testing.assert_allclose(centered(joined.offsets[:4]), centered(expected), atol=1e-14)
 
@@ -247,7 +247,7 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
         again = solve_groups(graph, groups, other)
         np.testing.assert_array_equal(again.locations, result.locations)
         np.testing.assert_array_equal(again.dual, result.dual)
-    with pytest.raises(InputError, match="'admm' does not know rigs"):
+    with pytest.raises(InputError, match="have no solver admm"):
         solve_groups(graph, groups, SolverOptions(solver="admm"))
     with pytest.raises(UnsolvableError, match="takes 0 MB, and only 0 MB are allowed"):
         ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)

@@ -170,7 +170,7 @@ def test_small_and_dense_graphs_and_those_that_would_fill_in_have_a_dense_factor
 )
 def test_the_table_of_choices(method, n, flops, chosen, reason, monkeypatch):
     graph = SimpleNamespace(num_nodes=n, dimension=3, num_edges=n * (n - 1) // 20)
-    monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops))
+    monkeypatch.setattr(solving, "predict_factor", lambda _: SimpleNamespace(flops=flops, tree=None))
     choice = choose_method(graph, SolverOptions(solver=method))
     assert (choice.method, choice.reason) == (chosen, reason)
 

@@ -41,8 +41,8 @@ def colmap_camera(scene: RenderedScene) -> pycolmap.Camera:
 
 
 def board_scene(spots: np.ndarray) -> RenderedScene:
-    """One camera at the origin before a black board with white spots at (k, 2) metres, 4 m ahead."""
-    texture = np.zeros((1200, 1600, 3), dtype=np.uint8)  # 4 m x 3 m, 400 texels a metre
+    """One camera at the origin before a black board with white spots at (k, 2) meters, 4 m ahead."""
+    texture = np.zeros((1200, 1600, 3), dtype=np.uint8)  # 4 m x 3 m, 400 texels a meter
     row, column = np.mgrid[0:1200, 0:1600] + 0.5
     for x, y in spots:
         inside = np.hypot(column - 400.0 * (x + 2.0), row - 400.0 * (y + 1.5)) < 20.0
@@ -68,7 +68,7 @@ def test_a_spot_is_drawn_where_colmaps_camera_sees_it_through_a_bent_lens():
     for at in expected:
         near = picture * (np.hypot(x - at[0], y - at[1]) < 9.0)
         found = np.array([(near * x).sum(), (near * y).sum()]) / near.sum()
-        # 2.8 px of spot in 2 x 2 samples a pixel: its centre of mass is good to a few hundredths.
+        # 2.8 px of spot in 2 x 2 samples a pixel: its center of mass is good to a few hundredths.
         np.testing.assert_allclose(found, at, rtol=0.0, atol=0.1)
 
 

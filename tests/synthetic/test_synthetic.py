@@ -296,7 +296,7 @@ def test_pycolmap_reads_back_the_scene_from_a_workspace(tmp_path):
             np.testing.assert_allclose(pose.translation, scene.relative_translations[pair], atol=1e-12)
 
 
-def test_model_points_have_the_tracks_and_colours_of_the_scene(tmp_path):
+def test_model_points_have_the_tracks_and_colors_of_the_scene(tmp_path):
     scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
     write_workspace(scene, tmp_path / "out", synthetic.WorkspaceOptions(database=False))
     assert not (tmp_path / "out/database.db").exists()
@@ -465,7 +465,7 @@ def test_graph_problems_are_simple_connected_and_exact_without_noise(family):
     i, j = problem.edges.T
     assert (i < j).all()
     assert len(np.unique(problem.edges, axis=0)) == len(problem.edges)
-    # Normalised twice: a few roundings.
+    # Normalized twice: a few roundings.
     np.testing.assert_allclose(problem.directions, true_directions(problem), rtol=0.0, atol=1e-15)
     assert not problem.corrupted.any()
     n = len(problem.locations)

@@ -16,7 +16,7 @@ The answers within 0.005 of the best score are equally consistent; of those the 
 Weighted by the number of matches itself, the score prefers an answer with six wrong cameras on lego100.
 """
 
-from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
@@ -34,18 +34,17 @@ _LOSSES: tuple[Loss, ...] = ("geman-mcclure", "half-norm")
 _EQUAL_SCORES = 0.005
 
 
-def averaged(num_images: int, relative: RelativeRotations, min_matches: int = 0) -> AveragedRotations:
-    """Return the most consistent rotations of some images.
+def average_consistently(
+    num_images: int, relative: RelativeRotations, min_matches: int = 0
+) -> AveragedRotations:
+    """Return the most consistent rotations of some images; of several components one is answered.
 
-    Args:
-        num_images: n; the pairs should join them all, for only one component is answered.
-        relative: the relative rotations of their pairs.
-        min_matches: the limit to use; 0 tries several.
+    With `min_matches` 0 several limits are tried.
 
     Raises:
         UnsolvableError: if no averaging succeeds.
     """
-    answers = list(_answers(num_images, relative, min_matches))
+    answers = _answers(num_images, relative, min_matches)
     if not answers:
         raise UnsolvableError(
             f"the relative rotations of {len(relative.pairs)} pairs cannot be averaged; match more images"
@@ -55,50 +54,36 @@ def averaged(num_images: int, relative: RelativeRotations, min_matches: int = 0)
     return replace(chosen, num_tried=len(answers))
 
 
-def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> Iterator[AveragedRotations]:
-    """Yield an answer per setting that is different from the others and succeeds."""
+def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> list[AveragedRotations]:
+    """Return an answer per setting that is different from the others and succeeds."""
     seen: set[tuple[int, bool]] = set()
+    answers = []
     for sound_only in (True, False):
         for limit in (min_matches,) if min_matches else _LIMITS:
             used = relative.num_matches >= limit
             if sound_only:
                 used &= relative.sound
-            if (int(used.sum()), sound_only and not relative.sound.all()) in seen or not used.any():
+            setting = int(used.sum()), sound_only and not bool(relative.sound.all())
+            if setting in seen or not used.any():
                 continue
-            seen.add((int(used.sum()), sound_only and not relative.sound.all()))
+            seen.add(setting)
+            pairs, rotations, counts, _ = relative.subset(used)
             for loss in _LOSSES:
-                answer = _answer(num_images, relative, used, loss)
-                if answer is not None:
-                    rotations, registered = answer
-                    yield _judged(relative, rotations, registered, limit, loss, sound_only)
+                with suppress(UnsolvableError):
+                    found = average_rotations(num_images, pairs, rotations, counts, loss=loss)
+                    answers.append(_judge(relative, found, limit, loss, sound_only))
+    return answers
 
 
-def _answer(
-    num_images: int, relative: RelativeRotations, used: BoolArray, loss: Loss
-) -> tuple[FloatArray, BoolArray] | None:
-    """Average the used pairs; None if that fails."""
-    try:
-        return average_rotations(
-            num_images,
-            relative.pairs[used],
-            relative.rotations[used],
-            relative.num_matches[used],
-            loss=loss,
-            count_matches=False,
-        )
-    except UnsolvableError:
-        return None
-
-
-def _judged(
+def _judge(
     relative: RelativeRotations,
-    rotations: FloatArray,
-    registered: BoolArray,
+    found: tuple[FloatArray, BoolArray],
     min_matches: int,
     loss: Loss,
     sound_only: bool,
 ) -> AveragedRotations:
     """Compare averaged rotations with the sound pairs, or with all if none is sound."""
+    rotations, registered = found
     pairs = relative.subset(relative.sound) if relative.sound.any() else relative
     i, j = pairs.pairs.T
     predicted = rotations[j] @ rotations[i].transpose(0, 2, 1)
@@ -114,11 +99,11 @@ def _judged(
     return AveragedRotations(
         rotations=rotations,
         registered=registered,
-        min_matches=min_matches,
-        loss=loss,
-        sound_only=sound_only,
         score=float(agreeing.sum() / weights.sum() * registered.mean()),
         share=float(agreeing.sum() / max(float((weights * both).sum()), 1e-300)),
         fit=float(near.sum() / weights.sum()),
         agreements=np.asarray(agreements, dtype=np.float64),
+        min_matches=min_matches,
+        loss=loss,
+        sound_only=sound_only,
     )

@@ -11,15 +11,11 @@ Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, the work done so far and the work in all."""
 
 
-def _silent(_stage: str, _done: int, _total: int) -> None:
-    """Report to nobody."""
-
-
 @dataclass(slots=True)
 class Clock:
     """Measures stages and passes their progress on."""
 
-    progress: Progress = _silent
+    progress: Progress = field(default=lambda _stage, _done, _total: None)
     seconds: dict[str, float] = field(default_factory=dict)
     stage: str = ""
 

@@ -60,13 +60,7 @@ def measure_with_workers(
 ) -> list[PairDirections]:
     """Return the directions of all pairs of a database, in parts, as an executor's workers measure them.
 
-    Args:
-        database: what they read for themselves.
-        model: the posed cameras.
-        options: what to believe.
-        executor: submits tasks; it is not shut down.
-        advance: told of the pairs done and in all.
-        matches_per_task: about so many in one task.
+    The executor is not shut down; `advance` is told of the pairs that are done and of their number.
 
     Raises:
         WorkerError: if a worker died and the executor does not replace it.

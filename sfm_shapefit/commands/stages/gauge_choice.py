@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.commands.stages.rigs import Rigid
@@ -21,7 +21,7 @@ from sfm_shapefit.placement.gauge import (
     unit_gauge,
 )
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.results import Inputs
+from sfm_shapefit.results.result import Inputs
 
 
 def read_priors(
@@ -56,15 +56,7 @@ def choose_gauge(
     """Return scale, origin and axes of the output.
 
     Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
-    given, else the input. A single fixed camera moves only the origin.
-
-    Args:
-        model: the input.
-        placement: its solution.
-        kept: which of the placement's cameras are in the output.
-        rigid: what of the model is rigid.
-        options: what is asked for.
-        priors: of the images; None if they are not wanted.
+    given, else the input. A single fixed camera moves only the origin. Only cameras that are `kept` count.
 
     Raises:
         InputError: if what is asked for is not determined.
@@ -75,7 +67,12 @@ def choose_gauge(
     fixed = rigid.fixed[cameras]
     if placement.unit is not None:
         return metric_gauge(locations, placement.unit, centers, fixed, has_rigs=model.has_rigs)
-    gauge = _choose_scale(model, placement, kept, options, priors)
+    if options.known_distance:
+        gauge = _gauge_of_distance(model, cameras.tolist(), locations, options.known_distance)
+    elif priors is not None:
+        gauge = prior_gauge(locations, priors.of(cameras))
+    else:
+        gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
     if not rigid.fixed.any():
         return gauge
     name = model.names[int(np.argmax(rigid.fixed))]
@@ -84,29 +81,10 @@ def choose_gauge(
     return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
 
 
-def _choose_scale(
-    model: PosedModel,
-    placement: Placement,
-    kept: BoolArray,
-    options: LocateOptions,
-    priors: PositionPriors | None,
-) -> Gauge:
-    """Return the gauge that is asked for, where no group knows the scale."""
-    cameras, locations = placement.cameras[kept], placement.locations[kept]
-    if options.known_distance:
-        return _gauge_of_distance(model, placement, kept, options.known_distance)
-    if priors is not None:
-        return prior_gauge(locations, priors.of(cameras))
-    if options.scale == "unit":
-        return unit_gauge(locations)
-    return input_gauge(locations, model.centers[cameras])
-
-
 def _gauge_of_distance(
-    model: PosedModel, placement: Placement, kept: BoolArray, known: tuple[str, str, float]
+    model: PosedModel, cameras: list[int], locations: FloatArray, known: tuple[str, str, float]
 ) -> Gauge:
     """Return the gauge of the known distance of two cameras, by their names."""
-    cameras = placement.cameras[kept].tolist()
     places = []
     for name in known[:2]:
         if name not in model.names:
@@ -116,4 +94,4 @@ def _gauge_of_distance(
             raise InputError(f"known_distance: the image {name} could not be placed; choose another")
         places.append(cameras.index(index))
     names = f"{known[0]} and {known[1]}"
-    return distance_gauge(placement.locations[kept], places[0], places[1], float(known[2]), names)
+    return distance_gauge(locations, places[0], places[1], float(known[2]), names)

@@ -13,7 +13,7 @@ from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, ch
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.options import LocateOptions, Source
-from sfm_shapefit.results import Inputs
+from sfm_shapefit.results.result import Inputs
 
 if TYPE_CHECKING:
     import pycolmap
@@ -34,7 +34,7 @@ class MatchSource:
     def batches(self, among: IntArray | None = None) -> Iterator[MatchBatch]:
         """Yield the matches of all pairs, or of those among some images, in the order of pairs."""
         if self.database is None:
-            return track_matches(self.model, 1)
+            return track_matches(self.model)
         return self.database.iter_matches(1, self.economy.batch, among)
 
     def counted(
@@ -76,12 +76,7 @@ class MatchSource:
 def open_source(
     model: PosedModel, inputs: Inputs, options: LocateOptions | None = None
 ) -> Iterator[MatchSource]:
-    """Open the matches that were chosen, and close them in the end.
-
-    Args:
-        model: whose images they belong to.
-        inputs: what was chosen.
-        options: whose limit of memory decides what is given up; None for no limit.
+    """Open the matches that were chosen, and close them in the end; without options memory has no limit.
 
     Raises:
         InputError: if the matches cannot be read, or there is no way to stay below the limit.

@@ -113,7 +113,6 @@ def sample_errors(
     """Return samples of the usable directions' errors, which share keypoints; None if not known."""
     if not samples_errors(source, directions):
         return None
-    usable = directions.usable()
     row_of = {tuple(pair): k for k, pair in enumerate(directions.pairs.tolist())}
     errors = np.zeros((len(directions.pairs), NUM_SAMPLES, 2))
     for batch in source.batches():
@@ -125,7 +124,7 @@ def sample_errors(
             SIGMA_PER_MEDIAN * directions.median_residual_px[rows],
             options.inlier_threshold_px,
         )
-    return errors[usable]
+    return errors[directions.usable()]
 
 
 def collect_evidence(directions: PairDirections, errors: FloatArray | None = None) -> Evidence:
@@ -156,4 +155,4 @@ def add_evidence(
         draws = np.random.default_rng(0).standard_normal((len(own), *errors.shape[1:]))
         sigmas = np.sqrt(np.diagonal(own, axis1=1, axis2=2))
         errors = np.concatenate([errors, sigmas[:, None, :] * draws])
-    return measured.with_evidence(replace(evidence, support=support, errors=errors))
+    return replace(measured, evidence=replace(evidence, support=support, errors=errors))

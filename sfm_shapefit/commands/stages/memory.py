@@ -130,13 +130,7 @@ def forecast(work: Workload, economy: Economy = ECONOMIES[0]) -> Forecast:
 def choose_economy(
     work: Workload, without_points: Workload, limit_mb: float, least: Economy = ECONOMIES[0]
 ) -> Economy:
-    """Return the cheapest economy whose forecast stays below a limit.
-
-    Args:
-        work: what there is to do.
-        without_points: what there is to do if no 3D points join the graph.
-        limit_mb: that the peak may not exceed.
-        least: what is given up already.
+    """Return the cheapest economy, from `least` on, whose forecast stays below a limit.
 
     Raises:
         InputError: if none does; the message has the number needed.
@@ -155,13 +149,9 @@ def choose_economy(
 def keep_within_memory(
     work: Workload, measured: MeasuredGraph, options: LocateOptions, least: Economy
 ) -> tuple[Economy, MeasuredGraph, LocateOptions]:
-    """Return what is given up to stay below `options.max_memory_mb`, and the graph and options then.
+    """Return what is given up, `least` or more, to stay below `options.max_memory_mb`, if that is not 0.
 
-    Args:
-        work: what there is to do but for the graph.
-        measured: the graph, with its rigid groups.
-        options: the settings; a limit of 0 is none.
-        least: what is given up already.
+    The graph and the options come back as they are then; the work is what there is to do but for the graph.
 
     Raises:
         InputError: with the number needed, if there is no way.

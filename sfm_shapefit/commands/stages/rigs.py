@@ -1,7 +1,7 @@
 """Rigs and fixed cameras in `locate`: which images form rigid groups, and how these are placed.
 
 The frames of a model with rigs are groups with metric offsets. Cameras that are fixed stand where the input
-has them: two or more are one group, whose offsets are their centres; of a single one only the origin can be
+has them: two or more are one group, whose offsets are their centers; of a single one only the origin can be
 taken.
 """
 
@@ -16,7 +16,7 @@ from sfm_shapefit.arrays import BoolArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.formats.lines import refuse_irregular_file
+from sfm_shapefit.formats.lines import text_of
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement.place import Placement, place
@@ -24,7 +24,7 @@ from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_grou
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
 from sfm_shapefit.solver.rigs.tied import largest_tied
 
-# Extent of the fixed centres, of their distance from the origin, that counts as none.
+# Extent of the fixed centers, of their distance from the origin, that counts as none.
 _COINCIDENT = 1e-9
 
 
@@ -47,12 +47,7 @@ class Rigid(NamedTuple):
 
 
 def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: bool) -> Rigid:
-    """Return what moves together and what not at all.
-
-    Args:
-        model: the input.
-        options: which images are fixed, and the scale asked for.
-        has_priors: whether position priors are to set scale and axes.
+    """Return what moves together and what not at all; priors, if there are any, set scale and axes.
 
     Raises:
         InputError: if a name to be fixed is unknown, the fixed images stand at one place, or another scale is
@@ -115,21 +110,19 @@ def place_cameras(measured: MeasuredGraph, options: LocateOptions, clock: Clock)
     Offsets do what 3D points do otherwise, and rays to far points let the convex starts collapse. So points
     take part with groups only if they are wanted always, or if cameras hang loose without them.
     """
-    settings = options
     first = None
     if measured.groups is not None and measured.num_points and options.points != "always":
         with suppress(UnsolvableError):
-            first = place(measured.without_points(), settings, on_iteration=clock.iteration)
+            first = place(measured.without_points(), options, on_iteration=clock.iteration)
         if first is not None and not first.assessment.loose_groups:
             return first
-    second = place(measured, settings, on_iteration=clock.iteration)
-    return second if first is None or _count_held(second) > _count_held(first) else first
+    second = place(measured, options, on_iteration=clock.iteration)
 
+    def count_held(placement: Placement) -> int:
+        loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
+        return len(placement.cameras) - loose
 
-def _count_held(placement: Placement) -> int:
-    """Return how many cameras are placed and not loose."""
-    loose = sum(len(group.cameras) for group in placement.assessment.loose_groups)
-    return len(placement.cameras) - loose
+    return second if first is None or count_held(second) > count_held(first) else first
 
 
 def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
@@ -145,15 +138,8 @@ def _read_fixed_images(model: PosedModel, fix: str) -> BoolArray:
             )
         return solved
     path, index = Path(fix), {name: k for k, name in enumerate(model.names)}
-    refuse_irregular_file(path)
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path} cannot be read; give a text file with the name of one image per line"
-        ) from error
     fixed = np.zeros(model.num_images, dtype=np.bool_)
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(text_of(path).splitlines(), start=1):
         name = line.strip()
         if not name or name.startswith("#"):
             continue

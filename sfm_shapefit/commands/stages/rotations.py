@@ -14,7 +14,7 @@ from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.place import place
-from sfm_shapefit.results import Inputs
+from sfm_shapefit.results.result import Inputs
 from sfm_shapefit.rotations.acceptance import refine_rotations
 
 _REFINEMENT_ROUNDS = 2
@@ -31,7 +31,7 @@ def refine_model_rotations(
 ) -> tuple[PosedModel, FloatArray]:
     """Return the model with refined rotations, and by how many degrees each camera turned, shape (n,).
 
-    Directions need rotations and the refinement needs centres: cameras are placed, rotations refined, and
+    Directions need rotations and the refinement needs centers: cameras are placed, rotations refined, and
     both once more, for with better rotations more pairs have a direction. What a camera may turn is
     always judged against its given rotation.
     """
@@ -60,13 +60,7 @@ def refine_model_rotations(
 
 
 def _rays_of_pairs(source: MatchSource, rows: IntArray, cameras: IntArray) -> RayMatches:
-    """Return matches of some pairs, evenly picked where a pair has too many.
-
-    Args:
-        source: the images and their matches.
-        rows: (k,) ascending positions of the pairs among all pairs with matches.
-        cameras: (n,) ascending images that become cameras 0 to n - 1; they hold all ends of the pairs.
-    """
+    """Return matches, evenly picked, of rows (k,) of the pairs, their images as positions in `cameras`."""
     limit = int(np.clip(_REFINEMENT_MATCHES // max(len(rows), 1), *_MATCHES_PER_PAIR))
     parts, first = [], 0
     for batch in source.batches():

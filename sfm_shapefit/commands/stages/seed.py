@@ -1,4 +1,4 @@
-"""From placed cameras to seeded models: poses, points, colours, and bundle adjustment if asked for."""
+"""From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
@@ -16,7 +16,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
-from sfm_shapefit.results import FurtherPiece
+from sfm_shapefit.results.result import FurtherPiece
 
 if TYPE_CHECKING:
     import pycolmap
@@ -59,21 +59,20 @@ def build_seeded_model(
 
     An executor shares out the model's own tracks.
     """
-    adjusted, fixed, axes = None, located.fixed, located.gauge.axes
+    adjusted, axes = None, located.gauge.axes
     with clock("structure"):
         seed, tracks = _seed_and_tracks(source, located, clock.advance)
-    if not options.bundle_adjust:  # which triangulates at the seed's poses itself
+    if not options.bundle_adjust:
         with clock("triangulation"):
-            settings = options
-            seeded = triangulate(seed, tracks, settings, clock.advance, executor, in_place=True)
-    if options.bundle_adjust:
+            seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
+    else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            frames = () if fixed is None else source.model.frame_ids[fixed].tolist()
+            frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
             adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
-    if source.database is not None:  # points of the model's own tracks have their colours already
-        with clock("colours"):
+    if source.database is not None:  # points of the model's own tracks have their colors already
+        with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
     return seeded if axes is None else turn_model(seeded, axes), adjusted
 

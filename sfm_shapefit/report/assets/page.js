@@ -10,7 +10,7 @@
   const VARIABLES = ["--agrees", "--contradicts", "--undetermined", "--nodirection"];
   const RAMP = [[0, "#b3202c"], [0.4, "#e8743b"], [0.7, "#e9c54a"], [1, "#2a9d8f"]];
   const STATES = {
-    input: "at the input's centres", optimum: "at the convex optimum", output: "at the output's centres",
+    input: "at the input's centers", optimum: "at the convex optimum", output: "at the output's centers",
   };
   const ROWS_PER_PAGE = 12;
   const MANY_PAIRS = 4000; // agreeing pairs from here on are not drawn until asked for
@@ -65,7 +65,7 @@
     ["placed", isPlaced(k) ? "yes" : "no"],
     ["trust", number(cameras.trust[k], 2)],
     ["std. deviation", number(cameras.sigma[k]) && `${number(cameras.sigma[k])} units`],
-    ["centre", isPlaced(k) ? at(cameras.world, k).slice(0, data.shownAxes).map((x) => number(x, 5)).join(", ") : ""],
+    ["center", isPlaced(k) ? at(cameras.world, k).slice(0, data.shownAxes).map((x) => number(x, 5)).join(", ") : ""],
     ["pairs", String(cameras.degree[k])],
     ["piece", cameras.piece[k] < 0 ? "none" : String(cameras.piece[k])],
     ["why", reason(cameras.reason[k])],
@@ -184,7 +184,7 @@
   };
   const nothing = () => ({ x: [null], y: [null], z: [null] });
 
-  // Dark points would vanish on a dark page and light ones on a light page; points without colours are grey.
+  // Dark points would vanish on a dark page and light ones on a light page; points without colors are gray.
   const pointColors = () => {
     const { colors } = points;
     if (colors.every((part) => part === 0)) return new Array(colors.length / 3).fill(color("--soft"));
@@ -198,7 +198,7 @@
     return shades;
   };
 
-  const LAYERS = []; // name, label, colour variable or null, traces, whether it is shown at first
+  const LAYERS = []; // name, label, color variable or null, traces, whether it is shown at first
   const traces = [];
   const addLayer = (name, label, variable, shown, made) => {
     LAYERS.push({ name, label, variable, shown, indices: made.map((item) => traces.push(item) - 1) });
@@ -244,7 +244,7 @@
         ["x", "y", "z"].forEach((name, c) => moved[name].push(now[c], before[c], null));
         moved.camera.push(k, k, k);
       }
-      addLayer("input", "From here to the input's centres", "--soft", false, [trace({
+      addLayer("input", "From here to the input's centers", "--soft", false, [trace({
         ...moved, customdata: moved.camera, kind: "camera", line: { color: color("--soft"), width: 2 },
       })]);
     }
@@ -378,7 +378,7 @@
     highlight(!turn || scroll);
     if (scroll) $("h-scene").scrollIntoView({ block: "start", behavior: "smooth" });
   };
-  const highlight = (centred) => {
+  const highlight = (centered) => {
     if (!plot.data) return;
     const [kind, k] = selected;
     const ends = placedEnds(selected);
@@ -394,7 +394,7 @@
     ];
     const style = { x: coordinate(0), y: coordinate(1), z: coordinate(2) };
     const layout = {};
-    if (centred && marks.length) {
+    if (centered && marks.length) {
       const middle = normal([0, 1, 2].map((c) => marks.reduce((sum, p) => sum + p[c], 0) / marks.length));
       const view = plot.layout.scene.camera;
       const keep = kind === "camera" ? 0.7 : 0.85; // of the distance, down to a limit

@@ -65,7 +65,7 @@ class DenseFactor(NamedTuple):
     ridge: tuple[float, float]
     """First and last multiple of the identity added to M, per mean eigenvalue."""
     refinements: int
-    """After which a step must fulfil its equations, or is not taken."""
+    """After which a step must fulfill its equations, or is not taken."""
     patience: int
     """Factorizations without progress after which more of this precision will not help."""
 

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray, frozen, sum_by
 from sfm_shapefit.errors import InputError
 
 # An offset within its group smaller than this, relative to the largest offset, counts as none.
@@ -78,9 +78,7 @@ class RigidGroups:
 
     def _sum(self, values: FloatArray) -> FloatArray:
         """Return the sum of values (n, d) over each group, (B, d)."""
-        return np.stack(
-            [np.bincount(self.group_of, column, minlength=self.num_groups) for column in values.T], axis=1
-        )
+        return sum_by(self.group_of, values, self.num_groups)
 
     def fit(self, locations: FloatArray) -> tuple[FloatArray, float]:
         """Return the x whose A x is nearest to locations (n, d), and its largest distance from them.

@@ -12,7 +12,7 @@ eta - h^T K^-1 h. Translations are taken away by grounding one group.
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray, sum_by
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.cholesky import allocate_factor, analyze
 from sfm_shapefit.solver.newton.reduction import Reduction
@@ -105,10 +105,5 @@ class ReducedFactor(Reduction):
 
     def _at_groups(self, values: FloatArray) -> FloatArray:
         """Return the sum of the signed values (m, d) at each group, (B, d)."""
-        count, ends = self.groups.num_groups, self._ends
-        sums = [
-            np.bincount(ends[:, 0], column, minlength=count)
-            - np.bincount(ends[:, 1], column, minlength=count)
-            for column in values.T
-        ]
-        return np.stack(sums, axis=1)
+        leaving, entering = (sum_by(end, values, self.groups.num_groups) for end in self._ends.T)
+        return np.asarray(leaving - entering)

@@ -1,7 +1,7 @@
 """The entry to the solvers over rigid groups: choose a method, solve, certify."""
 
 import time
-from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from sfm_shapefit.solver.program import scale_functional
 from sfm_shapefit.solver.rigs.certificate import certify_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups
 from sfm_shapefit.solver.rigs.reduced import ReducedFactor
-from sfm_shapefit.solver.solve import Choice, Run, run_choice
+from sfm_shapefit.solver.solve import Choice, run_choice
 from sfm_shapefit.viewgraph import ViewGraph
 
 # A^T c counts as 0 below this size, relative to the sum of weights.
@@ -63,32 +63,27 @@ def solve_groups(
         dual[outer] = dual_between
         return certify_groups(graph, groups, locations, dual, uniqueness=options.uniqueness)
 
-    return run_choice(between, _choose_method(unit, options), options, on_iteration, prove, start)
+    return run_choice(between, _choose_method(between, unit, options), options, on_iteration, prove, start)
 
 
-def _choose_method(groups: RigidGroups, options: SolverOptions) -> Choice:
-    """Return the solver that is asked for, if it knows groups."""
+def refuse_admm(options: SolverOptions) -> None:
+    """Raise InputError if the solver is asked for that does not know groups."""
     if options.solver == "admm":
-        raise InputError(
-            "solver 'admm' does not know rigs and fixed cameras; choose 'auto', 'newton' or 'conic'"
-        )
+        raise InputError("rigs and fixed cameras have no solver admm; choose auto, newton or conic")
+
+
+def _choose_method(graph: ViewGraph, groups: RigidGroups, options: SolverOptions) -> Choice:
+    """Return the solver that is asked for, if it knows groups."""
+    refuse_admm(options)
     by_size = f"{groups.num_nodes} nodes in {groups.num_groups} groups"
     reason = by_size if options.solver == "auto" else "asked for"
     if options.solver == "conic":
-        return Choice("conic", partial(_run_conic, groups), reason)
-    return Choice("newton", partial(_run_newton, groups), reason)
-
-
-def _run_newton(
-    groups: RigidGroups, graph: ViewGraph, options: SolverOptions, limit: int, watch: OnIteration | None
-) -> Run:
+        return Choice("conic", lambda graph, tol, limit, _: solve_conic(graph, tol, limit, groups), reason)
     factor = ReducedFactor(
         graph.edges, groups, threads=options.num_threads(), max_bytes=options.factor_memory_mb * 1_000_000
     )
-    return Run(*solve_newton_reduced(graph, factor, options.tol, limit, watch))
 
+    def newton(graph: ViewGraph, tol: float, limit: int, watch: OnIteration | None) -> tuple[Any, ...]:
+        return solve_newton_reduced(graph, factor, tol, limit, watch)
 
-def _run_conic(
-    groups: RigidGroups, graph: ViewGraph, options: SolverOptions, limit: int, _watch: OnIteration | None
-) -> Run:
-    return Run(*solve_conic(graph, options.tol, limit, groups))
+    return Choice("newton", newton, reason)
