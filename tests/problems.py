@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.measured import Evidence
 from sfm_shapefit.solver.options import OnIteration
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.rigs.groups import RigidGroups
@@ -98,6 +99,17 @@ def outer(graph: ViewGraph, groups: RigidGroups) -> tuple[ViewGraph, npt.NDArray
     return ViewGraph(graph.num_nodes, graph.edges[kept], graph.directions[kept], graph.weights[kept]), kept
 
 
+def make_evidence(num_pairs, support=100, against=(), against_support=50, errors=None) -> Evidence:
+    """Return the evidence of pairs of a support each, and of pairs against the rotations."""
+    against = np.array(against, dtype=np.int64).reshape(-1, 2)
+    return Evidence(
+        support=np.full(num_pairs, support),
+        contradicting=against,
+        contradicting_support=np.full(len(against), against_support),
+        errors=errors,
+    )
+
+
 def _measure(baselines: Floats, sigma: float, q: float, rng: np.random.Generator) -> Floats:
     """Return directions of baselines, each off by sigma or, with probability q, a random one."""
     v = normalized(normalized(baselines) + sigma * normalized(rng.normal(size=baselines.shape)))
@@ -115,6 +127,31 @@ def shape(locations: Floats) -> Floats:
 def shape_error(locations: Floats, truth: Floats) -> float:
     """Return the distance of two shapes: the relative error of Hand et al. (2015), section 4."""
     return float(np.linalg.norm(shape(locations) - shape(truth)))
+
+
+def fit_angles(t: Floats, edges: npt.NDArray[np.int64], directions: Floats, steps: int) -> Floats:
+    """Return t (n, d) after Gauss-Newton steps on the sum of |u_e - v_e|^2, by dense algebra.
+
+    Translation and scale, which no direction tells, do not move.
+    """
+    n, d = t.shape
+    i, j = edges.T
+    for _ in range(steps):
+        u = normalized(t[i] - t[j])
+        lengths = np.linalg.norm(t[i] - t[j], axis=1)
+        across = np.eye(d) - u[:, :, None] * u[:, None, :]
+        blocks, normal, pull = across / lengths[:, None, None] ** 2, np.zeros((n, n, d, d)), np.zeros((n, d))
+        for first, second, sign in ((i, i, 1.0), (j, j, 1.0), (i, j, -1.0), (j, i, -1.0)):
+            np.add.at(normal, (first, second), sign * blocks)
+        off = np.einsum("eab,eb->ea", across, u - directions) / lengths[:, None]
+        np.add.at(pull, i, off)
+        np.subtract.at(pull, j, off)
+        # Nothing pulls at the shifts and the scale, which are held so that the rest can be solved for.
+        free = np.column_stack([np.tile(np.eye(d), (n, 1)), (t - t.mean(axis=0)).ravel()])
+        free /= np.linalg.norm(free, axis=0)
+        matrix = normal.swapaxes(1, 2).reshape(n * d, n * d)
+        t = t - np.linalg.solve(matrix + matrix.max() * free @ free.T, pull.ravel()).reshape(n, d)
+    return t
 
 
 def solve_admm(

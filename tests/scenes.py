@@ -2,6 +2,9 @@
 
 import hashlib
 import shutil
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -22,6 +25,14 @@ def real_scene(name: str) -> Path:
 def copied(scene: Path, folder: Path) -> Path:
     """Return a private copy of a scene that a test may damage."""
     return Path(shutil.copytree(scene, folder / scene.name))
+
+
+def edit_database(path: Path, *statements: str | Callable[[sqlite3.Connection], object]) -> Path:
+    """Run SQL, or functions of the connection, on a database that a test owns."""
+    with closing(sqlite3.connect(path)) as connection, connection:
+        for statement in statements:
+            statement(connection) if callable(statement) else connection.execute(statement)
+    return path
 
 
 def fingerprint(folder: Path) -> dict[str, str]:

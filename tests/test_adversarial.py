@@ -3,8 +3,6 @@
 Twelve cameras with a direction for every pair, one of them, or one pair, changed for the worse.
 """
 
-import sqlite3
-
 import numpy as np
 import pycolmap
 import pytest
@@ -19,7 +17,7 @@ from sfm_shapefit.results.warnings import graph_warnings, quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs
-from tests.scenes import RING, copied
+from tests.scenes import RING, copied, edit_database
 
 N = 12
 BAD = N - 1
@@ -169,23 +167,16 @@ def test_twin_images_stand_at_one_center_and_their_pair_has_no_parallax(tmp_path
 
 def make_twin(database, of, twin):
     """Give an image the keypoints of another, which is of smaller id, and its matches."""
-    with sqlite3.connect(database) as connection:
-        keypoints = connection.execute(
-            "SELECT rows, cols, data FROM keypoints WHERE image_id = ?", (of,)
-        ).fetchone()
-        connection.execute(
-            "UPDATE keypoints SET rows = ?, cols = ?, data = ? WHERE image_id = ?", (*keypoints, twin)
-        )
-        own = np.repeat(np.arange(keypoints[0], dtype=np.uint32), 2)
-        connection.execute("DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = ?", (twin,))
-        connection.execute(
-            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config) "
-            "SELECT pair_id + ?, rows, cols, data, config FROM two_view_geometries "
-            "WHERE pair_id % 2147483647 = ?",
-            (twin - of, of),
-        )
-        connection.execute(
-            "INSERT INTO two_view_geometries (pair_id, rows, cols, data, config) VALUES (?, ?, 2, ?, 2)",
-            (of * 2147483647 + twin, keypoints[0], own.tobytes()),
-        )
-    connection.close()
+    rows, cols = "pair_id, rows, cols, data, config", "rows, cols, data"
+    own = np.repeat(np.arange(10_000, dtype="<u4"), 2).tobytes().hex()
+    number = f"(SELECT rows FROM keypoints WHERE image_id = {of})"
+    edit_database(
+        database,
+        f"UPDATE keypoints SET ({cols}) = (SELECT {cols} FROM keypoints WHERE image_id = {of}) "
+        f"WHERE image_id = {twin}",
+        f"DELETE FROM two_view_geometries WHERE pair_id % 2147483647 = {twin}",
+        f"INSERT INTO two_view_geometries ({rows}) SELECT pair_id + {twin - of}, {cols}, config "
+        f"FROM two_view_geometries WHERE pair_id % 2147483647 = {of}",
+        f"INSERT INTO two_view_geometries ({rows}) "
+        f"VALUES ({of * 2147483647 + twin}, {number}, 2, substr(x'{own}', 1, 8 * {number}), 2)",
+    )

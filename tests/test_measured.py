@@ -22,15 +22,19 @@ MEASURED = MeasuredGraph(
 )
 
 
-def test_pairs_are_the_edges_among_cameras():
+def test_pairs_are_the_edges_among_cameras_and_a_bare_graph_has_cameras_only():
     assert MEASURED.num_cameras == 5
     assert MEASURED.is_pair.tolist() == [True] * 4 + [False] * 2
     assert MEASURED.pairs.tolist() == [0, 1, 2, 3]
     assert MEASURED.classes.tolist() == [0, 0, 0, 0, 1, 1]
     assert MEASURED.cameras_per_group.tolist() == [2, 2, 1, 0, 0]
+    bare = MeasuredGraph(MEASURED.graph)
+    assert bare.num_cameras == 7
+    assert not bare.classes.any()
+    assert bare.part(np.array([0]))[0].covariance is None
 
 
-def test_a_part_renumbers_everything_alike():
+def test_a_part_renumbers_everything_alike_and_without_the_fixed_group_has_none():
     part, nodes = MEASURED.part(np.array([1, 2, 5]))
     assert nodes.tolist() == [1, 2, 4, 6]
     assert part.graph.names == ("n1", "n2", "n4", "n6")
@@ -44,11 +48,7 @@ def test_a_part_renumbers_everything_alike():
     assert part.groups.group_of.tolist() == [0, 0, 1, 2]
     np.testing.assert_array_equal(part.groups.offsets, MEASURED.groups.offsets[nodes])
     assert part.fixed_group == 1
-
-
-def test_a_part_without_the_fixed_group_has_none():
-    part, _ = MEASURED.part(np.array([0, 1]))
-    assert part.fixed_group is None
+    assert MEASURED.part(np.array([0, 1]))[0].fixed_group is None
 
 
 def test_without_points_all_cameras_keep_their_numbers():
@@ -61,10 +61,3 @@ def test_without_points_all_cameras_keep_their_numbers():
     assert bare.groups.num_groups == 3
     assert bare.fixed_group == 2
     assert bare.without_points() is bare
-
-
-def test_a_bare_graph_has_cameras_only():
-    measured = MeasuredGraph(MEASURED.graph)
-    assert measured.num_cameras == 7
-    assert not measured.classes.any()
-    assert measured.part(np.array([0]))[0].covariance is None

@@ -1,19 +1,15 @@
 """What README and docs say runs as it stands: commands one after the other, Python blocks, and every link."""
 
 import ast
-import os
 import re
 import shlex
-import signal
-import subprocess
-import sys
 from pathlib import Path
 
 import pycolmap
 import pytest
 
 from sfm_shapefit.cli import app
-from tests.program import run, run_python
+from tests.program import run, run_python, viewing
 from tests.scenes import COURTYARD, RING, ROOT
 
 README = ROOT / "README.md"
@@ -50,30 +46,10 @@ def test_examples_and_commands_are_found_on_every_page_that_has_them():
 @pytest.mark.parametrize(
     ("page", "number"), EXAMPLES, ids=lambda value: value.name if isinstance(value, Path) else str(value)
 )
-def test_every_python_example_of_the_docs_runs(page, number):
-    done = run_python("-W", "error", "-c", BLOCK.findall(TEXTS[page])[number])
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
-
-
-def viewed(arguments: list[str], folder: Path) -> None:
-    """Start the viewer, wait until it serves, and end it as a user does."""
-    pytest.importorskip("viser")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "sfm_shapefit.cli", *arguments],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        assert re.match(r"http://127\.0\.0\.1:\d+ ", process.stdout.readline())
-        process.send_signal(signal.SIGINT)
-        assert process.wait(timeout=60) == 0
-    finally:
-        process.kill()
-        process.communicate()
+def test_every_python_example_of_the_docs_runs(page, number, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    exec(BLOCK.findall(TEXTS[page])[number], {"__name__": "__main__"})
+    assert capsys.readouterr().out
 
 
 @pytest.mark.slow
@@ -92,33 +68,32 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
     for command in commands_of(page):
         arguments = shlex.split(command)
         if arguments[0] == "view":
-            viewed(arguments, tmp_path)
+            pytest.importorskip("viser")
+            with viewing(*arguments[1:], cwd=tmp_path) as address:
+                assert re.match(r"http://127\.0\.0\.1:\d+", address)
             continue
         result = run(*arguments)
         assert result.exit_code == 0, f"{command}\n{result.output}"
 
 
-def test_every_command_of_the_program_stands_in_the_readme():
+def test_the_readme_has_every_command_leads_with_a_light_picture_and_is_read_in_five_minutes():
     shown = {command.split()[0] for command in commands_of(README)}
     assert shown == {info.name for info in app.registered_commands if not info.hidden}
+    text = TEXTS[README]
+    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
+    assert (ROOT / picture).stat().st_size < 300_000
+    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
+    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_file_that_a_page_points_to_exists(page):
-    text = page.read_text(encoding="utf-8")
-    for target in re.findall(r"\]\((?!http)([^)]+)\)", text):
-        assert (page.parent / target).exists(), target
-    for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text):
-        assert (ROOT / script).exists(), script
-
-
-def test_every_page_of_the_docs_is_pointed_to():
-    targets = {
-        (page.parent / target).resolve()
-        for page in PAGES
-        for target in re.findall(r"\]\((?!http)([^)]+)\)", page.read_text(encoding="utf-8"))
-    }
-    assert set(PAGES[1:]) <= targets
+def test_every_file_that_a_page_points_to_exists_and_every_page_is_pointed_to():
+    pointed_to = set()
+    for page, text in TEXTS.items():
+        targets = {(page.parent / target).resolve() for target in re.findall(r"\]\((?!http)([^)]+)\)", text)}
+        scripts = {ROOT / script for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text)}
+        assert [path for path in targets | scripts if not path.exists()] == [], page
+        pointed_to |= targets
+    assert set(PAGES[1:]) <= pointed_to
 
 
 def strings_of(tree: ast.AST) -> list[str]:
@@ -138,11 +113,3 @@ def test_what_the_table_of_reasons_says_the_program_says():
     for row in table.splitlines()[2:]:
         sentence = re.sub(r"\b(N%?|X|\d+%)(?= |$)", "*", row.split("|")[1].strip())
         assert any(sentence in text for text in said), sentence
-
-
-def test_the_readme_leads_with_a_light_picture_and_is_read_in_five_minutes():
-    text = README.read_text(encoding="utf-8")
-    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
-    assert (ROOT / picture).stat().st_size < 300_000
-    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
-    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up

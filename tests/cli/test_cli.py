@@ -4,8 +4,6 @@ import dataclasses
 import json
 import re
 import shutil
-import signal
-import sqlite3
 from pathlib import Path
 
 import numpy as np
@@ -14,55 +12,39 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
-from sfm_shapefit.commands import write as files
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
-from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, fingerprint
+from tests.scenes import BUNDLED, COURTYARD, FACADE, RING, copied, edit_database, fingerprint
 
 RING_MODEL, FACADE_MODEL = RING / "sparse" / "0", FACADE / "sparse" / "0"
 
 
 @pytest.fixture(scope="module")
-def ring_out(tmp_path_factory):
+def ring_run(tmp_path_factory):
+    """A run of `locate`, and where it wrote."""
     out = tmp_path_factory.mktemp("ring") / "out"
-    run("locate", RING_MODEL, out, code=0)
-    return out
+    return run("locate", RING_MODEL, out, code=0), out
 
 
-def test_locate_writes_the_model_and_its_tables(ring_out):
-    written = {path.name for path in ring_out.iterdir()}
+def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_where_it_is(ring_run):
+    result, out = ring_run
     model = {"cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"}
-    assert written == model | {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
-    assert pycolmap.Reconstruction(ring_out).num_reg_images() == 8
-
-
-def test_the_summary_says_what_was_placed_and_where_it_is(tmp_path):
-    out = tmp_path / "out"
-    result = run("locate", RING_MODEL, out)
-    assert "8 of 8 images" in result.stdout
-    assert "certified to" in result.stdout
-    assert "locate.json" in result.stdout
+    tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
+    assert {path.name for path in out.iterdir()} == model | tables
+    assert pycolmap.Reconstruction(out).num_reg_images() == 8
+    for words in ("8 of 8 images", "certified to", "locate.json"):
+        assert words in result.stdout
     assert result.stderr == ""
 
 
-def test_json_is_the_only_thing_on_stdout_and_equals_the_file(tmp_path):
-    result = run("locate", RING_MODEL, tmp_path / "out", "--json")
-    assert json.loads(result.stdout) == json.loads((tmp_path / "out" / "locate.json").read_text())
-
-
-def test_quiet_prints_nothing(tmp_path):
-    result = run("locate", RING_MODEL, tmp_path / "out", "--quiet")
-    assert (result.exit_code, result.output) == (0, "")
-
-
-def test_colmaps_own_names_are_accepted(tmp_path):
+def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_names(tmp_path):
     out = tmp_path / "out"
     names = ("--input_path", RING_MODEL, "--output_path", out, "--database_path", RING / "database.db")
-    run("locate", *names, code=0)
-    assert out.is_dir()
+    result = run("locate", *names, "--json", code=0)
+    assert json.loads(result.stdout) == json.loads((out / "locate.json").read_text())
 
 
 def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
@@ -74,42 +56,32 @@ def test_paths_given_twice_or_not_at_all_are_wrong_usage(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_version_and_both_flags_of_help_are_there():
+def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_help(tmp_path):
     assert run("--version").stdout == f"sfm-shapefit {sfm_shapefit.__version__}\n"
     listed = run("-h").stdout
     assert listed == run("--help").stdout
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
+    assert "solve" not in listed
     assert run("view", "-h").stdout.startswith("Usage:")
-
-
-def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
-    graph = BUNDLED / "graph40.txt"
     flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
-    options = json.loads(run("solve", graph, tmp_path / "out", *flags).stdout)["options"]
+    done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
+    options = json.loads(done.stdout)["options"]
     assert (options["solver"], options["factor_memory_mb"]) == ("conic", 500)
     text = run("place", "--help").stdout
     assert "--method" not in text
     assert "--factor-memory " not in text
     assert run("solve", "--help").stdout == text.replace(" place ", " solve ", 1)
-    assert "solve" not in run("--help").stdout
 
 
-def test_help_lists_flags_in_the_groups_of_the_stages():
+def test_help_lists_every_option_as_a_flag_with_its_sentence_in_the_groups_of_the_stages():
     text = run("locate", "--help").stdout
     titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
     assert titles[:2] == ["Arguments:", "Options:"]
     assert titles[-1] == "What is written and shown:"
     assert len(titles) == 8
-
-
-def test_every_option_is_a_flag_with_its_sentence_and_changes_the_options(tmp_path):
-    text = run("locate", "--help").stdout
     for field in dataclasses.fields(LocateOptions):
         assert f"--{field.name.replace('_', '-')}" in text
     assert not re.search(r"\[default:\s*(None)?\]", text)
-    result = run("locate", FACADE_MODEL, tmp_path / "out", "--scale", "unit", "--threads", "1", "--json")
-    assert json.loads(result.stdout)["options"]["scale"] == "unit"
-    assert json.loads(result.stdout)["scale"].startswith("unit")
 
 
 @pytest.fixture(scope="module")
@@ -120,35 +92,29 @@ def plain(tmp_path_factory):
 
 
 @pytest.mark.parametrize(
-    ("flag", "value", "key"),
+    ("flags", "changed"),
     [
-        ("--min-inliers", "1000000", "num_pairs_rejected"),
-        ("--inlier-threshold-px", "0.3", "num_pairs_rejected"),
-        ("--max-reprojection-error-px", "0.3", "num_points"),
-        ("--min-triangulation-angle-deg", "40", "num_points"),
-        ("--min-inlier-ratio", "0.95", "num_pairs_rejected"),
-        ("--solver", "conic", "solve"),
-        ("--tol", "1e-3", "solve"),
-        ("--scale", "unit", "scale"),
-        ("--bundle-adjust", None, "bundle_adjustment"),
-        ("--directions", "tracks", "inputs"),
+        (
+            "--min-inlier-ratio 0.95 --bundle-adjust --scale unit",
+            "num_pairs_rejected bundle_adjustment scale",
+        ),
+        ("--inlier-threshold-px 0.3", "num_pairs_rejected"),
+        ("--max-reprojection-error-px 0.3", "num_points"),
+        ("--min-triangulation-angle-deg 40", "num_points"),
+        ("--solver conic", "solve"),
+        ("--tol 1e-3", "solve"),
+        ("--directions tracks", "inputs"),
     ],
 )
-def test_each_flag_matters(tmp_path, plain, flag, value, key):
-    values = [] if value is None else [value]
-    arguments = ("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", flag, *values)
-    if flag == "--min-inliers":
-        assert "none of the" in run_refused(*arguments, code=4)
-    else:
-        assert json.loads(run(*arguments).stdout)[key] != plain[key]
+def test_each_flag_matters(tmp_path, plain, flags, changed):
+    arguments = ("locate", COURTYARD / "truth", tmp_path / "out", "--json", "--no-report", *flags.split())
+    facts = json.loads(run(*arguments).stdout)
+    assert all(facts[key] != plain[key] for key in changed.split())
 
 
-def test_a_config_file_sets_options_and_flags_win(tmp_path):
-    config = tmp_path / "options.toml"
-    config.write_text('scale = "unit"\nmin_inliers = 20\n')
-    result = run("locate", FACADE_MODEL, tmp_path / "a", "--json", "--config", config, "--min-inliers", "16")
-    options = json.loads(result.stdout)["options"]
-    assert (options["scale"], options["min_inliers"]) == ("unit", 16)
+def test_a_flag_that_leaves_no_direction_is_refused(tmp_path):
+    few = ("--min-inliers", "1000000")
+    assert "none of the" in run_refused("locate", COURTYARD / "truth", tmp_path / "out", *few, code=4)
 
 
 @pytest.mark.parametrize("text", ["scale = ", "color = 3", "min_inliers = 'many'", "scale = 'metric'"])
@@ -158,9 +124,17 @@ def test_a_wrong_config_file_is_wrong_usage(tmp_path, text):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):
+def test_a_config_file_sets_options_and_flags_win(tmp_path):
+    (tmp_path / "options.toml").write_text('scale = "unit"\nmin_inliers = 20\n')
+    flags = ("--json", "--config", tmp_path / "options.toml", "--min-inliers", "16")
+    facts = json.loads(run("locate", FACADE_MODEL, tmp_path / "a", *flags).stdout)
+    assert (facts["options"]["scale"], facts["options"]["min_inliers"]) == ("unit", 16)
+    assert facts["scale"].startswith("unit")
+
+
+def test_quiet_prints_nothing_and_an_existing_output_is_refused_and_overwritten_on_request(tmp_path):
     out = tmp_path / "out"
-    run("locate", RING_MODEL, out, "-q", code=0)
+    assert run("locate", RING_MODEL, out, "-q", code=0).output == ""
     before = fingerprint(out)
     assert "exists already" in run_refused("locate", RING_MODEL, out)
     assert fingerprint(out) == before
@@ -201,7 +175,7 @@ def broken_scenes(folder: Path):
         rec.write(model)
 
     def sql(statement):
-        return lambda _, database: execute(database, statement)
+        return lambda _, database: edit_database(database, statement)
 
     no_pairs = sql("DELETE FROM two_view_geometries")
     unusable_pairs = sql("UPDATE two_view_geometries SET config = 7")
@@ -223,12 +197,6 @@ def broken_scenes(folder: Path):
     yield "database missing", [RING_MODEL, "--database", missing], 3, "missing.db"
 
 
-def execute(database, statement):
-    with sqlite3.connect(database) as connection:
-        connection.execute(statement)
-    connection.close()
-
-
 def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
     (tmp_path / "scenes").mkdir()
     for what, arguments, code, word in broken_scenes(tmp_path / "scenes"):
@@ -237,15 +205,6 @@ def test_bad_input_gets_one_sentence_and_leaves_no_trace(tmp_path):
         assert word in run_refused("locate", model, tmp_path / "out", *rest, code=code), what
         assert fingerprint(tmp_path) == before, what
         assert not (tmp_path / "out").exists(), what
-
-
-def test_an_interrupt_leaves_nothing(tmp_path, monkeypatch):
-    def interrupted(*_arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(files, "write_rows", interrupted)
-    assert "interrupted" in run_refused("locate", RING_MODEL, tmp_path / "out", code=130)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, monkeypatch):
@@ -283,8 +242,8 @@ def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
     assert "another component; see pieces/1" in (tmp_path / "out" / "cameras.csv").read_text()
 
 
-def test_evaluate_prints_a_table_json_and_csv(ring_out, tmp_path):
-    arguments = ("evaluate", ring_out, RING_MODEL, "--threshold", "0.5")
+def test_evaluate_prints_a_table_json_and_csv_and_writes_over_no_other_file(ring_run, tmp_path):
+    arguments = ("evaluate", ring_run[1], RING_MODEL, "--threshold", "0.5")
     table = run(*arguments, "--csv", tmp_path / "errors.csv", code=0)
     assert "8 in common of 8" in table.stdout
     errors = json.loads(run(*arguments, "--json").stdout)
@@ -293,6 +252,9 @@ def test_evaluate_prints_a_table_json_and_csv(ring_out, tmp_path):
     lines = (tmp_path / "errors.csv").read_text().splitlines()
     assert lines[0] == "name,position_error,rotation_error_deg,x,y,z"
     assert len(lines) == 9
+    (tmp_path / "images.bin").write_bytes(b"precious")
+    run_refused(*arguments, "--csv", tmp_path / "images.bin")
+    assert (tmp_path / "images.bin").read_bytes() == b"precious"
 
 
 def test_evaluate_refuses_models_without_common_cameras(tmp_path):
@@ -311,55 +273,39 @@ def test_synth_makes_a_workspace_that_locate_takes(tmp_path):
     run("synth", tmp_path / "other", "--num-images", "1", code=2)
 
 
-def test_names_cannot_play_with_the_terminal(tmp_path):
-    model = pycolmap.Reconstruction(RING_MODEL)
-    model.image(8).name = "[red]\x1b[2Jgone.jpg"
-    model.write(tmp_path)
-    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db", code=0)
-    assert "\x1b[2J" not in result.output
-    assert "[red]" in result.stdout
-
-
-def test_brackets_in_a_path_are_only_brackets(tmp_path):
+def test_names_cannot_play_with_the_terminal_and_brackets_are_only_brackets(tmp_path):
     folder = tmp_path / "a[b]:star:[red]"
     folder.mkdir()
-    scene = copied(RING, folder)
-    result = run("locate", scene / "sparse" / "0", folder / "out", code=0)
+    model = pycolmap.Reconstruction(RING_MODEL)
+    model.image(8).name = "[red]\x1b[2Jgone.jpg"
+    model.write(folder)
+    result = run("locate", folder, folder / "out", "--database", RING / "database.db", code=0)
+    assert "\x1b[2J" not in result.output
+    assert "[red]" in result.stdout
     assert "[b]:star:[red]" in "".join(result.stdout.split())
-    run("evaluate", folder / "out", scene / "sparse" / "0", code=0)
+    run("evaluate", folder / "out", folder, code=0)
 
 
-def test_evaluate_does_not_write_over_other_files(ring_out, tmp_path):
-    (tmp_path / "images.bin").write_bytes(b"precious")
-    run_refused("evaluate", ring_out, RING_MODEL, "--csv", tmp_path / "images.bin")
-    assert (tmp_path / "images.bin").read_bytes() == b"precious"
-
-
-def test_a_scale_from_meaningless_centers_is_warned_about(tmp_path):
+def test_a_scale_from_meaningless_centers_and_a_model_without_points_are_warned_about(tmp_path):
     model = pycolmap.Reconstruction(RING_MODEL)
     rng = np.random.default_rng(0)
     for frame in model.frames.values():
         rotation = frame.rig_from_world.rotation
         frame.rig_from_world = pycolmap.Rigid3d(rotation, 100.0 * rng.standard_normal(3))
     model.write(tmp_path)
-    result = run("locate", tmp_path, tmp_path / "out", "--database", RING / "database.db", "--json")
-    assert any("of their spread off" in warning for warning in json.loads(result.stdout)["warnings"])
-
-
-def test_a_model_without_points_is_warned_about(tmp_path):
-    result = run("locate", RING_MODEL, tmp_path / "out", "--min-triangulation-angle-deg", "89", "--json")
-    facts = json.loads(result.stdout)
+    flags = ("--database", RING / "database.db", "--min-triangulation-angle-deg", "89", "--json")
+    facts = json.loads(run("locate", tmp_path, tmp_path / "out", *flags).stdout)
     assert facts["num_points"] == 0
+    assert any("of their spread off" in warning for warning in facts["warnings"])
     assert any("no 3D point" in warning for warning in facts["warnings"])
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_signal_while_writing_leaves_nothing(tmp_path, number):
+def test_a_signal_while_writing_leaves_nothing(tmp_path):
     script = f"""
-import os, sys
+import os, signal, sys
 from sfm_shapefit import cli
 from sfm_shapefit.commands import write as files
-files.write_rows = lambda *_: os.kill(os.getpid(), {int(number)})
+files.write_rows = lambda *_: os.kill(os.getpid(), signal.SIGTERM)
 sys.argv = ["sfm-shapefit", "locate", {str(RING_MODEL)!r}, {str(tmp_path / "out")!r}]
 cli.main()
 """

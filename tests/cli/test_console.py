@@ -11,11 +11,11 @@ from functools import partial
 
 import pytest
 
-from sfm_shapefit import MapOptions, locate, map_database
+from sfm_shapefit import locate
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
-from tests.program import run_python
-from tests.scenes import BUNDLED, FACADE, RING, ROOT
+from tests.program import run
+from tests.scenes import FACADE, RING, ROOT
 
 
 def stages_of(run) -> dict[str, list[tuple[int, int]]]:
@@ -59,16 +59,7 @@ def test_tracks_of_a_model_are_counted_by_its_images_and_the_solve_by_iterations
     assert {limit for _, limit in iterations} == {100}  # of Newton steps; see `solver.solve`
 
 
-@pytest.mark.slow
-def test_map_counts_the_pairs_whose_rotations_it_estimates():
-    database = BUNDLED / "photographed" / "database.db"
-    stages = stages_of(lambda progress: map_database(database, MapOptions(refine=False), progress=progress))
-    steps = stages["relative rotations"]
-    assert steps[:2] == [(0, 1), (1, 57)]
-    assert steps[-2:] == [(57, 57), (1, 1)]
-
-
-def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
+def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed_and_elsewhere_there_are_none(capfd):
     """A stage that ends before its limit, as a solve does, shows the steps that it took."""
     code = (
         "from sfm_shapefit.cli.console import show_progress\n"
@@ -93,24 +84,21 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
     os.close(master)
     assert process.wait() == 0
     assert re.findall(rb"(\d+)/(\d+)", shown)[-1] == (b"7", b"7")
-
-
-def test_nothing_is_shown_where_there_is_no_terminal(capfd):
     with show_progress(enabled=True) as progress:
         assert progress is None
     assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("verbose", [False, True])
-def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, verbose):
+def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd, verbose):
     command = ["locate", RING / "sparse/0", tmp_path / "out", "--bundle-adjust", "--no-report"]
-    done = run_python("-m", "sfm_shapefit.cli", *command, *["--verbose"] * verbose)
-    assert done.returncode == 0
+    done = run(*command, *["--verbose"] * verbose, code=0)
+    native = capfd.readouterr().err
     if not verbose:
-        assert done.stderr == ""
+        assert (done.stderr, native) == ("", "")
         assert re.search(r"time +│ \d+\.\d s +│", done.stdout)
         return
-    assert "Bundle adjustment report" in done.stderr
+    assert "Bundle adjustment report" in native
     assert "sfm-shapefit: directions\n" in done.stderr
     assert re.search(r"time +│ \d+\.\d s \(read \d+\.\d\d, directions \d+\.\d\d", done.stdout)
     assert "bundle adjustment" in done.stdout

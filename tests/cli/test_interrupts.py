@@ -1,27 +1,39 @@
 """Interrupts and lack of memory end a command in one sentence."""
 
 import signal
-import subprocess
-import sys
 
 import pytest
 
 from sfm_shapefit.cli import console
 from tests.program import run_python
-from tests.scenes import RING, ROOT
+from tests.scenes import RING
 
 
-def failing(error):
-    with console.report_errors():
+@pytest.mark.parametrize(
+    ("error", "received", "code", "words"),
+    [
+        (
+            RuntimeError("Caught an unknown exception!"),
+            [signal.SIGINT],
+            130,
+            "interrupted; nothing was written",
+        ),
+        (MemoryError(), [], 3, "memory"),
+        (RuntimeError("can't start new thread"), [], 3, "memory"),
+    ],
+)
+def test_what_native_code_makes_of_an_interrupt_and_lack_of_memory_are_one_sentence(
+    capsys, monkeypatch, error, received, code, words
+):
+    monkeypatch.setattr(console, "_received", received)
+    with pytest.raises(console.typer.Exit) as caught, console.report_errors():
         raise error
-
-
-def test_an_error_that_native_code_makes_of_an_interrupt_is_an_interrupt(capsys, monkeypatch):
-    monkeypatch.setattr(console, "_received", [signal.SIGINT])
-    with pytest.raises(console.typer.Exit) as caught:
-        failing(RuntimeError("Caught an unknown exception!"))
-    assert caught.value.exit_code == 130
-    assert capsys.readouterr().err == "sfm-shapefit: interrupted; nothing was written\n"
+    assert caught.value.exit_code == code
+    said = capsys.readouterr().err
+    assert words in said
+    assert said.count("\n") == 1
+    with pytest.raises(ZeroDivisionError), console.report_errors():  # a defect of ours stays visible
+        raise ZeroDivisionError
 
 
 def test_an_interrupt_that_a_callback_of_native_code_loses_comes_again_without_a_traceback():
@@ -40,23 +52,10 @@ except KeyboardInterrupt:
     assert (done.returncode, done.stderr) == (130, "")
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("can't start new thread")])
-def test_lack_of_memory_is_one_sentence(capsys, error):
-    with pytest.raises(console.typer.Exit) as caught:
-        failing(error)
-    assert caught.value.exit_code == 3
-    assert "memory" in capsys.readouterr().err
-    with pytest.raises(ZeroDivisionError):  # a defect of ours stays visible
-        failing(ZeroDivisionError())
-
-
 def test_an_address_space_too_small_for_the_libraries_is_refused_at_once(tmp_path):
-    command = (
-        f"ulimit -v 500000; exec {sys.executable} -m sfm_shapefit.cli locate {RING}/sparse/0 {tmp_path}/out"
-    )
-    done = subprocess.run(
-        ["bash", "-c", command], capture_output=True, text=True, check=False, cwd=ROOT, timeout=60
-    )
+    limit = "import os, resource, sys; resource.setrlimit(resource.RLIMIT_AS, (512_000_000,) * 2); "
+    start = "os.execv(sys.executable, [sys.executable, '-m', 'sfm_shapefit.cli', *sys.argv[1:]])"
+    done = run_python("-c", limit + start, "locate", RING / "sparse/0", tmp_path / "out")
     assert done.returncode == 3
     assert "512 MB of address space" in done.stderr
     assert done.stderr.count("\n") == 1

@@ -14,18 +14,15 @@ import pytest
 
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
-from sfm_shapefit.colmap.model import read_model, track_matches, world_rays
+from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, world_rays
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from tests.scenes import fingerprint, real_scene
+from tests.scenes import edit_database, fingerprint, real_scene
 
 EPS = np.finfo(np.float64).eps
 MODEL_FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 CAMERA_MODELS = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
-
-
-# --- scenes ------------------------------------------------------------------------------------------
 
 
 def synthesize(seed: int, *database: pycolmap.Database, **settings: object) -> pycolmap.Reconstruction:
@@ -42,6 +39,11 @@ def scene() -> pycolmap.Reconstruction:
     """Six posed images of two cameras around twelve points that all of them see, without noise."""
     rigs = {"num_rigs": 2, "num_cameras_per_rig": 1, "num_frames_per_rig": 3}
     return synthesize(1, **rigs, num_points3D=12, num_points2D_without_point3D=2)
+
+
+@pytest.fixture(scope="module")
+def model(scene: pycolmap.Reconstruction) -> PosedModel:
+    return read_model(scene)
 
 
 @pytest.fixture
@@ -73,7 +75,7 @@ def tiny_model() -> dict[str, list]:
 
 def write_tiny(folder: Path, records: dict[str, list]) -> Path:
     """Write records in COLMAP's binary layouts."""
-    folder.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     packed = {
         "cameras": lambda i, m, w, h, p: struct.pack(f"<IiQQ{len(p)}d", i, m, w, h, *p),
         "images": lambda i, pose, camera, name, points: (
@@ -102,9 +104,6 @@ def write_tiny(folder: Path, records: dict[str, list]) -> Path:
     return folder
 
 
-# --- models that are sound -----------------------------------------------------------------------------
-
-
 def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_path):
     text, legacy = tmp_path / "text", tmp_path / "legacy"
     text.mkdir()
@@ -127,27 +126,11 @@ def test_binary_text_and_legacy_models_give_the_same_poses(scene, folder, tmp_pa
             assert model.focal_lengths_px[k] == 1280.0
 
 
-def test_the_tiny_model_of_these_tests_is_sound(tmp_path):
-    model = read_model(write_tiny(tmp_path / "m", tiny_model()))
+def test_the_tiny_model_of_these_tests_is_sound_and_needs_no_points(tmp_path):
+    records = tiny_model()
+    model = read_model(write_tiny(tmp_path / "m", records))
     assert model.names == ("a.jpg", "b.jpg")
     assert not model.centers.any()  # all centers at the origin are fine
-
-
-def test_binary_files_win_over_text_files_in_the_same_folder(scene, folder):
-    for name in ("cameras", "images", "points3D"):
-        (folder / f"{name}.txt").write_text("not a model")
-    assert read_model(folder).num_images == scene.num_images()
-
-
-def test_poses_in_frames_win_over_those_in_images(tmp_path):
-    records = tiny_model()
-    records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
-    model = read_model(write_tiny(tmp_path / "m", records))
-    np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
-
-
-def test_a_model_without_points_is_read(tmp_path):
-    records = tiny_model()
     records["points3D"] = []
     for image in records["images"]:
         image[4] = []
@@ -156,10 +139,22 @@ def test_a_model_without_points_is_read(tmp_path):
     assert list(track_matches(model)) == []
 
 
-def test_images_without_a_pose_are_left_out(scene):
+def test_binary_files_win_over_text_files_and_poses_in_frames_over_those_in_images(tmp_path):
+    for name in ("cameras", "images", "points3D"):
+        (tmp_path / f"{name}.txt").write_text("not a model")
+    records = tiny_model()
+    records["frames"][0][2] = (0.0, 1.0, 0.0, 0.0, 1.0, 2.0, 3.0)
+    model = read_model(write_tiny(tmp_path, records))
+    np.testing.assert_array_equal(model.rotations[0], np.diag([1.0, -1.0, -1.0]))
+
+
+def test_images_without_a_pose_are_left_out_and_arrays_are_read_only(scene):
     copy = pycolmap.Reconstruction(scene)
     copy.deregister_frame(copy.image(3).frame_id)
-    assert 3 not in read_model(copy).image_ids
+    model = read_model(copy)
+    assert 3 not in model.image_ids
+    with pytest.raises(ValueError, match="read-only"):
+        model.rotations[0, 0, 0] = 2.0
 
 
 def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothing(
@@ -173,14 +168,6 @@ def test_reading_changes_neither_a_folder_nor_a_reconstruction_and_prints_nothin
     copy.write_binary(tmp_path / "again")
     assert fingerprint(folder) == before == fingerprint(tmp_path / "again")
     assert capfd.readouterr() == ("", "")
-
-
-def test_arrays_of_a_model_are_read_only(scene):
-    with pytest.raises(ValueError, match="read-only"):
-        read_model(scene).rotations[0, 0, 0] = 2.0
-
-
-# --- models that are bad -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", MODEL_FILES)
@@ -213,20 +200,13 @@ def test_changed_bytes_end_in_a_sound_answer_or_an_input_error(folder, name):
 
 
 @pytest.mark.parametrize("name", MODEL_FILES)
-@pytest.mark.parametrize("count", [2**63, 2**64 - 1, 10**6])
-def test_an_absurd_count_is_refused(folder, name, count):
+def test_an_absurd_count_and_bytes_after_the_last_record_are_refused(folder, name):
     data = (folder / name).read_bytes()
-    (folder / name).write_bytes(struct.pack("<Q", count) + data[8:])
-    with pytest.raises(InputError, match=rf"{name}.*truncated"):
-        check_model_files(folder)
-
-
-@pytest.mark.parametrize("name", MODEL_FILES)
-def test_bytes_after_the_last_record_are_refused(folder, name):
-    with (folder / name).open("ab") as stream:
-        stream.write(b"\0")
-    with pytest.raises(InputError, match=rf"{name}: 1 bytes follow"):
-        check_model_files(folder)
+    counted = [(struct.pack("<Q", count) + data[8:], "truncated") for count in (2**63, 2**64 - 1, 10**6)]
+    for damaged, reason in [*counted, (data + b"\0", "1 bytes follow")]:
+        (folder / name).write_bytes(damaged)
+        with pytest.raises(InputError, match=rf"{name}.*{reason}"):
+            check_model_files(folder)
 
 
 def _set(*path_and_value):
@@ -320,13 +300,10 @@ def write_text_model(folder: Path, **changed: str) -> Path:
     return folder
 
 
-def test_a_text_model_with_comments_and_windows_line_ends_is_read(tmp_path):
-    changed = {name: text.replace("\n", "\r\n") for name, text in TEXT_MODEL.items()}
-    assert read_model(write_text_model(tmp_path / "m", **changed)).names == ("a.jpg", "b.jpg")
-
-
 @pytest.mark.parametrize("case", BROKEN_LINES)
-def test_a_broken_line_of_a_text_model_is_named(tmp_path, case):
+def test_a_broken_line_of_a_text_model_is_named_and_windows_line_ends_are_read(tmp_path, case):
+    windows = {name: text.replace("\n", "\r\n") for name, text in TEXT_MODEL.items()}
+    assert read_model(write_text_model(tmp_path / "m", **windows)).names == ("a.jpg", "b.jpg")
     name, old, new, message = BROKEN_LINES[case]
     assert old in TEXT_MODEL[name]
     changed = new.join(TEXT_MODEL[name].rsplit(old, 1))
@@ -334,25 +311,21 @@ def test_a_broken_line_of_a_text_model_is_named(tmp_path, case):
         read_model(write_text_model(tmp_path / "m", **{name: changed}))
 
 
-def test_a_folder_that_is_no_model_is_refused_with_advice(folder, tmp_path):
+def test_a_folder_that_is_no_model_is_refused_with_advice_and_the_one_that_was_meant(folder, tmp_path):
     (folder / "points3D.bin").rename(tmp_path / "elsewhere")
     (tmp_path / "empty").mkdir()
+    write_tiny(tmp_path / "a" / "0", tiny_model())
+    write_tiny(tmp_path / "b" / "sparse" / "0", tiny_model())
     for path, message in (
         (folder, r"lacks points3D\.bin"),
         (tmp_path / "nowhere", "does not exist"),
         (folder / "cameras.bin", "is a file"),
         (tmp_path / "empty", "holds no COLMAP model; give the folder with"),
+        (tmp_path / "a", rf"but {tmp_path / 'a' / '0'} does"),
+        (tmp_path / "b", rf"but {tmp_path / 'b' / 'sparse' / '0'} does"),
     ):
         with pytest.raises(InputError, match=message):
             read_model(path)
-
-
-@pytest.mark.parametrize("inner", ["0", "sparse/0"])
-def test_the_folder_that_was_meant_is_suggested(tmp_path, inner):
-    (tmp_path / inner).mkdir(parents=True)
-    write_tiny(tmp_path / inner, tiny_model())
-    with pytest.raises(InputError, match=rf"but {tmp_path / inner} does"):
-        read_model(tmp_path)
 
 
 @pytest.mark.parametrize(("there", "missing"), [("rigs", "frames"), ("frames", "rigs")])
@@ -362,21 +335,14 @@ def test_rigs_and_frames_come_together(folder, there, missing):
         read_model(folder)
 
 
-@pytest.mark.parametrize(
-    ("damage", "reason"),
-    [
-        pytest.param(
-            lambda file: file.chmod(0),
-            "Permission denied",
-            marks=pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything"),
-        ),
-        (lambda file: (file.unlink(), file.mkdir()), "Is a directory"),
-    ],
-)
-def test_a_file_that_cannot_be_read_is_refused(folder, damage, reason):
-    damage(folder / "images.bin")
-    with pytest.raises(InputError, match=rf"images\.bin cannot be read: {reason}"):
-        read_model(folder)
+def test_a_file_that_cannot_be_read_is_refused(folder):
+    reasons = {"Is a directory": lambda file: (file.unlink(), file.mkdir())}
+    if os.geteuid() != 0:  # root may read everything
+        reasons = {"Permission denied": lambda file: file.chmod(0)} | reasons
+    for reason, damage in reasons.items():
+        damage(folder / "images.bin")
+        with pytest.raises(InputError, match=rf"images\.bin cannot be read: {reason}"):
+            read_model(folder)
 
 
 def test_fewer_than_two_posed_images_are_refused(tmp_path):
@@ -426,9 +392,6 @@ def test_a_rig_of_two_cameras_is_read_with_the_poses_of_its_images(tmp_path):
     errors = evaluate(rig, tmp_path)
     assert len(errors.names) == 6
     assert errors.position.max == pytest.approx(0.0, abs=1e-9)
-
-
-# --- rays and tracks ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("camera_model", CAMERA_MODELS)
@@ -511,8 +474,7 @@ def test_track_matches_are_those_of_a_plain_loop_whatever_the_batch_size(scene, 
     assert len(expected) == 15
 
 
-def test_track_matches_carry_the_rays_of_their_keypoints(scene):
-    model = read_model(scene)
+def test_track_matches_carry_the_rays_of_their_keypoints(scene, model):
     (batch,) = track_matches(model)
     for p, (i, j) in enumerate(batch.pairs.tolist()):
         rows = slice(batch.offsets[p], batch.offsets[p + 1])
@@ -523,8 +485,6 @@ def test_track_matches_carry_the_rays_of_their_keypoints(scene):
             # exact projections; undistorting the pixel iterates to about 1e-10
             assert angle_between_deg(rays[rows], truth).max() < 1e-6
 
-
-# --- databases ---------------------------------------------------------------------------------------
 
 SCHEMA = """
 CREATE TABLE cameras (camera_id INTEGER PRIMARY KEY, model INTEGER, params BLOB);
@@ -563,6 +523,12 @@ def write_database(path: Path, scene: pycolmap.Reconstruction, id_of=lambda i: i
     return path
 
 
+@pytest.fixture
+def path(scene: pycolmap.Reconstruction, tmp_path: Path) -> Path:
+    """The scene as a database."""
+    return write_database(tmp_path / "d.db", scene)
+
+
 def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=None) -> None:
     """Insert or replace one row of two_view_geometries."""
     if pose is not None:
@@ -572,19 +538,6 @@ def add_pair(connection, a, b, rows, *, config=2, pose=None, qvec=None, tvec=Non
         "INSERT OR REPLACE INTO two_view_geometries VALUES (?, ?, 2, ?, ?, NULL, NULL, NULL, ?, ?)",
         (pair_id(a, b), len(rows), data, config, qvec, tvec),
     )
-
-
-def edited(path: Path, *statements) -> Path:
-    """Run SQL on a database that a test owns."""
-    connection = sqlite3.connect(path)
-    for statement in statements:
-        if callable(statement):
-            statement(connection)
-        else:
-            connection.execute(*statement) if isinstance(statement, tuple) else connection.execute(statement)
-    connection.commit()
-    connection.close()
-    return path
 
 
 def read_all(path: Path, model):
@@ -619,8 +572,7 @@ def test_matches_are_found_by_name_whatever_the_ids(scene, tmp_path, order, cols
 
 
 @pytest.mark.parametrize("order", ID_ORDERS)
-def test_relative_poses_point_from_camera_j_to_camera_i(scene, tmp_path, order):
-    model = read_model(scene)
+def test_relative_poses_point_from_camera_j_to_camera_i(scene, model, tmp_path, order):
     _, poses = read_all(write_database(tmp_path / "d.db", scene, ID_ORDERS[order]), model)
     assert poses.pairs.tolist() == [list(pair) for pair in itertools.combinations(range(6), 2)]
     assert_poses_point_to_the_first_camera(poses, model)
@@ -632,8 +584,7 @@ def test_relative_poses_point_from_camera_j_to_camera_i(scene, tmp_path, order):
 
 
 @pytest.mark.parametrize("cache_bytes", [0, 10**6])
-def test_rays_of_database_matches_are_those_of_its_keypoints(scene, tmp_path, cache_bytes):
-    model = read_model(scene)
+def test_rays_of_database_matches_are_those_of_its_keypoints(scene, model, tmp_path, cache_bytes):
     path = write_database(tmp_path / "d.db", scene, ID_ORDERS["reversed ids"])
     with open_database(path, model) as database:
         database.limit_rays(cache_bytes)
@@ -645,31 +596,30 @@ def test_rays_of_database_matches_are_those_of_its_keypoints(scene, tmp_path, ca
                 np.testing.assert_array_equal(rays[rows], expected[batch.keypoints[rows, side]])
 
 
-@pytest.mark.parametrize("limit", [1, 12, 30, 10**6])
-def test_batches_of_any_size_join_to_the_same_matches(scene, tmp_path, limit):
-    model = read_model(scene)
-    with open_database(write_database(tmp_path / "d.db", scene), model) as database:
-        batches = list(database.iter_matches(1, limit))
+def test_batches_of_any_size_join_to_the_same_matches(path, model):
+    with open_database(path, model) as database:
         (whole,) = database.iter_matches(1)
-    assert all(len(batch.keypoints) <= max(limit, 12) for batch in batches)
-    assert len(batches) == -(-15 // max(limit // 12, 1))
-    np.testing.assert_array_equal(np.concatenate([batch.pairs for batch in batches]), whole.pairs)
-    np.testing.assert_array_equal(np.concatenate([batch.rays_j for batch in batches]), whole.rays_j)
+        for limit in (1, 12, 30, 10**6):
+            batches = list(database.iter_matches(1, limit))
+            assert all(len(batch.keypoints) <= max(limit, 12) for batch in batches)
+            assert len(batches) == -(-15 // max(limit // 12, 1))
+            for name in ("pairs", "rays_j"):
+                joined = np.concatenate([getattr(batch, name) for batch in batches])
+                np.testing.assert_array_equal(joined, getattr(whole, name))
 
 
-def test_repeated_matches_count_once_and_thin_pairs_are_left_out(scene, tmp_path):
+def test_repeated_matches_count_once_and_thin_pairs_are_left_out(path, model):
     def change(connection):
         add_pair(connection, 1, 2, [(3, 4), (0, 1), (3, 4), (3, 5), (0, 1)])
         add_pair(connection, 1, 3, [(0, 0), (0, 0), (0, 0)])
 
-    path = edited(write_database(tmp_path / "d.db", scene), change)
-    with open_database(path, read_model(scene)) as database:
+    with open_database(edit_database(path, change), model) as database:
         batch = next(database.iter_matches(3))
     assert batch.pairs[:2].tolist() == [[0, 1], [0, 3]]
     assert batch.keypoints[:3].tolist() == [[0, 1], [3, 4], [3, 5]]  # sorted, whatever the order there
 
 
-def test_only_configurations_with_verified_matches_or_poses_are_used(scene, tmp_path):
+def test_only_configurations_with_verified_matches_or_poses_are_used(path, model):
     pairs = list(itertools.combinations(range(1, 6), 2))  # ten pairs, one per configuration
     pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([0.0, 0.0, 2.0]))
 
@@ -678,14 +628,14 @@ def test_only_configurations_with_verified_matches_or_poses_are_used(scene, tmp_
         for config, (a, b) in enumerate(pairs):
             add_pair(connection, a, b, [(0, 0), (1, 1)], config=config, pose=pose)
 
-    matches, poses = read_all(edited(write_database(tmp_path / "d.db", scene), change), read_model(scene))
+    matches, poses = read_all(edit_database(path, change), model)
     config_of = {(a - 1, b - 1): config for config, (a, b) in enumerate(pairs)}
     assert [config_of[pair] for pair in matches] == [2, 3, 4, 5, 6, 8, 9]
     assert poses.configs.tolist() == [2, 3, 4, 6, 9]
     np.testing.assert_array_equal(poses.translations, [[0.0, 0.0, 1.0]] * 5)
 
 
-def test_poses_that_mean_none_are_left_out(scene, tmp_path):
+def test_poses_that_mean_none_are_left_out(path, model):
     def blob(*values):
         return np.array(values, dtype="<f8").tobytes()
 
@@ -703,20 +653,15 @@ def test_poses_that_mean_none_are_left_out(scene, tmp_path):
         for (qvec, tvec), (a, b) in zip([*absent, (one, step)], pairs, strict=False):
             add_pair(connection, a, b, [(0, 0)], qvec=qvec, tvec=tvec)
 
-    matches, poses = read_all(edited(write_database(tmp_path / "d.db", scene), change), read_model(scene))
+    matches, poses = read_all(edit_database(path, change), model)
     assert len(matches) == len(absent) + 1
     assert len(poses.pairs) == 1
     np.testing.assert_array_equal(poses.translations, [[1.0, 0.0, 0.0]])
 
 
-def test_an_old_database_without_pose_columns_has_no_relative_poses(scene, tmp_path):
-    path = edited(
-        write_database(tmp_path / "d.db", scene),
-        "ALTER TABLE two_view_geometries DROP COLUMN qvec",
-        "ALTER TABLE two_view_geometries DROP COLUMN tvec",
-        "DROP TABLE cameras",
-    )
-    matches, poses = read_all(path, read_model(scene))
+def test_an_old_database_without_pose_columns_has_no_relative_poses(path, model):
+    drop = "ALTER TABLE two_view_geometries DROP COLUMN "
+    matches, poses = read_all(edit_database(path, drop + "qvec", drop + "tvec", "DROP TABLE cameras"), model)
     assert len(matches) == 15
     assert poses.pairs.shape == (0, 2)
     assert poses.rotations.shape == (0, 3, 3)
@@ -740,30 +685,19 @@ def assert_poses_point_to_the_first_camera(poses, model):
     np.testing.assert_allclose(directions, normalized(model.centers[i] - model.centers[j]), atol=256 * EPS)
 
 
-def test_images_that_only_one_side_has_are_named_or_skipped(scene, tmp_path):
-    path = edited(
-        write_database(tmp_path / "d.db", scene),
-        "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)",
-    )
-    model = read_model(scene)
+def test_images_that_only_one_side_has_are_named_or_skipped_and_none_in_common_is_explained(path, model):
+    edit_database(path, "UPDATE images SET name = 'renamed.png' WHERE image_id IN (2)")
     with open_database(path, model) as database:
         assert database.unmatched_names == (model.names[1],)
         assert database.keypoints(1).shape == (0, 2)
         assert not any(1 in pair for pair in as_sets(database.iter_matches(1)))
         assert database.num_pairs == 10
-
-
-def test_a_database_of_another_scene_is_explained_by_one_name_of_each(scene, tmp_path):
-    path = edited(write_database(tmp_path / "d.db", scene), "UPDATE images SET name = 'other/' || name")
-    model = read_model(scene)
-    message = (
-        rf"has 0 of the model's 6 images: the model's {model.names[0]} .*database's other/.*not in the model"
-    )
+    edit_database(path, "UPDATE images SET name = 'other/' || name")
+    first = model.names[0]
+    message = rf"has 0 of the model's 6 images: the model's {first} .*database's other/.*not in the model"
     with pytest.raises(InputError, match=message), open_database(path, model):
         pass
 
-
-# --- databases that are bad --------------------------------------------------------------------------
 
 GEOMETRY, KEYPOINTS = "UPDATE two_view_geometries SET ", "UPDATE keypoints SET "
 FIRST = f" WHERE pair_id = {pair_id(1, 2)}"
@@ -796,19 +730,17 @@ BROKEN_ROWS = {
 
 
 @pytest.mark.parametrize("case", BROKEN_ROWS)
-def test_a_broken_row_is_named(scene, tmp_path, case):
+def test_a_broken_row_is_named(path, model, case):
     statement, message = BROKEN_ROWS[case]
-    path = edited(write_database(tmp_path / "d.db", scene), statement)
     with pytest.raises(InputError, match=message) as caught:
-        read_all(path, read_model(scene))
+        read_all(edit_database(path, statement), model)
     assert str(path) in str(caught.value)
 
 
-def test_files_that_are_no_database_are_refused(scene, tmp_path):
-    model = read_model(scene)
+def test_files_that_are_no_database_are_refused(model, tmp_path):
     (tmp_path / "empty").touch()
     (tmp_path / "garbage").write_bytes(bytes(range(256)) * 40)
-    edited(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
+    edit_database(tmp_path / "other", "CREATE TABLE songs (title TEXT)")
     for name, message in (
         ("missing", "does not exist"),
         (".", "is a folder"),
@@ -821,34 +753,27 @@ def test_files_that_are_no_database_are_refused(scene, tmp_path):
     assert sorted(os.listdir(tmp_path)) == ["empty", "garbage", "other"]
 
 
-def test_a_truncated_database_is_an_input_error_at_any_length(scene, tmp_path):
-    model = read_model(scene)
-    data = write_database(tmp_path / "d.db", scene).read_bytes()
+def test_a_truncated_database_is_an_input_error_at_any_length(path, model):
+    data, cut = path.read_bytes(), path.with_name("cut.db")
     for length in np.linspace(1, len(data) - 1, 60).astype(int).tolist():
-        (tmp_path / "cut.db").write_bytes(data[:length])
+        cut.write_bytes(data[:length])
         with pytest.raises(InputError, match=r"cut\.db"):
-            read_all(tmp_path / "cut.db", model)
+            read_all(cut, model)
 
 
-def test_a_locked_database_is_refused_in_seconds(scene, tmp_path):
-    path = write_database(tmp_path / "d.db", scene)
+def test_a_locked_database_is_refused_in_seconds(path, model):
     writer = begin_writing(path, "BEGIN EXCLUSIVE")
-    with pytest.raises(InputError, match="locked by another program"), open_database(path, read_model(scene)):
+    with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
         pass
     writer.close()
 
 
-# --- databases are never changed ---------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("journal_mode", ["delete", "wal", "persist", "truncate"])
-def test_reading_changes_no_byte_and_leaves_no_file(scene, tmp_path, journal_mode):
-    path = write_database(tmp_path / "d.db", scene)
-    edited(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
-    before = fingerprint(tmp_path)
-    matches, _ = read_all(path, read_model(scene))
-    assert len(matches) == 15
-    assert fingerprint(tmp_path) == before
+def test_reading_changes_no_byte_and_leaves_no_file(path, model, journal_mode):
+    edit_database(path, f"PRAGMA journal_mode = {journal_mode}", "UPDATE images SET camera_id = 2")
+    before = fingerprint(path.parent)
+    assert len(read_all(path, model)[0]) == 15
+    assert fingerprint(path.parent) == before
 
 
 def begin_writing(path: Path, *statements: str) -> sqlite3.Connection:
@@ -871,34 +796,22 @@ def copy_as_crashed(path: Path, suffix: str) -> Path:
 DELETE_FIRST = f"DELETE FROM two_view_geometries WHERE pair_id = {pair_id(1, 2)}"
 
 
-def test_rows_that_sit_in_a_wal_file_are_read_and_the_file_is_kept(scene, tmp_path):
-    path = write_database(tmp_path / "d.db", scene)
+def test_rows_that_sit_in_a_wal_file_are_read_with_or_without_its_shm_and_the_file_is_kept(path, model):
     wal = ("PRAGMA journal_mode = wal", "PRAGMA wal_autocheckpoint = 0")
     writer = begin_writing(path, *wal, DELETE_FIRST)
-    before = fingerprint(tmp_path)
-    assert set(before) == {"d.db", "d.db-wal", "d.db-shm"}
-
-    matches, _ = read_all(path, read_model(scene))
-
-    assert (0, 1) not in matches
-    assert len(matches) == 14
-    assert fingerprint(tmp_path) == before
-    writer.close()
-
-
-def test_a_wal_file_left_by_a_crash_is_read_without_its_shm(scene, tmp_path):
-    path = write_database(tmp_path / "d.db", scene)
-    writer = begin_writing(path, "PRAGMA journal_mode = wal", DELETE_FIRST)
     crashed = copy_as_crashed(path, "-wal")
+    for there, files in ((path, {"d.db", "d.db-wal", "d.db-shm"}), (crashed, {"d.db", "d.db-wal"})):
+        before = {name: content for name, content in fingerprint(there.parent).items() if "/" not in name}
+        assert set(before) == files
+        matches, _ = read_all(there, model)
+        assert (0, 1) not in matches
+        assert len(matches) == 14
+        assert before.items() <= fingerprint(there.parent).items()
+        assert {file.name for file in there.parent.iterdir() if file.is_file()} == files
     writer.close()
-    before = fingerprint(crashed.parent)
-
-    assert len(read_all(crashed, read_model(scene))[0]) == 14
-    assert fingerprint(crashed.parent) == before
 
 
-def test_a_hot_journal_is_rolled_back_in_a_copy_only(scene, tmp_path):
-    path = write_database(tmp_path / "d.db", scene)
+def test_a_hot_journal_is_rolled_back_in_a_copy_only(path, model):
     spilling = ("PRAGMA cache_size = 1", "PRAGMA cache_spill = 1", "BEGIN")  # the transaction, into the file
     changes = ("DELETE FROM two_view_geometries", "UPDATE keypoints SET data = zeroblob(50000)")
     writer = begin_writing(path, *spilling, *changes)
@@ -908,15 +821,15 @@ def test_a_hot_journal_is_rolled_back_in_a_copy_only(scene, tmp_path):
     assert crashed.read_bytes() != path.read_bytes()
     before = fingerprint(crashed.parent)
 
-    assert len(read_all(crashed, read_model(scene))[0]) == 15
+    assert len(read_all(crashed, model)[0]) == 15
     assert fingerprint(crashed.parent) == before
 
 
-def test_paths_that_mean_something_in_a_uri_are_read(scene, tmp_path):
+def test_paths_that_mean_something_in_a_uri_are_read(scene, model, tmp_path):
     folder = tmp_path / "50%41 of #1? & Fotos für=alle"
     folder.mkdir()
     path = write_database(folder / "d?mode=rwc.db", scene)
-    assert len(read_all(path, read_model(scene))[0]) == 15
+    assert len(read_all(path, model)[0]) == 15
     assert os.listdir(folder) == [path.name]
 
 
@@ -931,9 +844,6 @@ def test_the_database_is_found_beside_above_or_two_above_the_model(tmp_path, mon
     (model / "database.db").unlink()
     assert find_database(Path(".")) == model.parent / "database.db"
     assert find_database(Path("../../sparse/0")) == model.parent / "database.db"
-
-
-# --- a real scene ------------------------------------------------------------------------------------
 
 
 def test_a_real_scene_is_read_in_well_under_ten_seconds():

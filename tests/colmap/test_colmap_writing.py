@@ -30,9 +30,6 @@ NUM_IMAGES = 8
 RADIUS = 6.0
 
 
-# --- a small scene: cameras on a ring, looking at a ball of points --------------------------------------
-
-
 def looking_at_origin(center):
     """cam_from_world of a camera at `center`, z axis towards the origin."""
     forward = -center / np.linalg.norm(center)
@@ -135,9 +132,6 @@ def centers_of(reconstruction):
     return np.array([reconstruction.image(i).projection_center() for i in sorted(reconstruction.images)])
 
 
-# --- the seed -------------------------------------------------------------------------------------------
-
-
 def test_rotations_and_intrinsics_of_a_written_seed_are_the_inputs_bit_by_bit(tmp_path):
     original, _ = ring_model()
     moved = 3.0 * ring_centers() + [100.0, -7.0, 0.5]
@@ -185,8 +179,13 @@ def test_an_image_that_is_not_placed_is_unregistered_and_the_model_still_loads(t
     assert triangulate(seed, original).num_points3D() == 120
 
 
-def test_images_that_had_no_pose_stay_without_one(tmp_path):
+def test_images_without_a_pose_stay_so_and_a_placed_one_without_a_center_is_refused_by_name(tmp_path):
     original, _ = ring_model()
+    model = read_model(original)
+    centers = model.centers.copy()
+    centers[4, 1] = np.nan
+    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
+        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
     original.deregister_frame(original.image(25).frame_id)
     seed, _ = seeded(original, batches=[])
     write_model(seed, tmp_path)
@@ -208,17 +207,6 @@ def test_keypoints_of_the_database_replace_the_models_where_there_are_any(missin
         np.testing.assert_array_equal([p.xy for p in seed.image(image_id).points2D], own)
 
 
-def test_a_placed_image_without_finite_center_is_refused_by_name():
-    model = read_model(ring_model()[0])
-    centers = model.centers.copy()
-    centers[4, 1] = np.nan
-    with pytest.raises(ValueError, match=r"view4\.jpg is not finite"):
-        build_seed(model, np.ones(NUM_IMAGES, dtype=bool), centers)
-
-
-# --- triangulation --------------------------------------------------------------------------------------
-
-
 @SOURCES
 def test_exact_data_give_every_point_back_with_its_color(source):
     original, points = ring_model()
@@ -233,24 +221,20 @@ def test_exact_data_give_every_point_back_with_its_color(source):
         assert point.error == pytest.approx(0.0, abs=1e-6)
 
 
-def test_points_follow_the_new_positions_and_not_the_old_ones():
+def test_points_follow_the_new_positions_and_those_of_the_models_own_tracks_keep_their_ids():
     original, points = ring_model()
+    for point_id in (3, 50):
+        original.delete_point3D(point_id)
     seed, graph = seeded(original, 2.0 * ring_centers() + [1.0, 2.0, 3.0])
     for tracks in (graph, original):
         structure = triangulate(seed, tracks)
-        xyz = {p.track.elements[0].point2D_idx: p.xyz for p in structure.points3D.values()}
-        found = np.array([xyz[k] for k in range(len(points))])
-        np.testing.assert_allclose(found, 2.0 * points + [1.0, 2.0, 3.0], rtol=0.0, atol=2e-9)
-
-
-def test_the_models_own_tracks_keep_the_ids_of_their_points():
-    original, _ = ring_model(noise_px=0.3)
-    for point_id in (3, 50):
-        original.delete_point3D(point_id)
-    structure = triangulate(seeded(original)[0], original)
+        assert structure.num_points3D() == 120 if tracks is graph else 118
+        for point_id, point in structure.points3D.items():
+            (keypoint,) = {element.point2D_idx for element in point.track.elements}
+            assert tracks is graph or keypoint == point_id - 1
+            expected = 2.0 * points[keypoint] + [1.0, 2.0, 3.0]
+            np.testing.assert_allclose(point.xyz, expected, rtol=0.0, atol=2e-9)
     assert set(structure.point3D_ids()) == set(original.point3D_ids())
-    for point_id, point in structure.points3D.items():
-        assert {e.point2D_idx for e in point.track.elements} == {point_id - 1}
 
 
 class Copying(ThreadPoolExecutor):
@@ -272,29 +256,20 @@ def test_tracks_shared_out_to_workers_give_the_same_bits(monkeypatch):
 
 
 @SOURCES
-def test_triangulating_in_place_gives_the_same_bits_and_saves_the_copy(source):
-    original, _ = ring_model(noise_px=3.0)
-    seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
-    copied = dump(triangulate(seed, tracks))
-    assert seed.num_points3D() == 0
-    structure = triangulate(seed, tracks, in_place=True)
-    assert structure is seed
-    assert dump(structure) == copied
-
-
-@SOURCES
-def test_twice_the_same_gives_the_same_bits(source):
+def test_the_same_gives_the_same_bits_again_and_in_place(source):
     # noise near the threshold of 4 px: which observations agree depends on the pairs that are tried
     original, _ = ring_model(noise_px=3.0)
 
-    def run():
+    def run(in_place=False):
         seed, tracks = seeded_with(source, original, ring_centers() + 0.01)
-        structure = color_points(triangulate(seed, tracks), original)
-        return dump(structure), dump(bundle_adjust(seed, tracks).reconstruction)
+        adjusted = dump(bundle_adjust(seed, tracks).reconstruction)
+        structure = triangulate(seed, tracks, in_place=in_place)
+        assert (structure is seed) == in_place == (seed.num_points3D() > 0)
+        return dump(color_points(structure, original)), adjusted
 
     first = run()
     pycolmap.set_random_seed(12345)  # the global generator must have no part in it
-    assert run() == first
+    assert run() == first == run(in_place=True)
 
 
 def test_points_under_a_small_angle_are_made_only_if_it_is_asked_for():
@@ -327,41 +302,26 @@ def test_wrong_matches_make_no_point_that_misses_its_observations():
     assert max(reprojection_errors_px(structure)) <= 4.0
 
 
-def test_of_two_placed_images_every_match_is_kept_because_there_are_no_longer_tracks():
+def test_matches_that_only_two_images_share_are_left_out_unless_asked_for_or_no_more_are_placed():
+    seed, graph = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
+    assert triangulate(seed, graph).num_points3D() == 0
+    both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
+    assert both.num_points3D() == 120
     seed, graph = seeded(ring_model(noise_px=0.3)[0], placed=np.arange(NUM_IMAGES) < 2)
     assert triangulate(seed, graph).num_points3D() == 120
     assert bundle_adjust(seed, graph).reconstruction.num_points3D() == 120
 
 
-def test_matches_that_only_two_images_share_are_left_out_unless_asked_for():
-    seed, graph = seeded(ring_model()[0], batches=[batch_of(np.array([[0, 1]]), 120)])
-    assert triangulate(seed, graph).num_points3D() == 0
-    both = triangulate(seed, graph, StructureOptions(ignore_two_view_tracks=False))
-    assert both.num_points3D() == 120
-
-
-def test_a_match_of_a_keypoint_that_does_not_exist_is_refused_by_the_names_of_its_images():
-    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
-        seeded(ring_model()[0], batches=[batch_of(np.array([[0, 3]]), 121)])
-
-
-def test_tracks_of_a_model_with_other_keypoints_are_refused():
+def test_matches_and_tracks_of_other_keypoints_are_refused():
     original, _ = ring_model()
+    with pytest.raises(InputError, match=r"view0\.jpg and view3\.jpg has matches of keypoints"):
+        seeded(original, batches=[batch_of(np.array([[0, 3]]), 121)])
     seed, _ = seeded(original, keypoints={0: np.ones((5, 2))}, batches=[])
     with pytest.raises(ValueError, match="image 5 has other points2D"):
         triangulate(seed, original)
 
 
-def test_a_source_without_colors_leaves_colors_as_they_are_and_costs_no_copy():
-    original, _ = ring_model()
-    structure = triangulate(seeded(original)[0], original)
-    for point in original.points3D.values():
-        point.color = np.zeros(3, dtype=np.uint8)
-    assert color_points(structure, original) is structure
-    assert all(point.color.any() for point in structure.points3D.values())
-
-
-def test_a_point_takes_the_mean_color_of_the_points_whose_observations_it_shares():
+def test_a_point_takes_the_mean_colour_of_the_points_whose_observations_it_shares():
     # every point of the source is split in two of 4 images each, which matches of all images join again
     original, _ = ring_model()
     for point_id in list(original.point3D_ids()):
@@ -382,7 +342,7 @@ def test_a_point_takes_the_mean_color_of_the_points_whose_observations_it_shares
         np.testing.assert_array_equal(point.color, [15, 20, 32])
 
 
-def test_colors_come_only_from_images_with_the_same_keypoints():
+def test_colors_come_only_from_images_with_the_same_keypoints_and_only_where_there_are_any():
     original, _ = ring_model()
     moved = [np.array([p.xy for p in original.image(i).points2D]) + 0.25 for i in sorted(original.images)]
     for changed, is_black in ((range(NUM_IMAGES), True), (range(1, NUM_IMAGES), False)):
@@ -390,9 +350,10 @@ def test_colors_come_only_from_images_with_the_same_keypoints():
         structure = color_points(triangulate(*seed_and_graph), original)
         assert structure.num_points3D() == 120
         assert [bool(p.color.any()) for p in structure.points3D.values()] == [not is_black] * 120
-
-
-# --- filters --------------------------------------------------------------------------------------------
+    for point in original.points3D.values():
+        point.color = np.zeros(3, dtype=np.uint8)
+    assert color_points(structure, original) is structure  # which costs no copy
+    assert all(point.color.any() for point in structure.points3D.values())
 
 
 def with_one_more_point(xyz, image_ids, offset_px=0.0):
@@ -431,14 +392,6 @@ def test_a_point_is_removed_that_is(xyz, image_ids, why):
     assert kept.num_points3D() == 120
 
 
-def test_a_point_far_away_stays_if_the_angle_asked_for_is_smaller_than_its_own():
-    # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
-    seed, point_id = with_one_more_point([-4000.0, 0.0, 0.0], [15, 75])
-    for angle_deg, stays in ((0.10, True), (0.14, False)):
-        kept = filter_points(seed, StructureOptions(min_triangulation_angle_deg=angle_deg))
-        assert kept.exists_point3D(point_id) == stays
-
-
 @pytest.mark.parametrize(("offset_px", "length"), [(3.9, 4), (4.1, 3)])
 def test_an_observation_is_removed_beyond_the_threshold_and_its_point_stays(offset_px, length):
     seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45, 65], offset_px)
@@ -461,15 +414,20 @@ def test_point_errors_are_those_of_the_observations_that_are_left():
     np.testing.assert_allclose([p.error for p in kept.points3D.values()], mean_px, rtol=1e-12)
 
 
-def test_tracks_shorter_than_asked_for_are_removed():
-    seed, point_id = with_one_more_point([0.3, 0.2, 0.1], [5, 25, 45])
-    assert filter_points(seed, StructureOptions(min_track_length=3)).exists_point3D(point_id)
-    kept = filter_points(seed, StructureOptions(min_track_length=4))
-    assert not kept.exists_point3D(point_id)
-    assert kept.num_points3D() == 120
-
-
-# --- bundle adjustment ----------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("xyz", "image_ids", "option", "loose", "strict"),
+    [
+        # Cameras 1 and 7 are 6 sqrt(2) = 8.5 units apart, seen from 4000 units away: 0.12 degrees.
+        ([-4000.0, 0.0, 0.0], [15, 75], "min_triangulation_angle_deg", 0.10, 0.14),
+        ([0.3, 0.2, 0.1], [5, 25, 45], "min_track_length", 3, 4),
+    ],
+)
+def test_a_point_stays_if_what_is_asked_for_is_less_than_it_has(xyz, image_ids, option, loose, strict):
+    seed, point_id = with_one_more_point(xyz, image_ids)
+    for value in (loose, strict):
+        kept = filter_points(seed, StructureOptions(**{option: value}))
+        assert kept.exists_point3D(point_id) == (value == loose)
+        assert kept.num_points3D() == 120 + (value == loose)
 
 
 @SOURCES
@@ -505,17 +463,13 @@ def test_adjusted_points_satisfy_the_same_filters():
     assert 1.0 < max(reprojection_errors_px(adjusted.reconstruction)) <= 1.5
 
 
-def test_too_few_iterations_are_reported_as_not_converged(monkeypatch):
+def test_too_few_iterations_and_no_points_are_told(monkeypatch):
     monkeypatch.setattr("sfm_shapefit.colmap.adjustment._MAX_STEPS", 1)
     original, _ = ring_model(noise_px=0.5)
     seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
     adjusted = bundle_adjust(seed, graph)
     assert not adjusted.converged
     assert adjusted.iterations == 3
-
-
-def test_adjustment_without_any_point_says_what_to_do():
-    original, _ = ring_model()
     seed, graph = seeded(original, np.zeros((NUM_IMAGES, 3)))
     with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
         bundle_adjust(seed, graph)
@@ -536,16 +490,11 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
     said = capfd.readouterr()
     assert said.out == ""
     assert ("not positive definite" in said.err) != quiet
-
-
-def test_stderr_is_quiet_only_inside_the_block_and_only_if_nobody_listens(capfd):
     with contextlib.suppress(KeyError), quiet_stderr():
         os.write(2, b"lost")
         raise KeyError
-    with hear_pycolmap(), quiet_stderr():
-        os.write(2, b"seen ")
-    os.write(2, b"after")
-    assert capfd.readouterr().err == "seen after"
+    os.write(2, b"after")  # it is quiet inside the block only
+    assert capfd.readouterr().err == "after"
 
 
 @pytest.mark.slow
@@ -560,9 +509,6 @@ def test_adjustment_on_a_real_scene_ends_as_accurate_as_the_best_pipelines(name,
     error_m = np.linalg.norm(fit_similarity_l1(centers, true_centers).apply(centers) - true_centers, axis=1)
     # the better of COLMAP's incremental mapper and GLOMAP; the laser truth itself is good to about 1 mm
     assert error_m.mean() <= 1.15 * to_reach_m
-
-
-# --- the files ------------------------------------------------------------------------------------------
 
 
 def test_a_full_disk_is_noticed_although_pycolmap_does_not(tmp_path):

@@ -42,15 +42,11 @@ def test_the_same_input_gives_the_same_rotations():
     np.testing.assert_array_equal(one, two)
 
 
-def test_a_camera_that_no_pair_ties_has_no_rotation():
+def test_a_camera_that_no_pair_ties_has_no_rotation_and_what_cannot_be_averaged_is_refused():
     _, pairs, rotations = problem()
     found, registered = average_rotations(22, pairs, rotations)
     assert registered.tolist() == [True] * 20 + [False] * 2
     np.testing.assert_array_equal(found[20:], np.tile(np.eye(3), (2, 1, 1)))
-
-
-def test_what_cannot_be_averaged_is_refused():
-    _, pairs, rotations = problem()
     with pytest.raises(InputError, match="without relative rotations"):
         average_rotations(20, pairs[:0], rotations[:0])
     with pytest.raises(InputError, match=r"outside 0\.\.9"):

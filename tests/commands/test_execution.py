@@ -68,25 +68,21 @@ def assert_same_bits(a, b):
             np.testing.assert_array_equal(ours, theirs, err_msg=field.name)
 
 
-def test_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
-    with open_database(workspace / "database.db", model) as database:
-        ours = list(database.iter_matches(1))
-    with open_database(workspace / "database.db", from_posed_cameras(posed_cameras(model))) as database:
-        theirs = list(database.iter_matches(1))
-    for a, b in zip(ours, theirs, strict=True):
+def test_parts_cover_all_pairs_once_and_posed_cameras_give_the_same_rays_to_the_bit(workspace, model):
+    found = []
+    for one in (model, from_posed_cameras(posed_cameras(model))):
+        with open_database(workspace / "database.db", one) as database:
+            found.append(list(database.iter_matches(1)))
+            whole = np.concatenate([batch.pairs for batch in found[-1]])
+            for size in (1, 700, 10**9):
+                parts = database.parts(size)
+                pieces = [b.pairs for part in parts for b in database.iter_matches(1, part=part)]
+                np.testing.assert_array_equal(np.concatenate(pieces), whole)
+            assert len(database.parts(700)) > 3
+            assert len(database.parts(10**9)) == 1
+    for a, b in zip(*found, strict=True):
         np.testing.assert_array_equal(a.rays_i, b.rays_i)
         np.testing.assert_array_equal(a.rays_j, b.rays_j)
-
-
-def test_parts_cover_all_pairs_once(workspace, model):
-    with open_database(workspace / "database.db", model) as database:
-        whole = np.concatenate([batch.pairs for batch in database.iter_matches(1)])
-        for size in (1, 700, 10**9):
-            parts = database.parts(size)
-            pieces = [b.pairs for part in parts for b in database.iter_matches(1, part=part)]
-            np.testing.assert_array_equal(np.concatenate(pieces), whole)
-        assert len(database.parts(700)) > 3
-        assert len(database.parts(10**9)) == 1
 
 
 def test_directions_of_threads_in_parts_equal_those_of_one_pass_to_the_bit(workspace, model):

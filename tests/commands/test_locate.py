@@ -2,8 +2,6 @@
 
 import csv
 import json
-import sqlite3
-from contextlib import closing
 
 import numpy as np
 import pycolmap
@@ -17,12 +15,17 @@ from sfm_shapefit.commands.write import write_result
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
-from tests.scenes import COURTYARD, FACADE, RING, copied, fingerprint, real_scene
+from tests.scenes import COURTYARD, FACADE, RING, copied, edit_database, fingerprint, real_scene
 
 
 @pytest.fixture(scope="module")
 def courtyard():
     return sfm_shapefit.locate(COURTYARD / "sparse" / "0")
+
+
+def rows_of(path):
+    with path.open(newline="") as stream:
+        return list(csv.DictReader(stream))
 
 
 def true_corruption():
@@ -32,16 +35,13 @@ def true_corruption():
     return {(f"{i + 1:04d}.jpg", f"{j + 1:04d}.jpg") for i, j in wrong.tolist()}
 
 
-def test_the_courtyard_is_placed_in_spite_of_a_quarter_of_wrong_pairs(courtyard):
+def test_the_courtyard_is_placed_in_spite_of_a_quarter_of_wrong_pairs_which_are_named(courtyard):
     errors = sfm_shapefit.evaluate(courtyard.reconstruction, COURTYARD / "truth")
     assert len(errors.names) == 25
     # 0.5 px at 720 px focal length and 10 m gives 7 mm per match; a pair has hundreds of matches.
     assert errors.position.median < 0.005
     assert errors.position.max < 0.03
     assert courtyard.certified.gap <= 1e-8
-
-
-def test_the_pairs_that_contradict_the_solution_are_the_wrong_ones(courtyard):
     outliers = {(row.name1, row.name2) for row in courtyard.pairs if row.verdict == "outlier"}
     assert outliers == true_corruption()
 
@@ -72,8 +72,13 @@ def test_the_inputs_centers_place_nothing(tmp_path):
         np.testing.assert_array_equal(*centers)
 
 
-def test_exact_data_give_the_exact_answer_in_the_inputs_scale():
-    found = sfm_shapefit.locate(RING / "sparse" / "0")
+def test_exact_data_give_the_exact_answer_in_the_inputs_scale_and_no_file_is_changed(tmp_path):
+    scene = copied(RING, tmp_path)
+    before = fingerprint(scene)
+    found = sfm_shapefit.locate(scene / "sparse" / "0")
+    write_result(found, tmp_path / "out")
+    assert fingerprint(scene) == before
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "ring8"]
     truth = pycolmap.Reconstruction(RING / "sparse" / "0")
     for image_id, image in truth.images.items():
         center = found.reconstruction.image(image_id).projection_center()
@@ -82,16 +87,12 @@ def test_exact_data_give_the_exact_answer_in_the_inputs_scale():
     assert found.reconstruction.compute_mean_reprojection_error() < 1e-3
 
 
-def test_tracks_serve_where_there_is_no_database():
+def test_tracks_serve_where_there_is_no_database_and_points_keep_their_colors():
     found = sfm_shapefit.locate(FACADE / "sparse" / "0")
     assert found.inputs.source == "tracks"
     errors = sfm_shapefit.evaluate(found.reconstruction, FACADE / "sparse" / "0")
     assert errors.position.max < 0.05  # meters, on a grid of 9 cameras before a wall
     assert found.reconstruction.num_points3D() > 300
-
-
-def test_points_keep_the_inputs_colors():
-    found = sfm_shapefit.locate(FACADE / "sparse" / "0")
     truth = pycolmap.Reconstruction(FACADE / "sparse" / "0")
     for point_id, point in found.reconstruction.points3D.items():
         np.testing.assert_array_equal(point.color, truth.point3D(point_id).color)
@@ -115,25 +116,6 @@ def test_the_same_input_gives_the_same_bits(courtyard):
     ours, theirs = courtyard.reconstruction.points3D, again.reconstruction.points3D
     assert sorted(ours) == sorted(theirs)
     assert all((ours[i].xyz == theirs[i].xyz).all() for i in ours)
-
-
-def test_neither_the_model_nor_the_database_is_changed(tmp_path):
-    scene = copied(RING, tmp_path)
-    before = fingerprint(scene)
-    found = sfm_shapefit.locate(scene / "sparse" / "0")
-    write_result(found, tmp_path / "out")
-    assert fingerprint(scene) == before
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "ring8"]
-
-
-def test_a_reconstruction_in_memory_is_not_changed():
-    model = pycolmap.Reconstruction(RING / "sparse" / "0")
-    before = {i: image.cam_from_world().matrix() for i, image in model.images.items()}
-    num_points = model.num_points3D()
-    sfm_shapefit.locate(model, RING / "database.db")
-    assert model.num_points3D() == num_points
-    for image_id, matrix in before.items():
-        np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
 
 
 PAIRS_ONLY = LocateOptions(points="never")
@@ -202,8 +184,7 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
     row = hinged.summary()["pieces"][1]
     assert (row["folder"], row["num_placed"]) == ("pieces/1", 4)
     assert row["scale"].startswith("unit")
-    with (folder / "cameras.csv").open(newline="") as stream:
-        rows = list(csv.DictReader(stream))
+    rows = rows_of(folder / "cameras.csv")
     assert [row["name"] for row in rows] == [f"000{k}.jpg" for k in range(1, 5)]
     assert {(row["placed"], row["piece"]) for row in rows} == {("true", "1")}
     assert {int(row["degree"]) for row in rows} <= {2, 3}  # a pair without enough parallax has no direction
@@ -215,10 +196,9 @@ def test_a_further_piece_is_written_with_a_scale_of_its_own(hinged, tmp_path):
 def ring_with_pairs(folder, wanted):
     """A copy of the ring whose database keeps the two-view geometries of the pairs that are wanted."""
     scene = copied(RING, folder)
-    with closing(sqlite3.connect(scene / "database.db")) as connection, connection:
-        for (pair_id,) in connection.execute("SELECT pair_id FROM two_view_geometries").fetchall():
-            if not wanted(*divmod(pair_id, 2147483647)):
-                connection.execute("DELETE FROM two_view_geometries WHERE pair_id = ?", (pair_id,))
+    pairs = [(i, j) for j in range(2, 9) for i in range(1, j) if not wanted(i, j)]
+    ids = ", ".join(str(2147483647 * i + j) for i, j in pairs)
+    edit_database(scene / "database.db", f"DELETE FROM two_view_geometries WHERE pair_id IN ({ids})")
     return scene / "sparse" / "0"
 
 
@@ -233,41 +213,35 @@ def test_bundle_adjustment_from_the_seed_converges_and_stays_there(courtyard):
     assert after < 1.5 * before
 
 
-def test_pycolmaps_own_bundle_adjustment_starts_from_the_written_seed(courtyard, tmp_path):
-    write_result(courtyard, tmp_path / "out")
-    seed = pycolmap.Reconstruction(tmp_path / "out")
-    before = seed.compute_mean_reprojection_error()
-    pycolmap.bundle_adjustment(seed)
-    seed.update_point_3d_errors()
-    assert seed.compute_mean_reprojection_error() < before
-
-
-def test_the_files_say_what_the_result_says(courtyard, tmp_path):
+def test_the_files_say_what_the_result_says_and_pycolmaps_adjustment_starts_from_them(courtyard, tmp_path):
     write_result(courtyard, tmp_path / "out")
     check_model_files(tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     assert facts["schema_version"] == 1
     assert facts["num_placed"] == facts["num_images"] == 25
     assert facts["num_pairs_rejected"] == facts["pairs"]["outlier"] == 44
-    assert facts["solve"]["gap"] == pytest.approx(
-        facts["solve"]["objective"] - facts["solve"]["dual_bound"], abs=1e-15
-    )
-    with (tmp_path / "out" / "cameras.csv").open(newline="") as stream:
-        cameras = list(csv.DictReader(stream))
+    solve = facts["solve"]
+    assert solve["gap"] == pytest.approx(solve["objective"] - solve["dual_bound"], abs=1e-15)
+    cameras = rows_of(tmp_path / "out" / "cameras.csv")
     for row in cameras:
         image = courtyard.reconstruction.find_image_with_name(row["name"])
         assert row["placed"] == "true"
         np.testing.assert_array_equal([float(row[k]) for k in "xyz"], image.projection_center())
         assert 0.0 < float(row["sigma_x"]) < 0.1
         assert 0.0 <= float(row["trust"]) <= 1.0
-    with (tmp_path / "out" / "pairs.csv").open(newline="") as stream:
-        pairs = list(csv.DictReader(stream))
+    pairs = rows_of(tmp_path / "out" / "pairs.csv")
     assert len(pairs) == facts["num_pairs"]
     for row in pairs:
         images = (courtyard.reconstruction.find_image_with_name(row[k]) for k in ("name1", "name2"))
         baseline = normalized(np.subtract(*(image.projection_center() for image in images)))
         direction = np.array([float(row[k]) for k in ("vx", "vy", "vz")])
         assert angle_between_deg(direction, baseline) == pytest.approx(float(row["residual_deg"]), abs=1e-6)
+
+    seed = pycolmap.Reconstruction(tmp_path / "out")
+    before = seed.compute_mean_reprojection_error()
+    pycolmap.bundle_adjustment(seed)
+    seed.update_point_3d_errors()
+    assert seed.compute_mean_reprojection_error() < before
 
 
 def test_standard_deviations_are_in_the_outputs_units(courtyard):
@@ -280,31 +254,35 @@ def test_standard_deviations_are_in_the_outputs_units(courtyard):
         assert large.sigma == pytest.approx([2.0 * value for value in small.sigma], rel=1e-4)
 
 
-def test_images_missing_from_the_database_are_warned_about(tmp_path):
-    scene = copied(RING, tmp_path)
-    model = pycolmap.Reconstruction(scene / "sparse" / "0")
-    model.image(3).name = "elsewhere.jpg"
-    found = sfm_shapefit.locate(model, scene / "database.db")
-    assert any("elsewhere.jpg" in warning for warning in found.warnings)
-    row = next(row for row in found.cameras if row.name == "elsewhere.jpg")
-    assert row.reason == "no matches with any posed image"
-
-
-def test_images_without_a_rotation_are_listed():
+def test_images_that_are_not_in_the_database_or_have_no_rotation_are_named_and_the_input_stays():
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    model.image(3).name = "elsewhere.jpg"
     model.deregister_frame(model.image(5).frame_id)
+    poses = {i: image.cam_from_world().matrix() for i, image in model.images.items() if image.has_pose}
+    num_points = model.num_points3D()
     found = sfm_shapefit.locate(model, RING / "database.db")
-    row = next(row for row in found.cameras if row.name == "0005.jpg")
-    assert row.reason == "the input has no rotation for it"
-    assert len(found.cameras) == 8
+    assert any("elsewhere.jpg" in warning for warning in found.warnings)
+    reasons = {row.name: row.reason for row in found.cameras}
+    assert len(reasons) == 8
+    assert reasons["elsewhere.jpg"] == "no matches with any posed image"
+    assert reasons["0005.jpg"] == "the input has no rotation for it"
+    assert model.num_points3D() == num_points
+    for image_id, matrix in poses.items():
+        np.testing.assert_array_equal(model.image(image_id).cam_from_world().matrix(), matrix)
 
 
-# Position errors in meters before bundle adjustment that issue-free runs reach with room to spare.
+# Position errors in metres before bundle adjustment that runs reach with room to spare, where the truth is.
 @pytest.mark.parametrize(
     ("name", "median", "mean"),
-    [("fountain-P11", 0.0025, 0.0026), ("castle-P19", 0.030, 0.095), ("castle-P30", 0.031, 0.036)],
+    [
+        ("fountain-P11", 0.0025, 0.0026),
+        ("castle-P19", 0.030, 0.095),
+        ("castle-P30", 0.031, 0.036),
+        pytest.param("Herz-Jesus-P8", np.inf, np.inf, marks=pytest.mark.slow),
+        pytest.param("Herz-Jesus-P25", np.inf, np.inf, marks=pytest.mark.slow),
+    ],
 )
-def test_real_scenes_are_placed_as_well_as_measured_before(name, median, mean):
+def test_real_scenes_are_placed_as_well_as_measured_before_and_no_camera_is_blamed(name, median, mean):
     scene = real_scene(name)
     found = sfm_shapefit.locate(scene / "sparse" / "0")
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
@@ -312,3 +290,4 @@ def test_real_scenes_are_placed_as_well_as_measured_before(name, median, mean):
     assert errors.position.median <= median
     assert errors.position.mean <= mean
     assert found.certified.gap <= 1e-8
+    assert all(row.placed and not row.reason for row in found.cameras)

@@ -38,29 +38,23 @@ WORK = Workload(
 BARE = replace(WORK, num_edges=100_000, num_nodes=1000, has_points=False, factor_entries=2_000_000)
 
 
-def test_no_economy_needs_more_memory_than_a_cheaper_one():
+@pytest.mark.parametrize("name", [field.name for field in fields(Workload) if field.name != "needs_factor"])
+def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
     peaks = [forecast(WORK, economy).peak_mb for economy in ECONOMIES]
     assert peaks == sorted(peaks, reverse=True)
     assert peaks[0] > 2.0 * peaks[-1]
+    more = replace(WORK, **{name: {"has_points": True}.get(name, 2 * getattr(WORK, name))})
+    for economy, peak in zip(ECONOMIES, peaks, strict=True):
+        assert forecast(more, economy).peak_mb >= peak
 
 
-@pytest.mark.parametrize("name", [field.name for field in fields(Workload) if field.name != "needs_factor"])
-def test_more_work_never_needs_less_memory(name):
-    more = {"has_points": True}.get(name, 2 * getattr(WORK, name))
-    for economy in ECONOMIES:
-        assert forecast(replace(WORK, **{name: more}), economy).peak_mb >= forecast(WORK, economy).peak_mb
-
-
-def test_the_cheapest_economy_that_fits_is_taken_and_what_is_given_up_already_stays_so():
+def test_the_cheapest_economy_that_fits_is_taken_or_the_number_that_is_enough_is_told():
     for k, economy in enumerate(ECONOMIES):
         limit = forecast(WORK if economy.points else BARE, economy).peak_mb
         chosen = choose_economy(WORK, BARE, limit)
         assert ECONOMIES.index(chosen) <= k
         assert forecast(WORK if chosen.points else BARE, chosen).peak_mb <= limit
-    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]
-
-
-def test_a_limit_below_every_economy_is_refused_with_the_number_that_is_enough():
+    assert choose_economy(WORK, BARE, np.inf, ECONOMIES[2]) is ECONOMIES[2]  # given up already
     with pytest.raises(InputError, match="raise it to") as refused:
         choose_economy(WORK, BARE, 100.0)
     needed = float(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
@@ -78,30 +72,25 @@ LOOP_WORK = Workload(
 )
 
 
-def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it():
+def test_the_factor_is_given_up_only_where_the_solve_does_not_need_it_and_then_nothing_is_refined():
     graph = loop_graph()
     plain, grouped = MeasuredGraph(graph), MeasuredGraph(graph, groups=separate(400, 3))
     split, newton = LocateOptions(solver="admm"), LocateOptions(solver="newton")
     with_priors = LocateOptions(solver="admm", refine_with_priors=True)
-    assert describe_work(LOOP_WORK, plain, split).factor_entries > 0
-    assert not describe_work(LOOP_WORK, plain, split).needs_factor
     for measured, options in ((plain, newton), (plain, with_priors), (grouped, split), (grouped, newton)):
         work = describe_work(LOOP_WORK, measured, options)
         assert work.needs_factor
         peaks = [forecast(work, economy).peak_mb for economy in ECONOMIES[-2:]]
         assert peaks[0] == peaks[1]  # so that it is never chosen
-
-
-def test_where_the_factor_is_given_up_nothing_is_refined_as_is_stated():
-    measured = MeasuredGraph(loop_graph())
-    options = LocateOptions(solver="admm")
-    full = describe_work(LOOP_WORK, measured, options)
+    full = describe_work(LOOP_WORK, plain, split)
+    assert full.factor_entries > 0
+    assert not full.needs_factor
     least = forecast(full, ECONOMIES[-1]).peak_mb
     assert forecast(full, ECONOMIES[-2]).peak_mb > least
-    limited = replace(options, max_memory_mb=int(np.ceil(least)))
-    economy, kept, changed = keep_within_memory(LOOP_WORK, measured, limited, ECONOMIES[0])
+    limited = replace(split, max_memory_mb=int(np.ceil(least)))
+    economy, kept, changed = keep_within_memory(LOOP_WORK, plain, limited, ECONOMIES[0])
     assert economy is ECONOMIES[-1]
-    assert kept is measured
+    assert kept is plain
     assert (changed.factor_memory_mb, changed.refine) == (NO_FACTOR, False)
     assert "neither refined" in economy.statement
 
@@ -130,21 +119,18 @@ def workspaces(tmp_path_factory):
 
 
 @pytest.mark.parametrize("kind", ["plain", "rigs"])
-def test_locate_refuses_a_limit_that_cannot_be_kept_and_keeps_the_one_that_it_names(workspaces, kind):
+def test_locate_keeps_a_limit_or_names_the_one_that_can_be_kept_and_a_large_one_changes_nothing(
+    workspaces, kind
+):
     with pytest.raises(InputError, match="max_memory_mb allows 100") as refused:
         sfm_shapefit.locate(workspaces[kind], max_memory_mb=100)
     needed = int(re.search(r"raise it to (\d+)", str(refused.value)).group(1))
     # The counts of the database alone do not know the graph, whose part is a few megabytes here.
-    found = sfm_shapefit.locate(workspaces[kind], max_memory_mb=needed + 30)
-    usual = sfm_shapefit.locate(workspaces[kind])
+    limits = (needed + 30, 9000, 0)
+    found, limited, usual = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in limits)
     assert len(found.placement.cameras) == len(usual.placement.cameras)
     assert found.placement.refined.is_refined
     assert np.isfinite(found.placement.assessment.sigmas).all()
-
-
-@pytest.mark.parametrize("kind", ["plain", "rigs"])
-def test_a_limit_that_is_none_changes_nothing(workspaces, kind):
-    usual, limited = (sfm_shapefit.locate(workspaces[kind], max_memory_mb=limit) for limit in (0, 9000))
     np.testing.assert_array_equal(limited.placement.locations, usual.placement.locations)
     assert limited.warnings == usual.warnings
 

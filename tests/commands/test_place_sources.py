@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from sfm_shapefit.baselines import linf
+from sfm_shapefit.commands.place import place_graph_file
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.formats.g2o import g2o_text
 from sfm_shapefit.formats.graph_text import graph_text, read_graph
 from sfm_shapefit.formats.onedsfm import is_onedsfm, read_onedsfm, read_rotations
-from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.geometry import fit_similarity, normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.rows import pair_rows
@@ -102,13 +103,25 @@ def test_a_bare_graph_written_as_1dsfm_has_the_same_directions(tmp_path):
     assert again.num_edges < first.num_edges  # those that contradict are gone
 
 
-def test_reversed_directions_give_the_same_scene(tmp_path):
-    graph = read_graph(BUNDLED / "graph40.txt")
-    turned = ViewGraph(graph.num_nodes, graph.edges, -graph.directions, graph.weights, graph.names)
-    (tmp_path / "prob.txt").write_text(graph_text(turned))
-    solve(BUNDLED / "graph40.txt", tmp_path / "a")
-    solve(tmp_path / "prob.txt", tmp_path / "b", "--reverse")
-    assert centers_of(tmp_path / "a") == centers_of(tmp_path / "b")
+def test_neither_order_nor_orientation_of_lines_matters_and_reversed_directions_give_the_same_scene(tmp_path):
+    graph, rng = read_graph(BUNDLED / "graph40.txt"), np.random.default_rng(5)
+    v = normalized(graph.directions + 0.03 * rng.standard_normal(graph.directions.shape))
+    order, flip = rng.permutation(graph.num_edges), rng.random((graph.num_edges, 1)) < 0.5
+    edges = np.where(flip, graph.edges[:, ::-1], graph.edges)[order]
+    flipped = np.where(flip, -v, v)[order]
+    locations = []
+    for pairs, directions, is_reversed in (
+        (graph.edges, v, False),
+        (edges, flipped, False),
+        (edges, -flipped, True),
+    ):
+        text = graph_text(ViewGraph(graph.num_nodes, pairs, directions, names=graph.names))
+        (tmp_path / "g.txt").write_text(text)
+        found = place_graph_file(tmp_path / "g.txt", reverse=is_reversed)
+        locations.append(found.placement.locations)
+    plain, shuffled, turned = locations
+    assert np.abs(shuffled - plain).max() <= 1e-12 * np.ptp(plain, axis=0).max()
+    np.testing.assert_array_equal(turned, shuffled)
 
 
 @pytest.mark.parametrize(
@@ -187,17 +200,12 @@ def test_dropped_pairs_are_named_in_the_table_and_others_keep_their_place():
     assert worst_error(placed.locations, problem.locations) < 0.01
 
 
-def test_without_a_filter_nothing_is_dropped():
+def test_without_a_filter_nothing_is_dropped_and_large_graphs_are_refused_by_l_inf(monkeypatch):
     _, graph = corrupted()
     assert place(graph, PlacementOptions(objective="shapefit")).dropped.tolist() == []
-
-
-def test_large_graphs_are_refused_by_l_inf():
-    _, graph = corrupted()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linf, "_MOST_PAIRS", 10)
-        with pytest.raises(UnsolvableError, match="at most 10 pairs"):
-            linf.locate_linf(graph)
+    monkeypatch.setattr(linf, "_MOST_PAIRS", 10)
+    with pytest.raises(UnsolvableError, match="at most 10 pairs"):
+        linf.locate_linf(graph)
 
 
 @pytest.mark.slow

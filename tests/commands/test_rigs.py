@@ -19,16 +19,11 @@ from tests.program import run
 from tests.scenes import RING, copied
 
 
-def drive(num_images, seed=0, **options):
-    return make_rig_drive(
-        SceneOptions(num_images=num_images, num_points=1500, max_pairs_per_image=12, seed=seed, **options)
-    )
-
-
 @pytest.fixture(scope="module")
 def rigs():
     """Twelve frames of two rigs, a fifth of the pairs wrong."""
-    return drive(36, corrupted_pair_fraction=0.2)
+    size = {"num_images": 36, "num_points": 1500, "max_pairs_per_image": 12}
+    return make_rig_drive(SceneOptions(seed=0, corrupted_pair_fraction=0.2, **size))
 
 
 @pytest.fixture(scope="module")
@@ -49,20 +44,14 @@ def centers_of(reconstruction):
     return ids, np.array([reconstruction.image(i).projection_center() for i in ids])
 
 
-def test_a_written_drive_has_its_rigs_and_its_true_poses(rigs, workspace):
-    truth = pycolmap.Reconstruction(workspace / "truth")
-    assert truth.num_rigs() == 2
-    assert truth.num_frames() == 12
-    assert truth.num_cameras() == 6
+def test_a_written_drive_has_its_rigs_and_true_poses_and_offsets_are_read_in_world_axes(rigs, workspace):
+    model = read_model(workspace / "truth")
+    truth = model.reconstruction
+    assert (truth.num_rigs(), truth.num_frames(), truth.num_cameras()) == (2, 12, 6)
     np.testing.assert_allclose(centers_of(truth)[1], rigs.scene.centers, atol=1e-12)
     assert truth.compute_mean_reprojection_error() < 1.0  # of half a pixel per coordinate: 0.63
     with pycolmap.Database.open(workspace / "database.db") as database:
-        assert database.num_rigs() == 2
-        assert database.num_frames() == 12
-
-
-def test_offsets_of_frames_are_read_in_world_axes(rigs, workspace):
-    model = read_model(workspace / "truth")
+        assert (database.num_rigs(), database.num_frames()) == (2, 12)
     first = rigs.sensor_of_image == 0
     expected = rigs.scene.centers - rigs.scene.centers[first][rigs.frame_of_image]
     np.testing.assert_allclose(model.frame_offsets, expected, atol=1e-12)
@@ -116,7 +105,7 @@ def test_the_metric_scale_is_found_to_a_thousandth_with_a_fifth_of_the_pairs_wro
     assert_rigs_equal(found.reconstruction, found.model.reconstruction)
 
 
-def test_images_stand_where_their_frames_and_sensors_put_them(found):
+def test_images_stand_where_frames_and_sensors_put_them_and_tables_say_what_moved_together(found, tmp_path):
     for image in found.reconstruction.images.values():
         frame = found.reconstruction.frame(image.frame_id)
         rig = found.reconstruction.rig(frame.rig_id)
@@ -125,9 +114,6 @@ def test_images_stand_where_their_frames_and_sensors_put_them(found):
         if not rig.is_ref_sensor(sensor):
             pose = rig.sensor_from_rig(sensor) * pose
         np.testing.assert_allclose(image.cam_from_world().matrix(), pose.matrix(), atol=1e-12)
-
-
-def test_tables_say_what_moved_together(found, tmp_path):
     write_result(found, tmp_path / "out")
     facts = json.loads((tmp_path / "out" / "locate.json").read_text())
     inner = facts["rigid_groups"].pop("num_inner_pairs")
@@ -166,7 +152,7 @@ def test_bundle_adjustment_keeps_the_rigs(workspace, rigs):
     assert abs(fit.scale - 1.0) < 1e-3
 
 
-def test_what_rigs_rule_out_is_said(workspace):
+def test_what_rigs_rule_out_is_said_and_inspecting_says_how_many_frames_hang_together(workspace):
     model = workspace / "sparse" / "0"
     for source, option, sentence in (
         (model, {"scale": "unit"}, "the scale is that of the rigs; leave out"),
@@ -178,15 +164,14 @@ def test_what_rigs_rule_out_is_said(workspace):
         with pytest.raises(InputError, match=sentence):
             sfm_shapefit.locate(source, **option)
 
-
-def test_inspecting_says_how_many_frames_hang_together(workspace):
     seen = sfm_shapefit.inspect(workspace / "sparse" / "0", points="never")
     assert seen.rigs.startswith("12 frames of 36 images, of which the pairs tie 12 in metric scale")
     assert sfm_shapefit.inspect(RING / "sparse" / "0").rigs.startswith("none")
 
 
 def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
-    model = pycolmap.Reconstruction(write_and_return(rigs, tmp_path / "w") / "sparse" / "0")
+    write_workspace(rigs.scene, tmp_path / "w", WorkspaceOptions(database=False), rigs)
+    model = pycolmap.Reconstruction(tmp_path / "w" / "sparse" / "0")
     for rig in model.rigs.values():
         for sensor, pose in rig.non_ref_sensors.items():
             rig.set_sensor_from_rig(sensor, pycolmap.Rigid3d(pose.rotation, np.zeros(3)))
@@ -194,15 +179,10 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
         sfm_shapefit.locate(model, points="never")
 
 
-def write_and_return(rigs, folder):
-    write_workspace(rigs.scene, folder, WorkspaceOptions(database=False), rigs)
-    return folder
-
-
 @pytest.fixture
 def moved_ring(tmp_path):
-    """The ring with true centers of five cameras, in a unit of 0.37 m, and the others at the origin."""
-    truth = read_model(RING / "truth") if (RING / "truth").exists() else read_model(RING / "sparse" / "0")
+    """The ring with true centres of five cameras, in a unit of 0.37 m, and the others at the origin."""
+    truth = read_model(RING / "sparse" / "0")
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]
     for k, image_id in enumerate(truth.image_ids.tolist()):
@@ -290,23 +270,17 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
         (None, "is not a readable text file"),
+        ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
 )
-def test_a_file_of_names_that_fits_nothing_is_refused(tmp_path, text, message):
+def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_path, text, message):
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    for frame in model.frames.values():
+        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
     names = tmp_path / "names.txt"
     if text is not None:
         names.write_text(text)
     with pytest.raises(InputError, match=message):
-        sfm_shapefit.locate(RING / "sparse" / "0", fix=str(names))
-
-
-def test_fixed_cameras_without_positions_are_refused(tmp_path):
-    model = pycolmap.Reconstruction(RING / "sparse" / "0")
-    names = tmp_path / "names.txt"
-    names.write_text("\n".join(sorted(image.name for image in model.images.values())[:3]))
-    for frame in model.frames.values():
-        frame.rig_from_world = pycolmap.Rigid3d(frame.rig_from_world.rotation, np.zeros(3))
-    with pytest.raises(InputError, match="the 3 fixed cameras stand at one place"):
         sfm_shapefit.locate(model, RING / "database.db", fix=str(names))
 
 

@@ -1,6 +1,5 @@
 """Directions from matches and known rotations, on pairs whose true direction is known."""
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,7 @@ from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirecti
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity, normalized, tangent_bases
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.viewgraph import ViewGraph
-from tests.problems import all_pairs
+from tests.problems import all_pairs, random_rotations
 from tests.scenes import COURTYARD
 
 FOCAL_PX = 1000.0
@@ -76,52 +75,58 @@ def test_exact_matches_give_the_exact_direction_with_its_sign(baseline):
     assert found.cheirality_fraction[0] == 1.0
 
 
-def test_swapping_the_images_flips_the_direction():
+def test_swapping_the_images_flips_the_direction_and_turning_the_world_turns_it():
     rays_i, rays_j, direction = make_pair(2, noise_px=0.5)
-    forward, backward = estimate([(rays_i, rays_j)]), estimate([(rays_j, rays_i)])
+    rotation = random_rotations(np.random.default_rng(3), 1)[0]
+    turned_rays = (rays_i @ rotation.T, rays_j @ rotation.T)
+    forward, backward, turned = (
+        estimate([rays]).directions[0] for rays in ((rays_i, rays_j), (rays_j, rays_i), turned_rays)
+    )
     # The same draws fall on the same matches, so only roundings differ.
-    assert angle_between_deg(forward.directions[0], -backward.directions[0]) < 1e-6
-    assert angle_between_deg(forward.directions[0], direction) < 1.0
+    assert angle_between_deg(forward, -backward) < 1e-6
+    assert angle_between_deg(turned, rotation @ forward) < 1e-6
+    assert angle_between_deg(forward, direction) < 1.0
 
 
-def test_turning_the_world_turns_the_direction():
-    rays_i, rays_j, _ = make_pair(3, noise_px=0.5)
-    rotation = np.linalg.qr(np.random.default_rng(3).standard_normal((3, 3)))[0]
-    rotation *= np.sign(np.linalg.det(rotation))
-    plain, turned = estimate([(rays_i, rays_j)]), estimate([(rays_i @ rotation.T, rays_j @ rotation.T)])
-    assert angle_between_deg(turned.directions[0], rotation @ plain.directions[0]) < 1e-6
+# 0.5 px in 200 matches at a baseline of a sixth of the depth: about 0.1 degrees; 45 % wrong doubles it. Of 40
+# right matches it is 0.12 degrees in the median; the worst of 100 is 4 standard deviations.
+@pytest.mark.parametrize(
+    ("wrong", "count", "median_deg", "max_deg"),
+    [(0.1, 200, 0.2, 1.0), (0.3, 200, 0.2, 1.0), (0.45, 200, 0.2, 1.0), (0.6, 100, 0.25, 2.0)],
+)
+def test_wrong_matches_inside_the_list_do_not_move_the_direction(wrong, count, median_deg, max_deg):
+    options = DirectionOptions(min_inlier_ratio=0.1) if wrong > 0.5 else None
+    num_pairs = 100 if wrong > 0.5 else 20
+    pairs = [make_pair(seed, count=count, noise_px=0.5, wrong=wrong) for seed in range(num_pairs)]
+    found = estimate(pairs, options)
+    assert wrong > 0.5 or set(found.status) == {DirectionStatus.USABLE}
+    errors = errors_deg(found, pairs)
+    assert np.median(errors) < median_deg
+    assert errors.max() < max_deg
 
 
-@pytest.mark.parametrize("wrong", [0.1, 0.3, 0.45])
-def test_wrong_matches_inside_the_list_do_not_move_the_direction(wrong):
-    errors = []
-    for seed in range(20):
-        pair = make_pair(seed, count=200, noise_px=0.5, wrong=wrong)
-        found = estimate([pair])
-        assert found.status == [DirectionStatus.USABLE]
-        errors.append(angle_between_deg(found.directions[0], pair[2]))
-    # 0.5 px in 200 matches at a baseline of a sixth of the depth: about 0.1 degrees; 45 % wrong doubles it.
-    assert np.median(errors) < 0.2
-    assert max(errors) < 1.0
-
-
-def test_two_motions_in_one_list_give_the_direction_of_the_larger_one():
+def test_two_motions_in_one_list_give_the_direction_of_the_larger_one_or_none_if_alike():
     larger, smaller = make_pair(4, count=140), make_pair(5, count=60, baseline=(0.0, 1.0, 0.3))
-    mixed = tuple(np.concatenate([larger[k], smaller[k]]) for k in (0, 1))
-    found = estimate([mixed])
+    found = estimate([tuple(np.concatenate([larger[k], smaller[k]]) for k in (0, 1))])
     assert found.status == [DirectionStatus.USABLE]
     assert angle_between_deg(found.directions[0], larger[2]) < 0.01  # soft weights keep a trace of the rest
+    pairs = []
+    for seed in range(20):
+        one = make_pair(seed, count=100, noise_px=0.5)
+        other = make_pair(seed + 50, count=80, noise_px=0.5, baseline=(0.0, 1.0, 0.3))
+        pairs.append(tuple(np.concatenate([one[k], other[k]]) for k in (0, 1)))
+    assert set(estimate(pairs).status) == {DirectionStatus.TWO_MOTIONS}
+    lenient = estimate(pairs, DirectionOptions(max_rival_share=1.0))
+    assert set(lenient.status) == {DirectionStatus.USABLE}
+    assert all(60 < rivals <= 80 for rivals in lenient.num_rivals)
 
 
-def test_identical_rays_and_empty_lists_give_no_direction():
+def test_identical_rays_empty_lists_and_random_matches_give_no_direction():
     rays = make_pair(6)[0]
     found = estimate([(rays, rays), (rays[:0], rays[:0]), (rays[:4], rays[:4])])
     few = DirectionStatus.TOO_FEW_MATCHES
     assert found.status == [DirectionStatus.NO_PARALLAX, few, few]
     assert np.isnan(found.directions).all()
-
-
-def test_random_matches_are_recognised_by_their_inlier_ratio():
     pairs = []
     for seed in range(20):
         rays_i, rays_j, _ = make_pair(seed, count=60)
@@ -129,11 +134,13 @@ def test_random_matches_are_recognised_by_their_inlier_ratio():
     assert set(estimate(pairs).status) == {DirectionStatus.LOW_INLIER_RATIO}
 
 
-def test_a_planar_scene_is_no_obstacle():
+def test_planar_scenes_and_five_pixels_of_parallax_are_no_obstacle():
     pair = make_pair(7, noise_px=0.5, depth=(6.0, 6.0), count=200)
     found = estimate([pair])
     assert found.status == [DirectionStatus.USABLE]
     assert angle_between_deg(found.directions[0], pair[2]) < 1.0
+    pairs = [make_pair(seed, noise_px=0.5, count=100, baseline=(0.03, 0.0, 0.0)) for seed in range(100)]
+    assert estimate(pairs).counts()[DirectionStatus.USABLE] >= 95
 
 
 @pytest.mark.parametrize(
@@ -170,28 +177,6 @@ def test_little_parallax_does_not_pull_the_direction_towards_the_view():
     assert abs(along_view_deg.mean()) < 4.0 * along_view_deg.std() / np.sqrt(len(pairs))
 
 
-def test_sixty_percent_of_wrong_matches_do_not_move_the_direction():
-    options = DirectionOptions(min_inlier_ratio=0.1)
-    pairs = [make_pair(seed, count=100, noise_px=0.5, wrong=0.6) for seed in range(100)]
-    found = estimate(pairs, options)
-    errors = errors_deg(found, pairs)
-    # 40 right matches: 0.12 degrees in the median with none wrong; the worst of 100 is 4 standard deviations.
-    assert np.median(errors) < 0.25
-    assert errors.max() < 2.0
-
-
-def test_two_motions_of_one_size_are_no_direction():
-    pairs = []
-    for seed in range(20):
-        one = make_pair(seed, count=100, noise_px=0.5)
-        other = make_pair(seed + 50, count=80, noise_px=0.5, baseline=(0.0, 1.0, 0.3))
-        pairs.append(tuple(np.concatenate([one[k], other[k]]) for k in (0, 1)))
-    assert set(estimate(pairs).status) == {DirectionStatus.TWO_MOTIONS}
-    lenient = estimate(pairs, DirectionOptions(max_rival_share=1.0))
-    assert set(lenient.status) == {DirectionStatus.USABLE}
-    assert all(60 < rivals <= 80 for rivals in lenient.num_rivals)
-
-
 def make_facade(seed, shifted):
     """A wall 8 away whose pattern repeats every unit; a share of the matches joins the next period."""
     rng = np.random.default_rng(seed)
@@ -201,23 +186,18 @@ def make_facade(seed, shifted):
     return see(points, 0.5, rng), see(matched + 1.5 * direction, 0.5, rng), direction
 
 
-@pytest.mark.parametrize("shifted", [0.5, 0.6])
-def test_a_repeated_facade_that_half_the_matches_confuse_is_refused(shifted):
+@pytest.mark.parametrize("shifted", [0.2, 0.5, 0.6])
+def test_a_repeated_facade_that_half_the_matches_confuse_is_refused_and_a_few_do_no_harm(shifted):
     pairs = [make_facade(seed, shifted) for seed in range(60)]
-
-    def share_wrong(options):
-        return np.mean(errors_deg(estimate(pairs, options), pairs) > 3.0)
-
-    # Two baselines whose epipolar lines nearly coincide (a sixth of these) share their inliers and stay.
-    assert share_wrong(DirectionOptions()) < 0.25
-    assert share_wrong(DirectionOptions(max_rival_share=100.0, min_inlier_ratio=0.1)) > 0.3
-
-
-def test_a_few_confused_matches_on_a_facade_do_no_harm():
-    pairs = [make_facade(seed, 0.2) for seed in range(60)]
     found = estimate(pairs)
-    assert set(found.status) == {DirectionStatus.USABLE}
-    assert errors_deg(found, pairs).max() < 3.0
+    if shifted < 0.5:
+        assert set(found.status) == {DirectionStatus.USABLE}
+        assert errors_deg(found, pairs).max() < 3.0
+        return
+    lenient = estimate(pairs, DirectionOptions(max_rival_share=100.0, min_inlier_ratio=0.1))
+    # Two baselines whose epipolar lines nearly coincide (a sixth of these) share their inliers and stay.
+    assert np.mean(errors_deg(found, pairs) > 3.0) < 0.25
+    assert np.mean(errors_deg(lenient, pairs) > 3.0) > 0.3
 
 
 @pytest.mark.parametrize(
@@ -252,25 +232,16 @@ def test_few_near_points_among_many_far_ones_give_the_direction_and_its_covarian
     assert np.median(errors_deg(found, pairs)[usable]) < error_deg
 
 
-def test_five_pixels_of_parallax_are_enough():
-    pairs = [make_pair(seed, noise_px=0.5, count=100, baseline=(0.03, 0.0, 0.0)) for seed in range(100)]
-    assert estimate(pairs).counts()[DirectionStatus.USABLE] >= 95
-
-
-def test_support_says_what_the_pair_has():
+def test_support_says_what_the_pair_has_and_neither_batches_nor_threads_change_a_bit():
     found = estimate([make_pair(8, count=100, noise_px=0.5, wrong=0.3)])
     assert found.num_matches[0] == 100
     assert 60 <= found.num_inliers[0] <= 80  # 70 are right; a few wrong ones fall on their epipolar line
     # A Sampson error of 0.5 px noise has median 0.6745 * 0.5 px, and 70 of them give it to 15 %.
     assert found.median_residual_px[0] == pytest.approx(0.6745 * 0.5, rel=0.45)
     assert 5.0 < found.parallax_deg[0] < 15.0  # baseline 1.02 seen from 4 to 8
-
-
-def test_neither_batches_nor_threads_change_a_bit():
     pairs = [make_pair(seed, noise_px=0.5, wrong=0.2) for seed in range(7)]
     whole, threaded = estimate(pairs), estimate(pairs, threads=2)
-    one_by_one = concatenate([estimate([pair]) for pair in pairs])
-    for other in (threaded, one_by_one):
+    for other in (threaded, concatenate([estimate([pair]) for pair in pairs])):
         for name in ("directions", "covariance", "num_inliers", "median_residual_px", "parallax_deg"):
             np.testing.assert_array_equal(getattr(whole, name), getattr(other, name))
         assert whole.status == other.status
@@ -311,19 +282,15 @@ def directions_with(sigmas_deg, ratios, directions=None, edges=None) -> PairDire
     )
 
 
-def test_weights_fall_with_uncertainty_and_with_contradicting_matches():
+def test_weights_fall_with_uncertainty_and_contradicting_matches_and_without_a_direction_there_is_none():
     weights = directions_with([0.0, 0.0, 0.0, 0.15, 90.0], [1.0, 1.0, 0.5, 1.0, 1.0]).weights()
     # Relative to the median, 1 / sqrt(1 + 3^2) = 0.316: 1, 1, 1/4, 0.316, and 5e-4 raised to the floor.
     expected = [np.sqrt(10.0), np.sqrt(10.0), np.sqrt(10.0) / 4.0, 1.0, 0.02]
     np.testing.assert_allclose(weights, expected, rtol=1e-12)
-
-
-def test_pairs_without_a_direction_have_no_weight_and_unknown_uncertainty_counts_as_none():
-    found = directions_with([0.0, np.nan, 0.1], [1.0, 1.0, 1.0])
-    found = dataclasses.replace(found, status=[*found.status[:2], DirectionStatus.FEW_INLIERS])
+    found = directions_with([0.0, np.nan, 0.1], [1.0, 1.0, 1.0])  # an unknown uncertainty counts as none
+    found = replace(found, status=[*found.status[:2], DirectionStatus.FEW_INLIERS])
     np.testing.assert_array_equal(found.weights(), [1.0, 1.0, np.nan])
-    nothing = dataclasses.replace(found, status=[DirectionStatus.NO_PARALLAX] * 3)
-    assert np.isnan(nothing.weights()).all()
+    assert np.isnan(replace(found, status=[DirectionStatus.NO_PARALLAX] * 3).weights()).all()
 
 
 def test_weights_make_the_locations_of_uneven_pairs_better():
@@ -357,7 +324,7 @@ def test_more_hypotheses_survive_more_wrong_matches():
     pairs = [make_pair(seed, count=150, noise_px=0.3, wrong=0.75) for seed in range(20)]
 
     def failures(num_hypotheses):
-        found = estimate(pairs, dataclasses.replace(options, num_hypotheses=num_hypotheses))
+        found = estimate(pairs, replace(options, num_hypotheses=num_hypotheses))
         return np.sum(~(errors_deg(found, pairs) < 5.0))
 
     assert failures(400) < failures(5)

@@ -84,11 +84,18 @@ def test_tracks_do_not_depend_on_the_order_of_pairs_or_on_batches():
 
 def test_a_track_that_meets_an_image_twice_is_dropped():
     _, _, batch = scene()
-    keypoints, rays_j = batch.keypoints.copy(), batch.rays_j.copy()
-    row = 7  # keypoint 7 of image 0 now matches keypoint 8 of image 1, at the ray that fits its direction
-    keypoints[row, 1] = 8
-    tracks = tracks_of(dataclasses.replace(batch, keypoints=keypoints, rays_j=rays_j))
-    assert tracks.num_tracks == NUM_POINTS - 2
+    keypoints = batch.keypoints.copy()
+    keypoints[7, 1] = 8  # of image 0 it now matches keypoint 8 of image 1, at the ray that fits its direction
+    assert tracks_of(dataclasses.replace(batch, keypoints=keypoints)).num_tracks == NUM_POINTS - 2
+
+
+def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept():
+    _, _, batch = scene()
+    tracks, again = (tracks_of(batch, max_matches=len(batch.keypoints) // 2) for _ in range(2))
+    np.testing.assert_array_equal(again.rays, tracks.rays)
+    kept = sum(length * (length - 1) // 2 for length in tracks.lengths().tolist())
+    assert 0 < kept < len(batch.keypoints)
+    assert tracks_of(batch, max_matches=len(batch.keypoints) // 50).num_tracks < tracks.num_tracks
 
 
 def test_matches_that_contradict_their_direction_join_no_track():
@@ -105,43 +112,37 @@ def test_matches_that_contradict_their_direction_join_no_track():
     assert len(points) == NUM_POINTS
 
 
-def test_with_too_many_matches_whole_stars_of_a_share_of_the_keypoints_are_kept():
-    _, _, batch = scene()
-    tracks = tracks_of(batch, max_matches=len(batch.keypoints) // 2)
-    assert tracks.num_tracks > 0
-    kept = sum(length * (length - 1) // 2 for length in tracks.lengths().tolist())
-    assert kept < len(batch.keypoints)
-    again = tracks_of(batch, max_matches=len(batch.keypoints) // 2)
-    np.testing.assert_array_equal(again.rays, tracks.rays)
-    few = tracks_of(batch, max_matches=len(batch.keypoints) // 50)
-    assert few.num_tracks < tracks.num_tracks
+def test_two_views_and_no_matches_are_no_track():
+    _, _, batch = scene(cameras=2)
+    directions = estimate_directions(batch)
+    none = build_tracks([], directions, 2.0)
+    assert build_tracks([batch], directions, 2.0).num_tracks == none.num_tracks == 0
+    assert len(covering_set(none, 6)) == 0
 
 
-def test_no_matches_give_no_tracks_and_an_unchanged_graph():
-    tracks = Tracks(
-        offsets=np.zeros(1, dtype=np.int64), cameras=np.zeros(0, dtype=np.int64), rays=np.zeros((0, 3))
-    )
-    _, _, batch = scene()
-    assert build_tracks([], estimate_directions(batch), 2.0).num_tracks == 0
-    assert len(covering_set(tracks, 6)) == 0
+def random_tracks(rng, lengths, num_cameras):
+    cameras = np.concatenate([rng.choice(num_cameras, size=size, replace=False) for size in lengths])
+    rays = normalized(rng.standard_normal((len(cameras), 3)))
+    return Tracks(offsets=np.concatenate([[0], np.cumsum(lengths)]), cameras=cameras, rays=rays)
 
 
 def test_a_covering_set_shows_every_camera_enough_points_or_all_there_are():
     rng = np.random.default_rng(5)
-    lengths = rng.integers(3, 7, size=300)
-    cameras = np.concatenate([rng.choice(20, size=size, replace=False) for size in lengths])
-    cameras[cameras == 19] = 18  # camera 19 sees nothing
-    tracks = Tracks(
-        offsets=np.concatenate([[0], np.cumsum(lengths)]),
-        cameras=cameras,
-        rays=normalized(rng.standard_normal((len(cameras), 3))),
-    )
+    tracks = random_tracks(rng, rng.integers(3, 7, size=300), 20)
+    tracks.cameras[tracks.cameras == 19] = 18  # camera 19 sees nothing
     chosen = covering_set(tracks, 20, per_camera=8)
     seen = np.bincount(tracks.subset(chosen).cameras, minlength=20)
     assert (seen[:19] >= 8).all()
     assert seen[19] == 0
     assert len(chosen) < 120  # and no more than it needs
     assert (np.diff(chosen) > 0).all()
+
+
+@pytest.mark.parametrize(("num_cameras", "least"), [(8, 60), (30, 26), (200, 20)])
+def test_small_scenes_take_more_points_per_camera(num_cameras, least):
+    tracks = random_tracks(np.random.default_rng(0), [4] * 60 * num_cameras, num_cameras)
+    seen = np.bincount(tracks.subset(covering_set(tracks, num_cameras)).cameras, minlength=num_cameras)
+    assert seen.min() >= least
 
 
 def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
@@ -157,16 +158,9 @@ def test_beyond_half_a_radian_the_number_of_views_decides_between_tracks():
     assert covering_set(tracks, 6, per_camera=1).tolist() == [1]  # shows all; the wider one, only three
 
 
-def test_two_views_are_no_track():
-    _, _, batch = scene(cameras=2)
-    assert tracks_of(batch).num_tracks == 0
-
-
 def test_joined_points_carry_the_rays_turned_round_and_their_noise():
     centers, points, batch = scene()
     directions = estimate_directions(batch)
-    from sfm_shapefit.viewgraph import ViewGraph
-
     graph = ViewGraph(6, batch.pairs, directions.directions, names=[f"{k}.jpg" for k in range(6)])
     joint = join_points(graph, directions.covariance, tracks_of(batch), np.full(6, PIXEL), noise_px=2.0)
     assert joint.num_points == NUM_POINTS
@@ -219,9 +213,8 @@ def test_on_a_straight_street_points_fix_what_the_directions_between_cameras_can
 def test_a_camera_that_the_points_do_not_determine_is_left_out():
     centers, pairs, directions, tracks = street()
     alone = tracks.cameras == len(centers) - 1
-    keep = (pairs != len(centers) - 1).all(axis=1) | (pairs == len(centers) - 2).any(
-        axis=1
-    )  # one pair is left
+    with_last, with_other = ((pairs == len(centers) - k).any(axis=1) for k in (1, 2))
+    keep = ~with_last | with_other  # one pair is left
     rows = np.repeat(np.arange(tracks.num_tracks), 6)[~alone]
     lengths = np.bincount(rows, minlength=tracks.num_tracks)
     without = Tracks(
@@ -234,18 +227,3 @@ def test_a_camera_that_the_points_do_not_determine_is_left_out():
     joint = join_points(graph, covariance, without, np.full(len(centers), 1e-3))
     placement = place(joint)
     np.testing.assert_array_equal(placement.cameras, np.arange(len(centers) - 1))
-
-
-@pytest.mark.parametrize("num_cameras", [8, 30, 200])
-def test_small_scenes_take_more_points_per_camera(num_cameras):
-    rng = np.random.default_rng(0)
-    cameras = np.concatenate(
-        [rng.choice(num_cameras, size=4, replace=False) for _ in range(60 * num_cameras)]
-    )
-    tracks = Tracks(
-        offsets=4 * np.arange(60 * num_cameras + 1),
-        cameras=cameras,
-        rays=normalized(rng.standard_normal((len(cameras), 3))),
-    )
-    seen = np.bincount(tracks.subset(covering_set(tracks, num_cameras)).cameras, minlength=num_cameras)
-    assert seen.min() >= {8: 60, 30: 26, 200: 20}[num_cameras]

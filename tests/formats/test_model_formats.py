@@ -223,12 +223,9 @@ def test_a_malformed_file_is_refused_by_its_line_or_key(tmp_path, kind, old, new
         read_model_file(file)
 
 
-def test_a_malformed_line_of_tracks_is_refused_by_its_number(tmp_path):
+def test_a_malformed_line_of_tracks_and_a_file_that_is_no_model_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"tracks\.csv, line 2: expected image, track"):
         read_model_file(opensfm_file(tmp_path, tracks=TRACKS.replace("0.1\t-0.2", "left", 1)))
-
-
-def test_a_file_that_is_no_model_is_refused(tmp_path):
     (tmp_path / "other.json").write_text('{"frames": []}')
     with pytest.raises(InputError, match="is no model: give a COLMAP folder"):
         read_model(tmp_path / "other.json")
@@ -239,7 +236,7 @@ def courtyard():
     return posed_model_of(pycolmap.Reconstruction(COURTYARD / "truth"))
 
 
-def test_transforms_json_has_opengl_axes(tmp_path):
+def test_transforms_json_has_opengl_axes_and_poses_come_back(tmp_path, courtyard):
     frames = json.loads(nerf_text(read_model_file(openmvg_file(tmp_path))))
     # Columns: right is -y, up is +z, backwards is -x; then the center.
     expected = [[0, 0, -1, 1], [-1, 0, 0, 2], [0, 1, 0, 3], [0, 0, 0, 1]]
@@ -247,19 +244,10 @@ def test_transforms_json_has_opengl_axes(tmp_path):
     assert frames["frames"][0]["file_path"] == "images/a.jpg"
     assert (frames["fl_x"], frames["cx"], frames["cy"], frames["w"]) == (100.0, 50.0, 40.0, 100)
     assert frames["camera_angle_x"] == pytest.approx(2 * np.arctan(0.5))
-
-
-def test_poses_come_back_from_transforms_json(courtyard):
     flip = np.diag([1.0, -1.0, -1.0])
-    for frame, rotation, center in zip(
-        json.loads(nerf_text(courtyard))["frames"], courtyard.rotations, courtyard.centers, strict=True
-    ):
-        matrix = np.array(frame["transform_matrix"])
-        np.testing.assert_array_equal(flip @ matrix[:3, :3].T, rotation)
-        np.testing.assert_array_equal(matrix[:3, 3], center)
-
-
-def test_a_camera_model_that_nerf_has_not_is_refused(courtyard):
+    matrices = np.array([frame["transform_matrix"] for frame in json.loads(nerf_text(courtyard))["frames"]])
+    np.testing.assert_array_equal(flip @ matrices[:, :3, :3].swapaxes(1, 2), courtyard.rotations)
+    np.testing.assert_array_equal(matrices[:, :3, 3], courtyard.centers)
     camera = courtyard.cameras[0]._replace(model="FOV", params=(1.0, 1.0, 0.0, 0.0, 0.5))
     with pytest.raises(InputError, match="camera model FOV has no equivalent"):
         nerf_text(replace(courtyard, cameras=(camera,)))
@@ -380,16 +368,12 @@ def test_convert_writes_every_format_and_replaces_nothing_unasked(tmp_path):
     run("convert", source, tmp_path / "t.xyz", code=3)
 
 
-def test_a_foreign_model_becomes_a_colmap_model(tmp_path):
+def test_a_foreign_model_becomes_a_colmap_model_and_a_scene_survives_the_way(tmp_path, courtyard):
     sfm_shapefit.convert(opensfm_file(tmp_path), tmp_path / "model")
     model = read_model(tmp_path / "model")
     np.testing.assert_allclose(model.centers, CENTERS, atol=1e-14)
     assert model.reconstruction.num_points3D() == 1
-
-
-def test_a_scene_survives_the_way_through_pycolmap(courtyard):
     back = posed_model_of(reconstruction_of(courtyard, "test"))
-    assert back.names == courtyard.names
-    assert back.cameras == courtyard.cameras
+    assert (back.names, back.cameras) == (courtyard.names, courtyard.cameras)
     np.testing.assert_allclose(back.rotations, courtyard.rotations, atol=1e-15)
     np.testing.assert_allclose(back.centers, courtyard.centers, atol=1e-13)

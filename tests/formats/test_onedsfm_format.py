@@ -50,23 +50,16 @@ def write_scene(path, n=6, num_rotations=None):
     return folder_with(path, EGs=egs_text(rotations, centers), rots=rots), rotations, centers
 
 
-def test_directions_in_world_axes_point_from_the_second_to_the_first_camera(tmp_path):
-    folder, _, centers = write_scene(tmp_path)
+def test_directions_in_world_axes_point_to_the_first_camera_and_camera_axes_become_those_of_colmap(tmp_path):
+    folder, rotations, centers = write_scene(tmp_path)
     found = read_onedsfm(folder)
-    known, all_known = read_rotations(folder / "rots.txt", found.names)
-    graph = found.view_graph(known, all_known)
+    cam_from_world, all_known = read_rotations(folder / "rots.txt", found.names)
+    graph = found.view_graph(cam_from_world, all_known)
     i, j = graph.edges.T
     assert graph.names == ("0", "10", "20", "30", "40", "50")
     np.testing.assert_allclose(graph.directions, normalized(centers[i] - centers[j]), atol=1e-12)
-
-
-def test_camera_axes_become_those_of_colmap(tmp_path):
-    folder, rotations, _ = write_scene(tmp_path)
-    found = read_onedsfm(folder)
-    cam_from_world, _ = read_rotations(folder / "rots.txt", found.names)
     # Bundler's camera looks along -z and its y is up: in COLMAP's axes both turn round.
-    np.testing.assert_allclose(cam_from_world[:, 2], -rotations[:, 2], atol=1e-12)
-    np.testing.assert_allclose(cam_from_world[:, 1], -rotations[:, 1], atol=1e-12)
+    np.testing.assert_allclose(cam_from_world[:, 1:], -rotations[:, 1:], atol=1e-12)
     i, j = found.pairs.T
     relative = cam_from_world[j] @ cam_from_world[i].swapaxes(1, 2)  # cam_j_from_cam_i
     np.testing.assert_allclose(found.rotations, relative, atol=1e-12)
@@ -93,60 +86,42 @@ def test_what_is_written_is_what_was_read(tmp_path):
     assert known.all()
 
 
-def test_cameras_without_rotation_have_no_directions(tmp_path):
+def test_cameras_without_rotation_have_no_directions_and_the_format_is_told_from_bare_graphs(tmp_path):
     folder, _, _ = write_scene(tmp_path, num_rotations=4)
     found = read_onedsfm(folder)
     graph = found.view_graph(*read_rotations(folder / "rots.txt", found.names))
     assert graph.degrees().tolist() == [3, 3, 3, 3, 0, 0]
-
-
-def test_the_format_is_told_from_bare_graphs(tmp_path):
-    folder = folder_with(tmp_path, EGs=GOOD, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
+    folder_with(folder, graph="0 1 1 0 0\n1 2 0 1 0\n", wide="0 1 1" + " 0" * 11 + "\n")
     assert is_onedsfm(folder)
     assert is_onedsfm(folder / "EGs.txt")
-    assert not is_onedsfm(folder / "graph.txt")
-    assert not is_onedsfm(folder / "wide.txt")  # a direction in 12 dimensions
-    assert not is_onedsfm(folder / "nowhere.txt")
+    for name in ("graph.txt", "wide.txt", "nowhere.txt"):  # the second has directions in 12 dimensions
+        assert not is_onedsfm(folder / name)
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("name", "text", "words"),
     [
-        ("", "no lines of the form i j R11"),
-        (f"1 2 {IDENTITY} 1 0\n", "line 1: has 13 columns, expected 14"),
-        (f"{GOOD}\n1 2 {IDENTITY} 1 0 x\n", "line 5: 'x' is not a number"),
-        (f"{GOOD}1 2 {IDENTITY} 1 0 inf\n", "line 4: has a number that is not finite"),
-        (f"{GOOD}1 2 1 0 0 0 1 0 0 0 -1 1 0 0\n", "line 4: has no rotation matrix"),
-        (f"{GOOD}1 2 2 0 0 0 1 0 0 0 1 1 0 0\n", "line 4: has no rotation matrix"),
-        (f"{GOOD}1 2 {IDENTITY} 2 0 0\n", "line 4: has no unit direction"),
-        (f"{GOOD}1 1 {IDENTITY} 1 0 0\n", "line 4: joins a camera with itself"),
-        (f"{GOOD}7 3 {IDENTITY} 1 0 0\n", "line 4: repeats an earlier pair"),
+        ("EGs", "", "no lines of the form i j R11"),
+        ("EGs", f"1 2 {IDENTITY} 1 0\n", "line 1: has 13 columns, expected 14"),
+        ("EGs", f"{GOOD}\n1 2 {IDENTITY} 1 0 x\n", "line 5: 'x' is not a number"),
+        ("EGs", f"{GOOD}1 2 {IDENTITY} 1 0 inf\n", "line 4: has a number that is not finite"),
+        ("EGs", f"{GOOD}1 2 1 0 0 0 1 0 0 0 -1 1 0 0\n", "line 4: has no rotation matrix"),
+        ("EGs", f"{GOOD}1 2 2 0 0 0 1 0 0 0 1 1 0 0\n", "line 4: has no rotation matrix"),
+        ("EGs", f"{GOOD}1 2 {IDENTITY} 2 0 0\n", "line 4: has no unit direction"),
+        ("EGs", f"{GOOD}1 1 {IDENTITY} 1 0 0\n", "line 4: joins a camera with itself"),
+        ("EGs", f"{GOOD}7 3 {IDENTITY} 1 0 0\n", "line 4: repeats an earlier pair"),
+        ("rots", f"3 {IDENTITY}\n7 1 2 3\n", "line 2: has 4 columns, expected 10"),
+        ("rots", f"3 {IDENTITY}\n7 1 0 0 0 1 0 0 0 2\n", "line 2: has no rotation matrix"),
+        ("rots", f"3 {IDENTITY}\n3 {IDENTITY}\n", "line 2: gives an earlier camera a second rotation"),
+        ("rots", f"4 {IDENTITY}\n", "a rotation of none of the 3 cameras"),
+        ("cc", "3\n7 1\n", "line 2: is not one"),
+        ("cc", "1\n", "keeps no pair"),
     ],
 )
-def test_malformed_pairs_are_refused_by_line(tmp_path, text, words):
+def test_malformed_pairs_rotations_and_components_are_refused_by_line(tmp_path, name, text, words):
+    folder_with(tmp_path, **({"EGs": GOOD} | {name: text}))
     with pytest.raises(InputError, match=words):
-        read_onedsfm(folder_with(tmp_path, EGs=text))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (f"3 {IDENTITY}\n7 1 2 3\n", "line 2: has 4 columns, expected 10"),
-        (f"3 {IDENTITY}\n7 1 0 0 0 1 0 0 0 2\n", "line 2: has no rotation matrix"),
-        (f"3 {IDENTITY}\n3 {IDENTITY}\n", "line 2: gives an earlier camera a second rotation"),
-        (f"4 {IDENTITY}\n", "a rotation of none of the 3 cameras"),
-    ],
-)
-def test_malformed_rotations_are_refused_by_line(tmp_path, text, words):
-    found = read_onedsfm(folder_with(tmp_path, EGs=GOOD, rots=text))
-    with pytest.raises(InputError, match=words):
-        read_rotations(tmp_path / "rots.txt", found.names)
-
-
-@pytest.mark.parametrize(("text", "words"), [("3\n7 1\n", "line 2: is not one"), ("1\n", "keeps no pair")])
-def test_a_component_that_fits_not_is_refused(tmp_path, text, words):
-    with pytest.raises(InputError, match=words):
-        read_onedsfm(folder_with(tmp_path, EGs=GOOD, cc=text))
+        read_rotations(tmp_path / "rots.txt", read_onedsfm(tmp_path).names)
 
 
 def test_the_published_scene_has_the_conventions_of_its_manual():
@@ -163,22 +138,16 @@ def test_the_published_scene_has_the_conventions_of_its_manual():
     assert angle_between_deg(found.to_second[rows], to_second).max() < 1e-3
 
 
-def test_g2o_has_the_camera_in_the_world(tmp_path):
+def test_g2o_has_the_camera_in_the_world_and_numbers_nodes_that_have_names():
     turn = Rotation.from_rotvec([0.0, 0.0, 0.3]).as_matrix()
     (line,) = g2o_text(["12"], np.array([[1.0, 2.0, 3.0]]), turn[None]).splitlines()
     tag, name, *numbers = line.split()
     assert (tag, name) == ("VERTEX_SE3:QUAT", "12")
     world_from_cam = [0.0, 0.0, -np.sin(0.15), np.cos(0.15)]
     np.testing.assert_allclose([float(x) for x in numbers], [1.0, 2.0, 3.0, *world_from_cam], atol=1e-15)
-
-
-def test_g2o_numbers_nodes_that_have_names_and_needs_no_rotations():
     text = g2o_text(["b.jpg", "a\n.jpg"], np.array([[0.1, 2.0], [3.0, 4.0]]))
     assert text == "# 0 b.jpg\nVERTEX_XY 0 0.1 2.0\n# 1 a?.jpg\nVERTEX_XY 1 3.0 4.0\n"
     assert g2o_text(["5"], np.array([[1.0, 2.0, 3.0]])) == "VERTEX_TRACKXYZ 5 1.0 2.0 3.0\n"
-
-
-def test_g2o_has_no_vertices_in_five_dimensions():
     with pytest.raises(InputError, match="5 dimensions"):
         g2o_text(["0"], np.zeros((1, 5)))
 

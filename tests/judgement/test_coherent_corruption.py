@@ -21,7 +21,7 @@ def test_wrong_pairs_agree_on_the_second_configuration_and_right_ones_on_the_tru
     assert relative_error(problem.false_locations, problem.locations) > 1.0
 
 
-def test_the_models_of_corruption_differ_in_the_wrong_directions_only():
+def test_the_models_of_corruption_differ_in_the_wrong_directions_only_and_others_are_refused():
     uniform, consistent = (
         random_graph_problem(30, sigma=0.05, q=0.3, seed=2, corruption=corruption)
         for corruption in ("uniform", "self-consistent")
@@ -31,6 +31,8 @@ def test_the_models_of_corruption_differ_in_the_wrong_directions_only():
     right = ~uniform.corrupted
     np.testing.assert_array_equal(uniform.directions[right], consistent.directions[right])
     assert (uniform.directions != consistent.directions)[~right].all()
+    with pytest.raises(ValueError, match="corruption must be one of uniform, self-consistent"):
+        random_graph_problem(5, corruption="sly")
 
 
 def test_concentrated_corruption_sits_on_cameras_with_few_pairs():
@@ -40,11 +42,6 @@ def test_concentrated_corruption_sits_on_cameras_with_few_pairs():
     few = smaller <= np.median(smaller)
     assert problem.corrupted.mean() == pytest.approx(0.3, abs=0.03)  # 3 sigma of 4,000 draws is 0.022
     assert problem.corrupted[few].mean() > 1.4 * problem.corrupted[~few].mean()
-
-
-def test_an_unknown_corruption_is_refused():
-    with pytest.raises(ValueError, match="corruption must be one of uniform, self-consistent"):
-        random_graph_problem(5, corruption="sly")
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -21,9 +21,8 @@ def test_pairs_that_agree_on_a_second_configuration_are_a_rival(q):
     problem = random_graph_problem(60, 0.5, sigma=0.01, q=q, seed=1, corruption="self-consistent")
     found = judged(problem)
     assert len(found.cameras) == 60
-    assert (
-        found.num_pairs > 0.9 * problem.corrupted.sum()
-    )  # noise of 0.6 deg against 3, short baselines of LUD unrefined
+    # Noise of 0.6 deg against 3, short baselines of LUD unrefined.
+    assert found.num_pairs > 0.9 * problem.corrupted.sum()
     assert found.num_against == np.sum(~problem.corrupted)
 
 
@@ -48,24 +47,17 @@ def test_pairs_that_just_suffice_to_place_their_cameras_are_no_rival():
     assert find_second_configuration(graph, np.arange(len(kept)), inliers[kept], 0.5) is None
 
 
-def test_a_few_pairs_that_agree_are_no_rival():
-    problem = random_graph_problem(60, 1.0, sigma=0.01, q=0.12, seed=4, corruption="self-consistent")
-    assert judged(problem) is None
-
-
-def test_directions_to_points_are_not_heard():
+def test_a_few_pairs_that_agree_are_no_rival_and_directions_to_points_are_not_heard():
+    few = random_graph_problem(60, 1.0, sigma=0.01, q=0.12, seed=4, corruption="self-consistent")
+    assert judged(few) is None
     problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.4, seed=5, corruption="self-consistent")
-    graph = problem.view_graph
-    assert (
-        find_second_configuration(graph, np.flatnonzero(~problem.corrupted), ~problem.corrupted, 0.5) is None
-    )
+    right, pairs = ~problem.corrupted, np.flatnonzero(~problem.corrupted)
+    assert find_second_configuration(problem.view_graph, pairs, right, 0.5) is None
 
 
 def test_a_placement_with_a_rival_warns_and_names_its_cameras():
     problem = random_graph_problem(60, 0.5, sigma=0.01, q=0.35, seed=6, corruption="self-consistent")
-    edges = np.concatenate(
-        [[[0, 61]], problem.edges + 1]
-    )  # camera 0 stays out, and the others keep their numbers
+    edges = np.concatenate([[[0, 61]], problem.edges + 1])  # camera 0 stays out, the others keep numbers
     graph = ViewGraph(62, edges, np.concatenate([[[1.0, 0.0, 0.0]], problem.directions]))
     placement = place(graph)
     assert placement.second_configuration is not None

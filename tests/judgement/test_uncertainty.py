@@ -41,15 +41,12 @@ def test_standard_deviations_are_those_of_the_dense_inverse(d):
     np.testing.assert_allclose(found.sigmas, expected, rtol=1e-6)  # the ridge changes 1e-12 of each block
 
 
-def test_leverages_add_up_to_the_number_of_unknowns():
+def test_leverages_add_up_to_the_number_of_unknowns_and_are_one_where_nothing_checks_a_direction():
     problem = box_graph_problem(60, 12.0, seed=1)
     found = propagate(problem.locations, problem.edges, isotropic(len(problem.edges)))
     assert found.leverages.sum() == pytest.approx((3 * 60 - 4) / 2, rel=1e-6)
     assert found.leverages.min() > 0.0
     assert found.leverages.max() < 1.0
-
-
-def test_a_direction_that_nothing_checks_has_leverage_one():
     t = np.random.default_rng(2).standard_normal((3, 2))
     found = propagate(t, np.array([(0, 1), (1, 2), (0, 2)]), isotropic(3, 2))  # 3 equations, 6 - 3 unknowns
     np.testing.assert_allclose(found.leverages, 1.0, rtol=1e-6)
@@ -70,15 +67,11 @@ def test_a_camera_that_hardly_anything_holds_does_not_decide_the_gauge_of_the_ot
 
 def test_points_are_judged_with_the_cameras_but_do_not_hold_the_gauge():
     problem = box_graph_problem(40, 12.0, seed=4)
-    found = propagate(problem.locations, problem.edges, isotropic(len(problem.edges)), num_cameras=25)
+    given = problem.locations, problem.edges, isotropic(len(problem.edges))
+    found = propagate(*given, num_cameras=25)
     assert found.gauge.tolist() == [True] * 25 + [False] * 15
     assert np.isfinite(found.sigmas).all()
-
-
-def test_a_factor_beyond_the_limit_is_not_tried():
-    problem = box_graph_problem(40, 12.0, seed=5)
-    given = problem.locations, problem.edges, isotropic(len(problem.edges))
-    assert propagate(*given, max_bytes=1000) is None
+    assert propagate(*given, max_bytes=1000) is None  # a factor beyond the limit is not tried
 
 
 def test_independent_samples_scatter_like_the_inverse():

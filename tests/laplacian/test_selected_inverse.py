@@ -30,8 +30,10 @@ def test_selected_entries_are_those_of_the_whole_inverse(problem, b):
     np.testing.assert_allclose(found.edges, whole[edges[:, 0], :, edges[:, 1], :], atol=limit)
 
 
-def test_entries_are_right_where_the_factor_is_cut_into_tasks():
+def test_entries_are_right_where_the_factor_is_cut_into_tasks_and_single_precision_is_refused():
     edges = trajectory_graph_problem(6000, 60.0, seed=0).edges
+    with pytest.raises(ValueError, match="float64"):
+        selected_inverse(factorize(analyze(6000, edges), np.ones(len(edges)), np.float32), edges)
     factor = factorize(analyze(6000, edges), np.ones(len(edges)), ground=7.0)
     assert len(factor.symbolic.tasks) > 1
     found = selected_inverse(factor, edges)
@@ -43,10 +45,3 @@ def test_entries_are_right_where_the_factor_is_cut_into_tasks():
         limit = 1e-9 * np.abs(column).max()
         np.testing.assert_allclose(found.nodes[node, 0, 0], column[node], atol=limit)
         np.testing.assert_allclose(found.edges[edges[:, 0] == node, 0, 0], column[tied[:, 1]], atol=limit)
-
-
-def test_a_single_precision_factor_is_refused():
-    edges = box_graph_problem(20, 8.0).edges
-    factor = factorize(analyze(20, edges), np.tile(np.eye(3), (len(edges), 1, 1)), dtype=np.float32)
-    with pytest.raises(ValueError, match="float64"):
-        selected_inverse(factor, edges)

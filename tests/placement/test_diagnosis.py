@@ -6,32 +6,25 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
-from sfm_shapefit import SolverOptions, UnsolvableError
+from sfm_shapefit import UnsolvableError, synthetic
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.judgement.conditioning import direction_spread
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.placement.diagnosis import diagnose, theory_of
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.options import PlacementOptions
-from sfm_shapefit.synthetic import (
-    box_graph_problem,
-    community_graph_problem,
-    expander_graph_problem,
-    random_graph_problem,
-    trajectory_graph_problem,
-)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, fingerprint
 
 FAMILIES = {
-    "random": lambda **how: random_graph_problem(60, **how),
-    "sparse": lambda **how: random_graph_problem(100, 0.2, **how),
-    "expander": lambda **how: expander_graph_problem(150, 30, **how),
-    "box": lambda **how: box_graph_problem(150, **how),
-    "trajectory": lambda **how: trajectory_graph_problem(150, **how),
-    "community": lambda **how: community_graph_problem(200, **how),
+    "random": lambda **how: synthetic.random_graph_problem(60, **how),
+    "sparse": lambda **how: synthetic.random_graph_problem(100, 0.2, **how),
+    "expander": lambda **how: synthetic.expander_graph_problem(150, 30, **how),
+    "box": lambda **how: synthetic.box_graph_problem(150, **how),
+    "trajectory": lambda **how: synthetic.trajectory_graph_problem(150, **how),
+    "community": lambda **how: synthetic.community_graph_problem(200, **how),
 }
 
 
@@ -65,28 +58,21 @@ def test_only_pairs_in_triangles_say_something_of_corruption():
     assert (corruption.num_checked, corruption.share) == (3, 0.0)
 
 
-def test_a_camera_seen_in_one_direction_only_is_weak_and_named_so():
+def test_a_camera_seen_in_one_direction_only_is_weak_and_named_so_a_wrong_pair_or_not():
     t = np.random.default_rng(2).standard_normal((10, 3))
     t[9] = [0.0, 0.0, 60.0]
-    (weak,) = diagnose(exact_graph(t, all_pairs(10))).weak
-    assert weak.name == "9"
-    assert weak.num_pairs == 9
+    graph = exact_graph(t, all_pairs(10))
+    (weak,) = diagnose(graph).weak
+    assert (weak.name, weak.num_pairs) == ("9", 9)
     assert "nearly parallel" in weak.reasons[0]
-    edges = [*all_pairs(9), (0, 9), (1, 9)]
-    (weak,) = diagnose(exact_graph(t, edges)).weak
+    v = graph.directions.copy()
+    v[(graph.edges == (0, 9)).all(axis=1)] = [1.0, 0.0, 0.0]
+    assert [camera.name for camera in diagnose(ViewGraph(10, graph.edges, v)).weak] == ["9"]
+    (weak,) = diagnose(exact_graph(t, [*all_pairs(9), (0, 9), (1, 9)])).weak
     assert [reason.split(":")[0] for reason in weak.reasons] == [
         "two pairs or fewer hold it",
         "the directions that hold it are nearly parallel",
     ]
-
-
-def test_a_wrong_pair_does_not_hide_that_the_others_are_parallel():
-    t = np.random.default_rng(2).standard_normal((10, 3))
-    t[9] = [0.0, 0.0, 60.0]
-    graph = exact_graph(t, all_pairs(10))
-    v = graph.directions.copy()
-    v[(graph.edges == (0, 9)).all(axis=1)] = [1.0, 0.0, 0.0]
-    assert [camera.name for camera in diagnose(ViewGraph(10, graph.edges, v)).weak] == ["9"]
 
 
 def test_a_camera_of_contradicting_matches_is_weak():
@@ -118,33 +104,28 @@ def test_the_spread_of_directions_is_zero_when_parallel_and_one_when_even():
 
 
 @pytest.mark.parametrize("method", ["auto", "admm"])
-def test_the_plan_is_what_a_placement_does(method):
-    problem = random_graph_problem(30, seed=5, sigma=0.01)
+def test_the_plan_is_what_a_placement_does_and_says_what_becomes_of_the_starts(method):
+    problem = synthetic.random_graph_problem(30, seed=5, sigma=0.01)
     graph = problem.view_graph
     options = PlacementOptions(solver=method, tol=1e-4)
     plan, done = diagnose(graph, options).plan, place(graph, options)
     assert plan.solver == done.certified.method
     assert done.certified.method_reason.startswith(plan.solver_reason)
     assert plan.second_start == (done.refined.lud is not None)
-    assert isinstance(options, SolverOptions)
-
-
-def test_the_plan_says_what_becomes_of_the_starts():
-    t = np.random.default_rng(6).standard_normal((5, 3))
-    graph = exact_graph(t, all_pairs(5))
     said = {
         "better is kept, refined": PlacementOptions(),
         "better is kept, unrefined": PlacementOptions(refine=False),
         "as it is, as asked": PlacementOptions(objective="shapefit"),
         "kept, as asked, refined": PlacementOptions(objective="lud"),
     }
-    for words, options in said.items():
-        assert words in diagnose(graph, options).plan.finish
-    assert "no second start" in diagnose(exact_graph(t[:2], [(0, 1)])).plan.finish
+    for words, asked in said.items():
+        assert words in diagnose(graph, asked).plan.finish
+    pair = exact_graph(problem.locations[:2], [(0, 1)])
+    assert "no second start" in diagnose(pair).plan.finish
 
 
 def test_theory_is_given_in_words_or_left_out_with_the_reason():
-    problem = random_graph_problem(12, 1.0, seed=7)
+    problem = synthetic.random_graph_problem(12, 1.0, seed=7)
     graph = problem.view_graph
     found = theory_of(graph, problem.locations)
     assert "less than one pair of 12 cameras" in found.statement
@@ -192,24 +173,18 @@ def test_json_has_the_same_content_and_theory():
     assert never["theory"] is None
 
 
-def test_a_bare_graph_is_diagnosed_too(tmp_path):
-    t = np.random.default_rng(8).standard_normal((6, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
-    result = run("inspect", tmp_path / "graph.txt", "--theory")
-    assert result.exit_code == 0
+def test_a_bare_graph_is_diagnosed_too_and_refused_if_it_cannot_be_placed(tmp_path):
+    t, graph = np.random.default_rng(8).standard_normal((6, 3)), tmp_path / "graph.txt"
+    graph.write_text(graph_text(exact_graph(t, [*all_pairs(5), (0, 5)])))
+    result = run("inspect", graph, "--theory", code=0)
     assert "5: pendant" in result.stdout
     assert "no centers" in result.stdout
-    run("inspect", tmp_path / "graph.txt", "--database", RING / "database.db", code=3)
+    run("inspect", graph, "--database", RING / "database.db", code=3)
     run("inspect", tmp_path / "nowhere", code=3)
     run("inspect", code=2)
-    run("inspect", tmp_path / "graph.txt", "--min-inlier-ratio", "7", code=2)
-
-
-def test_a_graph_that_cannot_be_placed_is_diagnosed_and_refused(tmp_path):
-    t = np.random.default_rng(9).standard_normal((5, 3))
-    (tmp_path / "graph.txt").write_text(graph_text(exact_graph(t, [(k, (k + 1) % 5) for k in range(5)])))
-    result = run("inspect", tmp_path / "graph.txt", "--json")
-    assert result.exit_code == 4
+    run("inspect", graph, "--min-inlier-ratio", "7", code=2)
+    graph.write_text(graph_text(exact_graph(t[:5], [(k, (k + 1) % 5) for k in range(5)])))
+    result = run("inspect", graph, "--json", code=4)
     facts = json.loads(result.stdout)["diagnosis"]
     assert "tie no three cameras" in facts["obstacle"]
     assert facts["obstacle"] in result.stderr

@@ -37,39 +37,29 @@ def priors_of(positions, sigma=np.nan, rows=None):
     )
 
 
-def test_the_input_gauge_is_recovered_without_turning_the_axes():
+def test_the_input_gauge_is_recovered_without_turning_the_axes_in_spite_of_a_few_wild_cameras():
     t = cameras(8)
     gauge = input_gauge(t, 7.0 * t + [1.0, -2.0, 3.0])
     assert gauge.scale == "input"
     assert gauge.similarity.scale == pytest.approx(7.0, rel=1e-9)
     np.testing.assert_allclose(gauge.similarity.apply(t), 7.0 * t + [1.0, -2.0, 3.0], atol=1e-8)
     np.testing.assert_array_equal(gauge.similarity.rotation, np.eye(3))
-
-
-def test_a_few_wild_cameras_do_not_set_the_scale():
-    t = cameras(9)
     wild_input, wild_answer = 7.0 * t, t.copy()
     wild_input[3] += 1e4
     wild_answer[5] += 1e4
     assert input_gauge(wild_answer, wild_input).similarity.scale == pytest.approx(7.0, rel=1e-6)
 
 
-@pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6)])
-def test_without_input_centers_the_scale_is_unit_and_said_so(centers):
+@pytest.mark.parametrize("centers", [np.zeros((12, 3)), np.full((12, 3), 1e6), -cameras(10)])
+def test_without_input_centers_or_with_contradicting_ones_the_scale_is_unit(centers):
     t = cameras(10)
     gauge = input_gauge(t, centers)
     placed = gauge.similarity.apply(t)
     assert gauge.scale == "unit"
-    assert "coincide" in gauge.statement
+    assert ("coincide" in gauge.statement) == (np.ptp(centers) == 0.0)
+    assert gauge.similarity.scale > 0.0
     np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-12)
     assert np.median(np.linalg.norm(placed, axis=1)) == pytest.approx(1.0, rel=1e-12)
-
-
-def test_centers_that_contradict_the_answer_do_not_turn_it_inside_out():
-    t = cameras(11)
-    gauge = input_gauge(t, -t)
-    assert gauge.scale == "unit"
-    assert gauge.similarity.scale > 0.0
 
 
 def test_a_known_distance_becomes_true():
@@ -82,26 +72,28 @@ def test_a_known_distance_becomes_true():
         distance_gauge(t, 4, 5, 1.0, "a and b")
 
 
-def test_locate_makes_a_known_distance_true_and_says_so(tmp_path):
+def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_image(tmp_path):
     known = ("--known-distance", "0003.jpg", "0007.jpg", "42.5")
     result = run("locate", RING_MODEL, tmp_path / "out", "--json", *known)
     model = pycolmap.Reconstruction(tmp_path / "out")
     centers = {image.name: image.projection_center() for image in model.images.values()}
     assert np.linalg.norm(centers["0003.jpg"] - centers["0007.jpg"]) == pytest.approx(42.5, rel=1e-12)
     assert "0003.jpg and 0007.jpg are 42.5 apart" in json.loads(result.stdout)["scale"]
+    unknown = ("--known-distance", "0003.jpg", "x.jpg", "1")
+    assert "no posed image x.jpg" in run_refused("locate", RING_MODEL, tmp_path / "none", *unknown)
 
 
-def test_a_known_distance_of_an_unknown_image_names_it(tmp_path):
-    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--known-distance", "0003.jpg", "x.jpg", "1")
-    assert "no posed image x.jpg" in said
-
-
-def test_exact_priors_give_back_scale_axes_and_origin():
+def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_stay():
     t = cameras(3)
     truth = 5.0 * t @ TURN.T + [100.0, -20.0, 3.0]
     gauge = prior_gauge(t, priors_of(truth, rows=[0, 2, 3, 7, 9]))
     np.testing.assert_allclose(gauge.apply(t), truth, atol=1e-9)
     np.testing.assert_allclose(gauge.axes, TURN, atol=1e-12)
+    line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
+    gauge = prior_gauge(line, priors_of(3.0 * line + 1.0))
+    assert gauge.axes is None
+    assert "lie on a line" in gauge.warning
+    assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
 
 
 def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
@@ -121,14 +113,6 @@ def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
     assert gauge.warning == ""
 
 
-def test_priors_on_a_line_keep_the_axes_and_say_so():
-    t = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
-    gauge = prior_gauge(t, priors_of(3.0 * t + 1.0))
-    assert gauge.axes is None
-    assert "lie on a line" in gauge.warning
-    assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
-
-
 @pytest.mark.parametrize(
     ("positions", "rows", "message"),
     [
@@ -137,12 +121,11 @@ def test_priors_on_a_line_keep_the_axes_and_say_so():
         (np.full((12, 3), 4.0), None, "coincide"),
     ],
 )
-def test_too_few_priors_and_those_at_one_place_are_refused(positions, rows, message):
+def test_too_few_priors_and_those_at_one_place_are_refused_and_unrelated_ones_warned_about(
+    positions, rows, message
+):
     with pytest.raises(InputError, match=message):
         prior_gauge(cameras(5), priors_of(positions, rows=rows))
-
-
-def test_priors_that_have_nothing_to_do_with_the_cameras_are_warned_about():
     assert "rough; check them" in prior_gauge(cameras(7), priors_of(cameras(8))).warning
 
 
@@ -159,24 +142,16 @@ def write_table(path, model, positions, lines=(), sep=" "):
     return path
 
 
-def test_a_table_is_read_by_name_with_either_separator(ring, tmp_path):
+def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(ring, tmp_path):
+    path = tmp_path / "priors.txt"
     for sep in (" ", ","):
-        path = write_table(
-            tmp_path / "priors.txt", ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep
-        )
+        write_table(path, ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep)
         found = table_priors(path, ring)
         np.testing.assert_array_equal(found.positions, ring.centers)
         assert np.isnan(found.covariances).all()
-
-
-def test_standard_deviations_of_a_table_become_covariances(ring, tmp_path):
-    path = tmp_path / "priors.csv"
     path.write_text(f"name,x,y,z,sx,sy,sz\n{ring.names[0]},1,2,3,0.5,0.25,2\n")
     np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
 
-
-def test_latitudes_and_longitudes_become_meters_east_north_up(ring, tmp_path):
-    path = tmp_path / "gps.csv"
     names = ring.names[:3]
     path.write_text(
         f"name,lat,lon,alt\n{names[0]},48.0,11.0,500\n{names[1]},48.0,11.001,500\n{names[2]},48.001,11.0,510\n"
@@ -206,11 +181,18 @@ def test_a_malformed_line_of_a_table_is_named(ring, tmp_path, line, message):
         table_priors(path, ring)
 
 
-def test_a_table_of_other_images_is_refused(ring, tmp_path):
+def test_priors_of_other_images_or_without_effect_are_refused(ring, tmp_path):
     path = tmp_path / "priors.txt"
     path.write_text("other.jpg 1 2 3\n")
     with pytest.raises(InputError, match="no prior of the model's images"):
         table_priors(path, ring)
+    table = write_table(path, ring, ring.centers)
+    for flags, sentence in (
+        (("--priors", table, "--scale", "unit"), "no effect with the scale unit"),
+        (("--scale", "prior"), "give a table with --priors"),
+        (("--refine-with-priors",), "needs priors"),
+    ):
+        assert sentence in run_refused("locate", RING_MODEL, tmp_path / "out", *flags)
 
 
 NEW = (
@@ -267,11 +249,11 @@ def test_a_database_without_usable_priors_is_refused(ring, tmp_path):
         database_priors(database_with_priors(tmp_path / "d.db", NEW, rows), ring)
 
 
-def test_locate_turns_the_whole_model_onto_priors(ring, tmp_path):
-    plain = locate(RING_MODEL)
-    truth = 2.0 * ring.centers @ TURN.T + [1000.0, 0.0, -50.0]
+def test_locate_turns_the_whole_model_with_its_directions_and_deviations_onto_priors(ring, tmp_path):
+    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()  # x becomes y, y becomes -x
+    truth = 2.0 * ring.centers @ quarter.T + [1000.0, 0.0, -50.0]
     table = write_table(tmp_path / "priors.txt", ring, truth)
-    found = locate(RING_MODEL, priors=table)
+    plain, found = locate(RING_MODEL), locate(RING_MODEL, priors=table)
     for image_id, center in zip(ring.image_ids.tolist(), truth, strict=True):
         image, before = found.reconstruction.image(image_id), plain.reconstruction.image(image_id)
         apart = np.linalg.norm(before.projection_center() - ring.centers[ring.image_ids == image_id][0])
@@ -281,36 +263,27 @@ def test_locate_turns_the_whole_model_onto_priors(ring, tmp_path):
         np.testing.assert_allclose(image.cam_from_world().rotation.matrix(), expected, atol=1e-12)
     before, after = (r.reconstruction.compute_mean_reprojection_error() for r in (plain, found))
     assert after == pytest.approx(before, abs=1e-5)  # exact matches: rounding alone
+    ratio = found.gauge.similarity.scale / plain.gauge.similarity.scale
+    for before, after in zip(plain.cameras, found.cameras, strict=True):
+        x, y, z = before.sigma
+        # The ring is exact, so that the turn is a quarter to 1e-6 or so, and so are the variances' shares.
+        np.testing.assert_allclose(after.sigma, ratio * np.array([y, x, z]), rtol=1e-4)
+    for before, after in zip(plain.pairs, found.pairs, strict=True):
+        np.testing.assert_allclose(after.direction, quarter @ before.direction, atol=1e-5)
 
 
-def test_priors_without_effect_are_refused(ring, tmp_path):
-    table = write_table(tmp_path / "priors.txt", ring, ring.centers)
-    for flags, sentence in (
-        (("--priors", table, "--scale", "unit"), "no effect with the scale unit"),
-        (("--scale", "prior"), "give a table with --priors"),
-        (("--refine-with-priors",), "needs priors"),
-    ):
-        assert sentence in run_refused("locate", RING_MODEL, tmp_path / "out", *flags)
-
-
-def test_priors_with_refinement_mend_what_directions_leave_open():
-    """A drive along a line: directions with errors drift; positions known to a few centimeters do not."""
+def test_priors_mend_what_directions_leave_open_and_a_fifth_of_wrong_ones_does_not_pull():
+    """A drive along a line: directions with errors drift; positions known to a few centimetres do not."""
     terms, start, truth, priors = drive(sigma=0.05)
     before = np.linalg.norm(start - truth, axis=1)
-    moved = refine_anchored(*terms, priors)
-    after = np.linalg.norm(moved - truth, axis=1)
+    after = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
     assert np.median(before) > 5.0 * np.median(after)
     assert np.median(after) < 1.538 * 0.05  # the median error of the priors themselves
-
-
-def test_a_fifth_of_wrong_priors_does_not_pull():
-    terms, _, truth, priors = drive(sigma=0.05)
-    right = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
     wrong = np.random.default_rng(1).permutation(len(truth))[: len(truth) // 5]
     priors.positions[wrong] += 5.0 * np.random.default_rng(2).standard_normal((len(wrong), 3))
     left = np.linalg.norm(refine_anchored(*terms, priors) - truth, axis=1)
     # A fifth fewer positions: sqrt(5 / 4) times the error, if the wrong ones have no part.
-    assert np.median(left) < 1.25 * np.sqrt(5.0 / 4.0) * np.median(right)
+    assert np.median(left) < 1.25 * np.sqrt(5.0 / 4.0) * np.median(after)
 
 
 def drive(sigma):
@@ -351,16 +324,3 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
         centers = {image.name: image.projection_center() for image in model.images.values()}
         off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
     assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
-
-
-def test_standard_deviations_and_directions_follow_the_axes(ring, tmp_path):
-    quarter = Rotation.from_euler("z", 90, degrees=True).as_matrix()  # x becomes y, y becomes -x
-    table = write_table(tmp_path / "priors.txt", ring, ring.centers @ quarter.T)
-    plain, found = locate(RING_MODEL), locate(RING_MODEL, priors=table)
-    ratio = found.gauge.similarity.scale / plain.gauge.similarity.scale
-    for before, after in zip(plain.cameras, found.cameras, strict=True):
-        x, y, z = before.sigma
-        # The ring is exact, so that the turn is a quarter to 1e-6 or so, and so are the variances' shares.
-        np.testing.assert_allclose(after.sigma, ratio * np.array([y, x, z]), rtol=1e-4)
-    for before, after in zip(plain.pairs, found.pairs, strict=True):
-        np.testing.assert_allclose(after.direction, quarter @ before.direction, atol=1e-5)

@@ -16,37 +16,29 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.options import NO_FACTOR, Status
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.solver.rigs.groups import RigidGroups, separate
+from sfm_shapefit.solver.rigs.groups import separate
 from sfm_shapefit.synthetic import random_graph_problem
 from sfm_shapefit.viewgraph import ViewGraph
+from tests.problems import rig_problem
 
 NUM_FRAMES, SENSORS = 12, 3
 N = NUM_FRAMES * SENSORS
 
 
-def directions_between(t, edges, rng):
-    """Directions of the baselines with errors of 0.003 rad."""
-    return normalized(normalized(differences(t, edges)) + 0.003 * rng.normal(size=(len(edges), 3)))
-
-
 def measure(kind, wrong=0.2, other=None):
     """A measured graph of 36 cameras, a share of its pairs wrong: at random, or as other places have them."""
+    share = wrong if other is None else 0.0
+    graph, groups, t = rig_problem(7, NUM_FRAMES, SENSORS, share, noise=0.003)
     rng = np.random.default_rng(7)
-    frames = np.repeat(np.arange(NUM_FRAMES), SENSORS)
-    offsets = 0.7 * rng.normal(size=(N, 3))
-    t = 4.0 * rng.normal(size=(NUM_FRAMES, 3))[frames] + offsets
-    edges = np.stack(np.triu_indices(N, 1), axis=1)
-    edges = edges[rng.random(len(edges)) < 0.5]
-    v = directions_between(t, edges, rng)
-    bad = rng.random(len(edges)) < wrong
-    wrong_v = normalized(rng.normal(size=v.shape)) if other is None else directions_between(other, edges, rng)
-    v[bad] = wrong_v[bad]
-    graph, groups, fixed = ViewGraph(N, edges, v), None, None
-    if kind == "rigs":
-        groups = RigidGroups(group_of=frames, offsets=offsets)
-    if kind == "fixed":
-        groups, fixed = separate(N, 3).with_fixed(np.arange(N) < 8, t), 0
-    return MeasuredGraph(graph, groups=groups, fixed_group=fixed)
+    v = graph.directions.copy()
+    if other is not None:
+        bad = rng.random(len(v)) < wrong
+        v[bad] = normalized(normalized(differences(other, graph.edges)) + 0.003 * rng.normal(size=v.shape))[
+            bad
+        ]
+    fixed = 0 if kind == "fixed" else None
+    given = {"rigs": groups, "fixed": separate(N, 3).with_fixed(np.arange(N) < 8, t)}
+    return MeasuredGraph(ViewGraph(N, graph.edges, v), groups=given.get(kind), fixed_group=fixed)
 
 
 # Another value of each option, and what must then be so of the placement, given that with the defaults.

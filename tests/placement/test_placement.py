@@ -20,9 +20,7 @@ from tests.problems import all_pairs
 def two_pieces():
     """Five cameras 0-4 after three cameras 4-6 hinged at 4; the small piece's edges come first."""
     t = np.random.default_rng(0).standard_normal((7, 3))
-    small = [(4, 5), (4, 6), (5, 6)]
-    large = all_pairs(5)
-    edges = np.array(small + large)
+    edges = np.array([(4, 5), (4, 6), (5, 6), *all_pairs(5)])
     return t, edges, normalized(differences(t, edges))
 
 
@@ -85,31 +83,22 @@ def test_further_pieces_are_solved_each_by_its_own_edges():
     assert verdicts[bent] == "outlier"
 
 
-def test_a_piece_that_no_scale_fits_is_left_out_and_the_rest_is_placed():
+def test_a_piece_that_no_scale_fits_is_left_out_and_a_graph_without_a_triangle_is_refused():
     _, edges, v = two_pieces()
     v[:3] = [[1.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]]  # (4, 5), (4, 6), (5, 6): they cancel at every camera
     placement = place(ViewGraph(7, edges, v))
     assert list(place_further(placement)) == []
     assert placement.cameras.tolist() == [0, 1, 2, 3, 4]
-
-
-def test_a_graph_without_a_triangle_is_refused():
     with pytest.raises(UnsolvableError, match="no three cameras"):
         place(ViewGraph(4, [(0, 1), (1, 2), (2, 3)], np.eye(3)))
 
 
-def test_directions_that_do_not_fit_together_raise_the_alarm():
-    noise = random_graph_problem(14, 1.0, sigma=1e-4, q=1.0, seed=3)
-    warnings = list(quality_warnings(place(ViewGraph(14, noise.edges, noise.directions))))
-    assert any("deg off the solution" in warning for warning in warnings)
-    clean = random_graph_problem(14, 1.0, sigma=1e-4, seed=3)
-    assert list(quality_warnings(place(ViewGraph(14, clean.edges, clean.directions)))) == []
-
-
-def test_mostly_contradicting_pairs_raise_the_alarm():
-    problem = random_graph_problem(14, 1.0, sigma=1e-4, q=0.0, seed=5)
-    placement = place(problem.view_graph)
-    judged = dataclasses.replace(placement.assessment, inliers=np.arange(len(problem.edges)) % 3 == 0)
+def test_directions_that_do_not_fit_together_and_mostly_contradicting_pairs_raise_the_alarm():
+    noise, clean = (random_graph_problem(14, 1.0, sigma=1e-4, q=q, seed=3).view_graph for q in (1.0, 0.0))
+    assert any("deg off the solution" in warning for warning in quality_warnings(place(noise)))
+    placement = place(clean)
+    assert list(quality_warnings(placement)) == []
+    judged = dataclasses.replace(placement.assessment, inliers=np.arange(clean.num_edges) % 3 == 0)
     warnings = list(quality_warnings(dataclasses.replace(placement, assessment=judged)))
     assert any("66% of the pairs contradict the solution" in warning for warning in warnings)
 
@@ -120,10 +109,6 @@ def test_a_loose_camera_is_named():
     t[11] = 2.0 * t[1] - t[0] + [0.0, 0.0, 1e-3]  # behind camera 1 as seen from camera 0: it may slide
     edges = np.array([*all_pairs(11), (0, 11), (1, 11)])
     noise = 1e-3 * np.random.default_rng(4).standard_normal((len(edges), 3))
-    graph = ViewGraph(
-        12,
-        edges,
-        normalized(normalized(differences(t, edges)) + noise),
-        names=[f"image{k}" for k in range(12)],
-    )
+    v = normalized(normalized(differences(t, edges)) + noise)
+    graph = ViewGraph(12, edges, v, names=[f"image{k}" for k in range(12)])
     assert any("above all image11" in warning for warning in quality_warnings(place(graph)))

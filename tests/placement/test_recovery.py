@@ -8,60 +8,33 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from sfm_shapefit import synthetic
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.solver.program import differences
-from sfm_shapefit.synthetic import (
-    GraphProblem,
-    box_graph_problem,
-    community_graph_problem,
-    corridor_graph_problem,
-    lawn_graph_problem,
-    random_graph_problem,
-    ring_graph_problem,
-    trajectory_graph_problem,
-)
-from tests.problems import shape_error
+from tests.problems import fit_angles, shape_error
 
 NOISE = {"sigma": 0.01, "q": 0.2, "seed": 0}
 Floats = npt.NDArray[np.float64]
 
 
-def oracle(problem: GraphProblem, steps: int = 6) -> Floats:
-    """Return (n, d) Gauss-Newton on sum |u_e - v_e|^2 over the right directions.
-
-    Dense, and of least norm: translation and scale, which no direction tells, never move.
-    """
+def oracle(problem: synthetic.GraphProblem) -> Floats:
+    """Return (n, d) least squares in angles over the right directions, from the truth."""
     right = ~problem.corrupted
-    edges, v = problem.edges[right], problem.directions[right]
     t = problem.locations - problem.locations.mean(axis=0)
-    (m, d), n = v.shape, len(t)
-    row = np.arange(m)
-    for _ in range(steps):
-        baselines = differences(t, edges)
-        u = normalized(baselines)
-        lengths = np.linalg.norm(baselines, axis=1)
-        slope = (np.eye(d) - u[:, :, None] * u[:, None, :]) / lengths[:, None, None]
-        jacobian = np.zeros((m, d, n, d))
-        jacobian[row, :, edges[:, 0]] = slope
-        jacobian[row, :, edges[:, 1]] = -slope
-        normal = jacobian.reshape(m * d, n * d)
-        # Four free directions (three shifts and the scale) have singular values of rounding alone.
-        step = np.linalg.pinv(normal.T @ normal, rcond=1e-11, hermitian=True) @ (normal.T @ (u - v).ravel())
-        t = t - step.reshape(n, d)
-    return t
+    return fit_angles(t, problem.edges[right], problem.directions[right], 6)
 
 
 USUAL = {
-    "er2": lambda: random_graph_problem(60, 0.5, **NOISE),
-    "geo": lambda: box_graph_problem(120, 30.0, **NOISE),
-    "comm": lambda: community_graph_problem(120, 40.0, **NOISE),
+    "er2": lambda: synthetic.random_graph_problem(60, 0.5, **NOISE),
+    "geo": lambda: synthetic.box_graph_problem(120, 30.0, **NOISE),
+    "comm": lambda: synthetic.community_graph_problem(120, 40.0, **NOISE),
 }
 CHAINS = {
-    "seq": lambda: trajectory_graph_problem(120, 24.0, **NOISE),
-    "seqv": lambda: trajectory_graph_problem(120, 24.0, speed_ratio=4.0, **NOISE),
-    "ring": lambda: ring_graph_problem(120, 20.0, **NOISE),
-    "corridor": lambda: corridor_graph_problem(120, 20.0, **NOISE),
+    "seq": lambda: synthetic.trajectory_graph_problem(120, 24.0, **NOISE),
+    "seqv": lambda: synthetic.trajectory_graph_problem(120, 24.0, speed_ratio=4.0, **NOISE),
+    "ring": lambda: synthetic.ring_graph_problem(120, 20.0, **NOISE),
+    "corridor": lambda: synthetic.corridor_graph_problem(120, 20.0, **NOISE),
 }
 
 
@@ -90,23 +63,19 @@ def test_chains_on_which_shapefit_collapses_are_placed(family):
     assert error < shape_error(finish.lud.locations, problem.locations)
 
 
-def test_strips_flown_back_and_forth_are_placed_with_nearly_a_third_of_wrong_directions():
-    problem = lawn_graph_problem(200, 20.0, sigma=0.01, q=0.3, seed=0)
+def test_strips_flown_back_and_forth_with_a_third_of_wrong_directions_and_the_plane_are_placed():
+    problem = synthetic.lawn_graph_problem(200, 20.0, sigma=0.01, q=0.3, seed=0)
     placement = place(problem.view_graph)
     best = shape_error(oracle(problem), problem.locations)
     assert shape_error(placement.locations, problem.locations) <= 1.08 * best
     assert shape_error(placement.certified.locations, problem.locations) > 5.0 * best
-
-
-def test_the_plane_is_as_good_a_space():
-    problem = random_graph_problem(60, 0.5, d=2, sigma=0.01, q=0.1, seed=1)
-    placement = place(problem.view_graph)
-    best = shape_error(oracle(problem), problem.locations)
-    assert shape_error(placement.locations, problem.locations) <= 1.15 * best  # fewer equations per unknown
+    plane = synthetic.random_graph_problem(60, 0.5, d=2, sigma=0.01, q=0.1, seed=1)
+    error = shape_error(place(plane.view_graph).locations, plane.locations)
+    assert error <= 1.15 * shape_error(oracle(plane), plane.locations)  # fewer equations per unknown
 
 
 def test_the_oracle_is_a_least_squares_fit():
-    problem = random_graph_problem(12, 1.0, sigma=0.02, q=0.2, seed=3)
+    problem = synthetic.random_graph_problem(12, 1.0, sigma=0.02, q=0.2, seed=3)
     best = oracle(problem)
     right = ~problem.corrupted
 

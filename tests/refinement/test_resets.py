@@ -59,24 +59,19 @@ def test_strays_do_not_vouch_for_one_another_but_a_group_that_the_rest_holds_sta
     assert found_strays(graph, t, moved, agreeing) == ([] if held else [4, 5, 6])
 
 
-def test_one_agreeing_pair_holds_no_distance():
+def test_one_agreeing_pair_holds_no_distance_and_nobody_strays_within_three_radii_of_the_start():
     graph, t, moved = scene(4)
     of_node, _ = joining(graph, 4)
-    one = np.flatnonzero(of_node)[:1]
-    kept = np.sort(np.concatenate([np.flatnonzero(~of_node), one]))
+    kept = np.sort(np.concatenate([np.flatnonzero(~of_node), np.flatnonzero(of_node)[:1]]))
     hanging = ViewGraph(N, graph.edges[kept], graph.directions[kept])
     assert found_strays(hanging, t, moved, np.ones(len(kept), dtype=bool)) == [4]
-
-
-def test_nobody_is_a_stray_within_three_times_the_radius_of_the_start():
-    graph, t, _ = scene()
     none = np.zeros(graph.num_edges, dtype=bool)
     assert found_strays(graph, t, t, none) == []
-    distances = np.linalg.norm(t - np.median(t, axis=0), axis=1)
-    last = int(np.argmax(distances))
+    middle = np.median(t, axis=0)
+    last = int(np.argmax(np.linalg.norm(t - middle, axis=1)))
     for share, found in ((2.5, []), (3.5, [last])):
         moved = t.copy()
-        moved[last] = np.median(t, axis=0) + share * (t[last] - np.median(t, axis=0))
+        moved[last] = middle + share * (t[last] - middle)
         assert found_strays(graph, t, moved, none) == found
 
 
@@ -135,54 +130,44 @@ def test_a_sound_graph_has_no_strays_and_says_how_many_pairs_changed_sides():
     assert (unrefined.num_turned_pairs, len(unrefined.reset_nodes)) == (0, 0)
 
 
-def test_openness_is_the_error_that_triangulation_makes():
+def test_openness_is_the_error_that_triangulation_makes_at_any_scale_from_either_end():
     """Two rays a either side of their middle and s of noise: s / (sqrt 2 sin a) of their length."""
     for half_angle in (np.pi / 4, 0.1, 1e-3):
         side = np.tan(half_angle)
         t = np.array([[-side, 0.0, 0.0], [side, 0.0, 0.0], [0.0, 0.0, 1.0]])
         found = openness(t, np.array([[0, 2], [1, 2]]), np.array([2]), np.full(2, 0.01))
-        length = np.hypot(side, 1.0)
-        assert found == pytest.approx([0.01 * length / (np.sqrt(2.0) * np.sin(half_angle))], rel=1e-6)
-
-
-def test_openness_does_not_depend_on_scale_nor_on_which_end_is_in_the_group():
+        error = 0.01 * np.hypot(side, 1.0) / (np.sqrt(2.0) * np.sin(half_angle))
+        assert found == pytest.approx([error], rel=1e-6)
     t = np.random.default_rng(3).standard_normal((6, 3)) + np.array([[0, 0, 0]] * 3 + [[9, 0, 0]] * 3)
-    edges = np.array([(i, j) for i in range(3) for j in range(3, 6)])
-    noise = np.linspace(0.01, 0.02, 9)
+    edges, noise = np.array([(i, j) for i in range(3) for j in range(3, 6)]), np.linspace(0.01, 0.02, 9)
     found = openness(t, edges, np.array([3, 4, 5]), noise)
     turned = np.where(np.arange(9)[:, None] % 2, edges, edges[:, ::-1])
     other = openness(1e6 * t - 5.0, turned, np.array([3, 4, 5]), 2.0 * noise)
     np.testing.assert_allclose(other, 2.0 * found, rtol=1e-6)
 
 
-def test_parallel_baselines_and_a_group_around_a_single_node_leave_distances_open():
+def test_parallel_baselines_and_a_group_around_or_on_a_single_node_leave_distances_open():
     t = np.array([[0.0, 0, 0], [0, 0, 1], [0, 0, 5], [3, 0, 5], [-3, 4, -10]])
     noise = np.full(4, 1e-3)
     assert openness(t, np.array([[0, 2], [1, 2]]), np.array([2]), noise[:2])[0] > 1e3
     group = np.array([2, 3, 4])  # blown up around node 0, in different directions
     assert openness(t, np.array([[0, 2], [0, 3], [0, 4]]), group, noise[:3]).min() > 1e3
     assert openness(t, np.array([[0, 2], [1, 3], [0, 4], [1, 4]]), group, noise).max() < 0.05
-
-
-def test_a_group_that_hangs_on_one_of_its_nodes_may_be_of_any_size():
-    t = np.array([[0.0, 0, 0], [3, 0, 0], [0, 0, 5], [0, 3, 7], [2, 0, 9]])
-    found = openness(t, np.array([[0, 2], [1, 2]]), np.array([2, 3, 4]), np.full(2, 1e-3))
+    t = np.array([[0.0, 0, 0], [3, 0, 0], [0, 0, 5], [0, 3, 7], [2, 0, 9]])  # and hanging on node 2
+    found = openness(t, np.array([[0, 2], [1, 2]]), group, noise[:2])
     assert found[0] < 0.01
     assert found[1:].min() > 1e3
 
 
-@pytest.mark.parametrize(("noise_rad", "found"), [(1e-3, []), (0.2, [4])])
-def test_a_node_seen_in_nearly_one_direction_is_held_only_by_directions_that_are_exact(noise_rad, found):
+def test_nodes_far_off_in_one_direction_or_around_the_rest_are_held_by_exact_directions_only():
     graph, t, moved = scene(4)  # 19 pairs in a cone of about 0.6 degrees
-    assert found_strays(graph, t, moved, np.ones(graph.num_edges, dtype=bool), noise_rad) == found
-
-
-def test_a_group_blown_up_around_the_rest_is_lost_though_all_its_pairs_agree():
+    everything = np.ones(graph.num_edges, dtype=bool)
+    for noise_rad, found in ((1e-3, []), (0.2, [4])):
+        assert found_strays(graph, t, moved, everything, noise_rad) == found
     graph, t, moved = scene(*range(12, N))
     moved[12:] *= 1e4
-    everything = np.ones(graph.num_edges, dtype=bool)
-    assert found_strays(graph, t, moved, everything, 0.01) == list(range(12, N))
-    assert found_strays(graph, t, moved, everything, 1e-9) == []
+    for noise_rad, found in ((0.01, list(range(12, N))), (1e-9, [])):
+        assert found_strays(graph, t, moved, everything, noise_rad) == found
 
 
 def test_what_hangs_on_a_far_group_far_beyond_it_is_looked_at_by_itself():

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from sfm_shapefit import synthetic
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.place import place
@@ -13,12 +14,6 @@ from sfm_shapefit.refinement.starts import COLLAPSED, Start, disagreement, refin
 from sfm_shapefit.results.warnings import quality_warnings
 from sfm_shapefit.solver.program import differences
 from sfm_shapefit.solver.solve import solve
-from sfm_shapefit.synthetic import (
-    box_graph_problem,
-    random_graph_problem,
-    street_problem,
-    trajectory_graph_problem,
-)
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import shape_error
 
@@ -31,12 +26,12 @@ def finished(problem, **options):
 @pytest.fixture(scope="module")
 def chain():
     """A video of 200 cameras on which ShapeFit collapses."""
-    return trajectory_graph_problem(200, 36.0, sigma=0.01, q=0.2, seed=1, speed_ratio=4.0)
+    return synthetic.trajectory_graph_problem(200, 36.0, sigma=0.01, q=0.2, seed=1, speed_ratio=4.0)
 
 
 @pytest.fixture(scope="module")
 def expander():
-    return random_graph_problem(40, 0.6, sigma=0.02, q=0.2, seed=1)
+    return synthetic.random_graph_problem(40, 0.6, sigma=0.02, q=0.2, seed=1)
 
 
 def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
@@ -53,12 +48,15 @@ def test_shapefit_collapses_on_a_long_chain_and_the_placement_does_not(chain):
     assert found.costs["LUD"] < found.costs["ShapeFit"]
 
 
-def test_where_both_starts_agree_nothing_is_said_of_a_collapse(expander):
-    found = finished(expander)
+def test_where_both_starts_agree_nothing_is_said_of_a_collapse_and_the_scale_is_the_solvers(expander):
+    graph, found = expander.view_graph, finished(expander)
     assert not found.collapsed
     assert "not by a collapse" in found.reason
     assert shape_error(found.locations, expander.locations) < 0.02
     assert found.costs["LUD"] == pytest.approx(found.costs["ShapeFit"], rel=1e-3)
+    along = np.sum(differences(found.locations, graph.edges) * graph.directions, axis=1)
+    assert along.mean() == pytest.approx(1.0)
+    np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
 
 
 def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_chain(chain):
@@ -74,21 +72,18 @@ def test_the_certified_answer_is_given_to_the_bit_if_asked_and_warned_of_on_a_ch
     assert "--objective auto" in warnings[0]
 
 
-def test_lud_is_taken_whatever_its_fit_if_asked(expander):
+def test_lud_is_taken_if_asked_and_without_refinement_the_better_start_as_it_is(chain, expander):
     found = finished(expander, objective="lud")
     assert (found.start, found.is_refined) == ("LUD", True)
+    median, largest = found.moved
+    assert 0.0 < median < largest < 1.0
+    assert f"{median:.2%}" in found.statement()
     raw = finished(expander, objective="lud", refine=False)
-    assert shape_error(raw.locations, raw.lud.locations) < 1e-12
-    assert not raw.is_refined
     assert raw.statement() == "LUD, not refined: LUD, as asked"
-
-
-def test_without_refinement_the_start_that_fits_better_is_kept_as_it_is(chain):
-    found = finished(chain, refine=False)
-    assert found.start == "LUD"
-    assert not found.is_refined
-    assert found.moved == (0.0, 0.0)
-    assert shape_error(found.locations, found.lud.locations) < 1e-12
+    better = finished(chain, refine=False)
+    for unrefined in (raw, better):
+        assert shape_error(unrefined.locations, unrefined.lud.locations) < 1e-12
+        assert (unrefined.start, unrefined.is_refined, unrefined.moved) == ("LUD", False, (0.0, 0.0))
 
 
 def start(name: str) -> Start:
@@ -128,7 +123,7 @@ def test_without_a_second_start_shapefit_is_kept_and_the_reason_says_so(monkeypa
 
 @pytest.mark.parametrize("d", [2, 3, 5])
 def test_noise_free_answers_are_exact_and_not_made_worse(d):
-    problem = random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
+    problem = synthetic.random_graph_problem(30, 0.9, d=d, q=0.1, seed=d)
     graph = problem.view_graph
     certified = solve(graph)
     found = refine_starts(MeasuredGraph(graph), certified, PlacementOptions())
@@ -141,18 +136,11 @@ def test_noise_free_answers_are_exact_and_not_made_worse(d):
 @pytest.mark.parametrize("d", [2, 3])
 @pytest.mark.parametrize("n", [2, 3, 4])
 def test_the_smallest_graphs_are_finished(n, d):
-    problem = random_graph_problem(n, 1.0, d=d, sigma=1e-3, seed=2)
+    problem = synthetic.random_graph_problem(n, 1.0, d=d, sigma=1e-3, seed=2)
     found = finished(problem)
     assert np.isfinite(found.locations).all()
     assert shape_error(found.locations, problem.locations) < 0.02
     assert (found.lud is None) == (n == 2)
-
-
-def test_the_answer_has_the_scale_of_the_solver(expander):
-    graph, found = expander.view_graph, finished(expander)
-    along = np.sum(differences(found.locations, graph.edges) * graph.directions, axis=1)
-    assert along.mean() == pytest.approx(1.0)
-    np.testing.assert_allclose(found.locations.mean(axis=0), 0.0, atol=1e-12)
 
 
 def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
@@ -162,17 +150,10 @@ def test_too_large_a_factor_is_refused_with_the_reason(monkeypatch, expander):
         found = finished(expander)  # without a factor, and as good
         assert found.is_refined
         np.testing.assert_allclose(found.locations, exact.locations, atol=1e-3 * np.ptp(exact.locations))
-    found = finished(box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
+    found = finished(synthetic.box_graph_problem(400, 24.0, seed=1), factor_memory_mb=1)  # MB
     assert not found.is_refined
     assert found.statement().endswith("not refined, since the factor for that would be too large")
     assert "too large" not in finished(expander, refine=False).reason  # nobody asked for it
-
-
-def test_what_the_refinement_changed_is_measured_by_the_extent(expander):
-    found = finished(expander, objective="lud")
-    median, largest = found.moved
-    assert 0.0 < median < largest < 1.0
-    assert f"{median:.2%}" in found.statement()
 
 
 def test_the_finish_is_the_same_to_the_bit_each_time_and_for_any_number_of_threads(expander):
@@ -182,24 +163,18 @@ def test_the_finish_is_the_same_to_the_bit_each_time_and_for_any_number_of_threa
     assert one.costs == two.costs
 
 
-def test_disagreement_is_blind_to_scale_and_sees_stretched_lengths():
+def test_disagreement_is_blind_to_scale_sees_stretched_lengths_and_is_finite_at_one_place():
     t = np.arange(40.0)[:, None] * [1.0, 0.2, 0.1]
     graph = ViewGraph(40, [(i, i + 1) for i in range(39)], normalized(np.tile([-1.0, -0.2, -0.1], (39, 1))))
     assert disagreement(graph, t, 5.0 * t + 1.0) < 1e-12
     stretched = np.concatenate([t[:20], t[19] + 4.0 * (t[20:] - t[19])])
     # Half of the node lengths are 4 times as long: the deviation of a fair coin of log 4 is log(4) / 2.
     assert disagreement(graph, t, stretched) == pytest.approx(np.log(4.0) / 2.0, rel=0.02)
-
-
-def test_cameras_at_one_place_have_a_finite_disagreement():
-    t = np.zeros((4, 3))
-    t[3] = 1.0
-    graph = ViewGraph(4, [(0, 1), (0, 2), (1, 2), (2, 3)], normalized(np.ones((4, 3))))
-    assert np.isfinite(disagreement(graph, t, np.arange(12.0).reshape(4, 3)))
+    assert np.isfinite(disagreement(graph, np.minimum(t, t[1]), t))
 
 
 def test_a_straight_street_is_placed_by_its_points_and_not_without_them():
-    street = street_problem(60, 10, seed=3)
+    street = synthetic.street_problem(60, 10, seed=3)
     n = street.num_cameras
     graph = ViewGraph(len(street.locations), street.edges, street.directions)
     joint = place(MeasuredGraph(graph, covariance=street.covariance, num_points=graph.num_nodes - n))

@@ -49,33 +49,23 @@ def test_in_the_glb_y_is_up_and_the_cameras_are_around_the_origin(folder):
     np.testing.assert_allclose(np.median(apexes, axis=0), 0.0, atol=1e-5)
 
 
-def test_the_ply_is_in_the_axes_of_the_model_and_colored_by_trust(folder):
+def test_the_ply_is_in_the_axes_of_the_model_colored_by_trust_with_a_ribbon_for_each_drawn_pair(folder):
     drawing, _ = make_drawing()
     mesh = trimesh.load(folder / "scene.ply", process=False)
-    placed = drawing.cameras.centers[drawing.cameras.placed]
-    apexes = mesh.vertices[: 5 * 24 : 5]
-    np.testing.assert_allclose(apexes, placed, atol=1e-5)  # float32 of 10
-    colors = mesh.visual.vertex_colors[: 5 * 24 : 5, :3]
-    np.testing.assert_array_equal(colors, trust_colors(drawing.cameras.trust[drawing.cameras.placed]))
-    np.testing.assert_allclose(
-        mesh.vertices[-len(drawing.points.positions) :], drawing.points.positions, atol=1e-5
-    )
-
-
-def test_the_ply_has_a_ribbon_for_each_pair_of_placed_cameras(folder):
-    drawing, _ = make_drawing()
-    mesh = trimesh.load(folder / "scene.ply", process=False)
+    placed, num_points = drawing.cameras.placed, len(drawing.points.positions)
+    colors, vertices = mesh.visual.vertex_colors[:, :3], np.asarray(mesh.vertices)
+    np.testing.assert_allclose(vertices[: 5 * 24 : 5], drawing.cameras.centers[placed], atol=1e-5)
+    np.testing.assert_array_equal(colors[: 5 * 24 : 5], trust_colors(drawing.cameras.trust[placed]))
+    np.testing.assert_allclose(vertices[-num_points:], drawing.points.positions, atol=1e-5)  # float32 of 10
     ends, classes = drawing.pairs.cameras, drawing.pairs.classes
-    drawn = drawing.cameras.placed[ends].all(axis=1) & (classes != PairClass.NO_DIRECTION)
+    drawn = placed[ends].all(axis=1) & (classes != PairClass.NO_DIRECTION)
     assert len(mesh.faces) == 6 * 24 + 2 * int(drawn.sum())
-    wrong = int(np.sum(drawn & (classes == PairClass.CONTRADICTS)))
-    reds = (mesh.visual.vertex_colors[:, :3] == PAIR_COLORS[PairClass.CONTRADICTS]).all(axis=1)
-    assert int(reds[5 * 24 :].sum()) == 4 * wrong
-    ribbons = (
-        np.asarray(mesh.vertices)[5 * 24 : -len(drawing.points.positions)].reshape(-1, 4, 3).mean(axis=1)
-    )
-    middles = drawing.cameras.centers[ends[drawn & (classes == PairClass.CONTRADICTS)]].mean(axis=1)
-    found = ribbons[reds[5 * 24 : -len(drawing.points.positions) : 4]]
+    wrong = drawn & (classes == PairClass.CONTRADICTS)
+    reds = (colors[5 * 24 :] == PAIR_COLORS[PairClass.CONTRADICTS]).all(axis=1)
+    assert int(reds.sum()) == 4 * int(wrong.sum())
+    ribbons = vertices[5 * 24 : -num_points].reshape(-1, 4, 3).mean(axis=1)
+    middles = drawing.cameras.centers[ends[wrong]].mean(axis=1)
+    found = ribbons[reds[:-num_points:4]]
     np.testing.assert_allclose(np.sort(found, axis=0), np.sort(middles, axis=0), atol=1e-5)
 
 

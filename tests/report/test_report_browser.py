@@ -58,7 +58,7 @@ def test_a_click_on_a_row_highlights_and_centers_its_camera(driver, report):
     ) == str(k)
 
 
-def test_a_click_in_the_scene_leads_to_the_row(driver, report):
+def test_a_click_in_the_scene_leads_to_the_row_and_a_pair_shows_its_two_cameras_and_its_line(driver, report):
     # Plotly's own event, as over a camera that the table's first page does not show, then a press.
     driver.execute_script(
         "const plot = document.getElementById('scene');"
@@ -70,6 +70,11 @@ def test_a_click_in_the_scene_leads_to_the_row(driver, report):
     row = driver.find_element("css selector", "#cameras tr[aria-selected=true]")
     assert int(row.get_attribute("data-row")) == k
     assert row.find_element("tag name", "td").text == driver.find_element("css selector", "#details h3").text
+    driver.execute_script("document.querySelector('#pairs tbody tr:nth-child(2)').click()")
+    shown = [button.text for button in driver.find_elements("css selector", "#details button")]
+    names = [c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name")]
+    assert shown == names
+    assert driver.execute_script("return document.getElementById('scene').data.at(-1).x.length") == 2
 
 
 def test_the_mouse_over_a_camera_tells_of_it_and_a_click_selects_it(driver, report):
@@ -87,14 +92,6 @@ def test_the_mouse_over_a_camera_tells_of_it_and_a_click_selects_it(driver, repo
     ActionChains(driver).click().perform()
     assert wait_for(driver, SELECTED) == chosen
     assert complaints(driver) == []
-
-
-def test_a_pair_shows_its_two_cameras_and_its_line(driver, report):
-    driver.execute_script("document.querySelector('#pairs tbody tr:nth-child(2)').click()")
-    shown = [button.text for button in driver.find_elements("css selector", "#details button")]
-    names = [c.text for c in driver.find_elements("css selector", "#pairs tr[aria-selected=true] td.name")]
-    assert shown == names
-    assert driver.execute_script("return document.getElementById('scene').data.at(-1).x.length") == 2
 
 
 def test_tables_sort_filter_and_turn_pages(driver, report):
@@ -117,17 +114,13 @@ def test_tables_sort_filter_and_turn_pages(driver, report):
     ]
 
 
-def test_layers_can_be_switched(driver, report):
+def test_layers_and_the_theme_can_be_switched_and_the_plots_follow(driver, report):
     box = driver.find_element("css selector", "[data-layer=contradicts]")
     driver.execute_script("arguments[0].click()", box)
-    shown = (
-        "return document.getElementById('scene').data.filter((t) => t.kind === 'pair').map((t) => t.visible)"
-    )
+    scene = "return document.getElementById('scene')"
+    shown = f"{scene}.data.filter((t) => t.kind === 'pair').map((t) => t.visible)"
     assert driver.execute_script(shown) == [True, False, True, False]
-
-
-def test_the_theme_can_be_switched_and_the_plots_follow(driver, report):
-    paper = "return document.getElementById('scene').layout.paper_bgcolor"
+    paper = f"{scene}.layout.paper_bgcolor"
     light = driver.execute_script(paper)
     driver.execute_script("document.getElementById('theme').click()")
     assert driver.execute_script(paper) != light

@@ -1,12 +1,9 @@
 """The viewer and the two commands that look at what an earlier run wrote."""
 
 import json
-import os
 import re
-import signal
-import subprocess
-import sys
 import urllib.request
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -16,8 +13,8 @@ from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.report.viewer import Thresholds, camera_at, input_centers, select_pairs, serve
 from tests.drawings import make_drawing
-from tests.program import run
-from tests.scenes import BUNDLED, FACADE, ROOT
+from tests.program import run, viewing
+from tests.scenes import BUNDLED, FACADE
 
 pytest.importorskip("viser", reason="viser is not installed")
 
@@ -29,23 +26,12 @@ def located(tmp_path_factory):
     return out
 
 
-def test_locate_writes_the_report_and_the_scenes_that_are_asked_for(located, tmp_path):
+def test_locate_writes_the_pictures_that_are_asked_for_and_a_folder_is_read_back(located, tmp_path):
     pictures = {"report.html", "scene.glb", "scene.ply"}
     assert pictures <= {path.name for path in located.iterdir()}
     result = run("locate", FACADE / "sparse" / "0", tmp_path / "out", "--no-report", code=0)
     assert "report.html" not in result.stdout
     assert not pictures & {path.name for path in (tmp_path / "out").iterdir()}
-
-
-def test_a_bare_graph_has_its_report_too(tmp_path):
-    result = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--scene", code=0)
-    assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
-    assert "40 nodes" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    drawing, _ = read_output(tmp_path / "out")
-    assert np.isfinite(drawing.cameras.centers).all()
-
-
-def test_a_folder_is_read_back_as_it_was_written(located):
     drawing, facts = read_output(located)
     assert facts == json.loads((located / "locate.json").read_text())
     assert int(drawing.cameras.placed.sum()) == facts["num_placed"]
@@ -54,13 +40,19 @@ def test_a_folder_is_read_back_as_it_was_written(located):
     assert len(drawing.points.positions) > 0
 
 
-def test_the_report_can_be_made_again(located):
-    before = (located / "report.html").read_text(encoding="utf-8")
-    (located / "report.html").unlink()
-    run("report", located, code=0)
-    after = (located / "report.html").read_text(encoding="utf-8")
-    summaries = [re.search(r'"summary":(\[.*?\])', text).group(1) for text in (before, after)]
-    assert summaries[0] == summaries[1]
+def test_a_bare_graph_has_its_report_too_and_a_report_can_be_made_again(located, tmp_path):
+    result = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", "--scene", code=0)
+    assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
+    drawing, _ = read_output(tmp_path / "out")
+    assert np.isfinite(drawing.cameras.centers).all()
+    for folder, words in ((tmp_path / "out", "40 nodes"), (located, "9 images")):
+        report = folder / "report.html"
+        before = report.read_text(encoding="utf-8")
+        assert words in before
+        report.unlink()
+        run("report", folder, code=0)
+        texts = (before, report.read_text(encoding="utf-8"))
+        assert len({re.search(r'"summary":(\[.*?\])', text).group(1) for text in texts}) == 1
 
 
 @pytest.mark.parametrize("command", ["report", "view"])
@@ -92,23 +84,19 @@ def test_thresholds_decide_which_pairs_are_drawn():
     np.testing.assert_array_equal(contradicts, drawing.pairs.residuals_deg[rows] > 4.0)
 
 
-def test_the_inputs_centers_are_brought_into_the_outputs_units():
-    from dataclasses import replace
-
+def test_the_inputs_centers_are_brought_into_the_outputs_units_and_a_ray_picks_a_camera():
     drawing, _ = make_drawing()
-    poses = replace(drawing.cameras.poses, centers=100.0 * drawing.cameras.centers + 7.0)
-    other = replace(drawing, cameras=replace(drawing.cameras, poses=poses), input_is_aligned=False)
-    placed = drawing.cameras.placed
-    np.testing.assert_allclose(input_centers(other)[placed], drawing.cameras.centers[placed], atol=1e-6)
-    same = replace(poses, centers=np.zeros_like(poses.centers))
-    assert input_centers(replace(other, cameras=replace(other.cameras, poses=same))) is None
-
-
-def test_a_ray_picks_the_camera_that_it_meets():
-    drawing, _ = make_drawing()
-    eye = drawing.cameras.centers[drawing.cameras.placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
-    for camera in np.flatnonzero(drawing.cameras.placed)[:5].tolist():
-        assert camera_at(drawing, eye, 7.0 * (drawing.cameras.centers[camera] - eye)) == camera
+    cameras, placed = drawing.cameras, drawing.cameras.placed
+    for centers, seen in ((100.0 * cameras.centers + 7.0, True), (np.zeros_like(cameras.centers), False)):
+        poses = replace(cameras.poses, centers=centers)
+        other = replace(drawing, cameras=replace(cameras, poses=poses), input_is_aligned=False)
+        found = input_centers(other)
+        assert (found is not None) == seen
+        if seen:
+            np.testing.assert_allclose(found[placed], cameras.centers[placed], atol=1e-6)
+    eye = cameras.centers[placed].mean(axis=0) + np.array([3.0, 40.0, 8.0])
+    for camera in np.flatnonzero(placed)[:5].tolist():
+        assert camera_at(drawing, eye, 7.0 * (cameras.centers[camera] - eye)) == camera
     assert camera_at(drawing, eye, np.array([0.0, 1.0, 0.0])) is None  # away from all
 
 
@@ -131,21 +119,8 @@ def test_moving_a_control_redraws():
 
 
 def test_view_serves_a_page_on_this_machine_only_and_ends_when_told(located):
-    with subprocess.Popen(
-        [sys.executable, "-m", "sfm_shapefit.cli", "view", str(located), "--port", "8790"],
-        stdout=subprocess.PIPE,
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": str(ROOT)},
-        text=True,
-    ) as process:
-        try:
-            address = process.stdout.readline().split()[0]
-            assert address.startswith("http://127.0.0.1:")
-            with urllib.request.urlopen(address, timeout=30) as answer:
-                assert answer.status == 200
-                assert b"<html" in answer.read().lower()
-            process.send_signal(signal.SIGINT)
-            process.wait(timeout=60)
-        finally:
-            process.kill()
-    assert process.returncode == 0
+    with viewing(located, "--port", "8790") as address:
+        assert address.startswith("http://127.0.0.1:")
+        with urllib.request.urlopen(address, timeout=30) as answer:
+            assert answer.status == 200
+            assert b"<html" in answer.read().lower()

@@ -34,19 +34,13 @@ def commands(out):
     }
 
 
-def test_the_schema_is_one():
+def test_the_schema_is_one_with_a_sentence_for_every_key_and_the_shipped_one_is_that_which_is_generated():
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-
-
-def test_every_key_has_a_sentence():
+    assert schema_text() == PATH.read_text("utf-8"), "run python -m sfm_shapefit.results.schema"
     keys = {
         (name, key): kind for name, one in SCHEMA["$defs"].items() for key, kind in one["properties"].items()
     }
     assert [key for key, kind in keys.items() if not kind.get("description")] == []
-
-
-def test_the_shipped_schema_is_the_one_that_is_generated():
-    assert schema_text() == PATH.read_text("utf-8"), "run python -m sfm_shapefit.results.schema"
 
 
 @pytest.mark.parametrize("name", commands(""))

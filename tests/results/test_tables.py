@@ -5,14 +5,13 @@ import json
 import math
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from sfm_shapefit.results.tables import CameraRow, PairRow, dumps, write_json, write_rows
-from tests.scenes import RING, ROOT
+from tests.program import run, run_python
+from tests.scenes import RING
 
 SIGMAS = ["sigma_x", "sigma_y", "sigma_z"]
 NOT_UTF8 = os.fsdecode(b"mod\xe8le")
@@ -51,35 +50,25 @@ def test_a_pair_has_one_column_per_dimension(tmp_path, dimension, axes):
     assert len(header) == len(cells)
 
 
-def test_bytes_that_are_no_utf8_come_back_from_the_json(tmp_path):
+def test_bytes_that_are_no_utf8_come_back_from_the_json_and_are_escaped_in_a_table(tmp_path):
     text = dumps({"path": NOT_UTF8, "name": "é"})
     write_json({"path": NOT_UTF8, "name": "é"}, tmp_path / "out.json")
     assert (tmp_path / "out.json").read_bytes() == text.encode("utf-8") + b"\n"
     assert "é" in text
     assert os.fsencode(json.loads(text)["path"]) == b"mod\xe8le"
-
-
-def test_bytes_that_are_no_utf8_are_escaped_in_a_table(tmp_path):
     write_rows([CameraRow(name=NOT_UTF8)], CameraRow, 3, tmp_path / "cameras.csv")
     assert lines_of(tmp_path / "cameras.csv")[1][0] == r"mod\udce8le"
 
 
-@pytest.mark.parametrize("as_json", [True, False])
-def test_a_model_whose_path_is_no_utf8_is_located_and_reported(tmp_path, as_json):
+def test_a_model_whose_path_is_no_utf8_is_located_and_reported(tmp_path):
     try:
         scene = Path(shutil.copytree(RING, tmp_path / NOT_UTF8))
     except OSError:
         pytest.skip("this file system takes names in UTF-8 only")
-    command = [sys.executable, "-m", "sfm_shapefit.cli", "locate", scene / "sparse" / "0", tmp_path / "out"]
-    done = subprocess.run(
-        command + ["--json"] * as_json,
-        capture_output=True,
-        cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": str(ROOT), "PYTHONIOENCODING": "utf-8:strict"},
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, b"")
+    locate = ("locate", scene / "sparse" / "0", tmp_path / "out")
+    done = run_python("-m", "sfm_shapefit.cli", *locate, "--json", PYTHONIOENCODING="utf-8:strict")
+    assert (done.returncode, done.stderr) == (0, "")
     written = json.loads((tmp_path / "out" / "locate.json").read_text(encoding="utf-8"))
     assert os.fsencode(written["inputs"]["model"]) == os.fsencode(scene / "sparse" / "0")
-    if as_json:
-        assert json.loads(done.stdout)["inputs"] == written["inputs"]
+    assert json.loads(done.stdout)["inputs"] == written["inputs"]
+    assert run(*locate, "--overwrite", code=0).stderr == ""

@@ -3,8 +3,6 @@
 import gc
 import os
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,24 +10,17 @@ import pytest
 
 from abuse import determinism, verdicts
 from abuse.fuzz import make_base
+from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.write import write_result
+from tests.program import run_python
 from tests.scenes import COURTYARD, FACADE, RING, ROOT
 
 SCRIPTS = ROOT / "scripts"
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
+ENVIRONMENT = {"PYTHONPATH": os.pathsep.join([str(ROOT), str(SCRIPTS)])}
 
 
-def reliability(*arguments, timeout=280):
-    return subprocess.run(
-        [sys.executable, str(SCRIPTS / "benchmark.py"), "reliability", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=timeout,
-        env=ENVIRONMENT,
-    )
-
-
-# --- hostile input -------------------------------------------------------------------------------------
+def reliability(*arguments):
+    return run_python(SCRIPTS / "benchmark.py", "reliability", *arguments, **ENVIRONMENT)
 
 
 def test_300_damaged_inputs_end_in_a_correct_result_or_one_sentence():
@@ -67,13 +58,8 @@ for sin in (traceback, crash, outside, network, shell, memory, chatter, loop, go
 
 def test_the_sandbox_sees_every_sin(tmp_path):
     (tmp_path / "work").mkdir()
-    done = subprocess.run(
-        [sys.executable, "-c", SINS, str(tmp_path / "work")],
-        capture_output=True,
-        text=True,
-        check=True,
-        env=ENVIRONMENT,
-    )
+    done = run_python("-c", SINS, tmp_path / "work", **ENVIRONMENT)
+    assert done.returncode == 0, done.stderr
     seen = dict(line.split(": ", 1) for line in done.stdout.splitlines())
     words = {
         "traceback": "a traceback",
@@ -101,16 +87,10 @@ def test_the_verdict_sees_a_changed_input_and_another_answer(tmp_path):
     assert verdicts.differs([], [(1.0, 0.0, 0.0)])
 
 
-# --- faults --------------------------------------------------------------------------------------------
-
-
 def test_signals_limits_rivals_and_locks_leave_output_and_input_whole():
     done = reliability("faults", "--moments", 3, "--cold", 0, "--rivals", 2)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout.count("held") == 12
-
-
-# --- determinism ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("scene", [RING, FACADE, COURTYARD], ids=lambda scene: scene.name)
@@ -124,18 +104,10 @@ def test_reordering_changes_every_file_of_the_input(tmp_path):
         assert (copy / file).read_bytes() != (RING / file).read_bytes()
 
 
-def test_hash_seed_and_threads_do_not_change_a_byte(tmp_path, monkeypatch):
-    name = "hash seed 4242, two threads"
-    monkeypatch.setattr(determinism, "VARIANTS", {name: determinism.VARIANTS[name]})
-    assert list(determinism.differing_files(RING, tmp_path)) == []
-
-
 @pytest.mark.slow
 def test_no_variant_of_a_run_changes_a_byte(tmp_path):
     assert list(determinism.differing_files(COURTYARD, tmp_path)) == []
 
-
-# --- many calls ----------------------------------------------------------------------------------------
 
 WARM_UP = 10
 """Calls in which caches and allocators fill."""
@@ -145,9 +117,6 @@ GROWTH_BYTES = 8_000_000
 
 @pytest.mark.slow
 def test_30_calls_in_one_process_leave_memory_files_and_answers_as_they_were(tmp_path):
-    from sfm_shapefit.commands.locate import locate
-    from sfm_shapefit.commands.write import write_result
-
     base = make_base(tmp_path / "base")
     sources = [(base / "sparse" / "0", base / "database.db", "auto"), (base / "old", None, "tracks")]
     answers, sizes, descriptors = {}, [], set()

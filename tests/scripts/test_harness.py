@@ -15,8 +15,6 @@ from harness.driver import Benchmark, Kept
 from harness.graphs import relative_error
 from harness.metrics import Check, Quantity, number, ratio, times, verdict
 
-# --- limits, ratios, numbers -----------------------------------------------------------------------
-
 
 @pytest.mark.parametrize(
     ("value", "better", "met"),
@@ -35,12 +33,7 @@ def test_a_limit_is_met_by_the_unrounded_finite_value_only(value, better, met):
     assert Check(name="median", value=value, limit=0.025, better=better).met is met
 
 
-def test_a_check_needs_a_direction():
-    with pytest.raises(ValueError, match="pairs needs a direction"):
-        Check(name="pairs", value=1.0, limit=2.0, better="neither")
-
-
-def test_a_verdict_names_every_limit_that_is_missed_and_no_other():
+def test_a_verdict_names_every_limit_that_is_missed_and_no_other_and_a_check_needs_a_direction():
     checks = [
         Check(name="median", value=0.03, limit=0.025),
         Check(name="mean", value=0.02, limit=0.026),
@@ -49,54 +42,31 @@ def test_a_verdict_names_every_limit_that_is_missed_and_no_other():
     assert verdict(checks) == "**missed**: median 0.0300 > 0.0250, max - > 1.00"
     assert verdict(checks[1:2]) == "met"
     assert verdict([]) == "no target"
+    with pytest.raises(ValueError, match="pairs needs a direction"):
+        Check(name="pairs", value=1.0, limit=2.0, better="neither")
 
 
 @pytest.mark.parametrize("bad", [(1.0, 0.0), (1.0, -2.0), (math.nan, 1.0), (1.0, math.nan), (math.inf, 1.0)])
-def test_a_ratio_to_nothing_sensible_is_not_a_number_and_prints_as_a_dash(bad):
+def test_a_ratio_is_the_value_over_the_reference_or_a_dash(bad):
     assert math.isnan(ratio(*bad))
     assert times(ratio(*bad)) == "-"
-
-
-def test_a_ratio_is_the_value_over_the_reference():
     assert ratio(3.0, 2.0) == 1.5
     assert [times(value) for value in (0.156, 1.5, 9.96, 21.4)] == ["0.16x", "1.5x", "10x", "21x"]
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (0.0, "0"),
-        (0.00226, "0.00226"),
-        (0.03, "0.0300"),
-        (7.28, "7.28"),
-        (447.2, "447"),
-        (12345.6, "12346"),
-        (3e-11, "3.0e-11"),
-        (2e7, "2.0e+07"),
-        (-0.5, "-0.500"),
-        (math.inf, "-"),
-    ],
-)
-def test_numbers_have_three_significant_digits(value, text):
-    assert number(value) == text
+def test_numbers_have_three_significant_digits():
+    values = (0.0, 0.00226, 0.03, 7.28, 447.2, 12345.6, 3e-11, 2e7, -0.5, math.inf)
+    expected = "0 0.00226 0.0300 7.28 447 12346 3.0e-11 2.0e+07 -0.500 -"
+    assert " ".join(map(number, values)) == expected
 
 
-# --- tables ----------------------------------------------------------------------------------------
-
-
-def test_a_table_has_a_line_per_row_and_refuses_ragged_rows():
+def test_a_table_has_a_line_per_row_and_the_processor_is_named_by_its_model(tmp_path):
     assert record.table(["a", "b"], [["1", "2|3"]]) == "| a | b |\n| --- | --- |\n| 1 | 2/3 |\n"
     with pytest.raises(ValueError, match="row '1' has 1 cells, the header has 2"):
         record.table(["a", "b"], [["1"]])
-
-
-def test_the_processor_is_named_by_its_model(tmp_path):
     (tmp_path / "cpuinfo").write_text("processor : 0\nmodel name\t: Some CPU @ 2 GHz\nmodel name\t: other\n")
     assert record.cpu_model(tmp_path / "cpuinfo") == "Some CPU @ 2 GHz"
     assert record.cpu_model(tmp_path / "missing")
-
-
-# --- bare graphs -----------------------------------------------------------------------------------
 
 
 def test_the_error_knows_the_gauge():
@@ -106,16 +76,10 @@ def test_the_error_knows_the_gauge():
     assert relative_error(-t, t) == pytest.approx(2.0)
 
 
-# --- fresh processes -------------------------------------------------------------------------------
-
-
-def test_a_fresh_process_has_the_threads_that_were_asked_for_and_this_one_keeps_its_own():
+def test_a_fresh_process_has_the_threads_that_were_asked_for_and_its_failure_is_one_sentence():
     before = dict(os.environ)
     assert process.call(os.getenv, "OPENBLAS_NUM_THREADS", environment=process.thread_environment(3)) == "3"
     assert dict(os.environ) == before
-
-
-def test_a_failure_in_a_fresh_process_is_one_sentence():
     with pytest.raises(RuntimeError, match=r"^ValueError: .*literal"):
         process.call(int, "x")
     with pytest.raises(RuntimeError, match="ended with code 7 and no answer"):
@@ -129,9 +93,6 @@ def test_a_process_that_takes_too_long_is_ended():
     assert time.perf_counter() - start < 20.0
     with pytest.raises(TimeoutError, match="no answer within 1 s of CPU time"):
         process.call(sum, itertools.repeat(0), cpu_limit_s=1)
-
-
-# --- the driver ------------------------------------------------------------------------------------
 
 
 def fail():
@@ -174,13 +135,12 @@ def test_a_section_says_what_was_measured_by_which_command_and_what_was_not_and_
     assert [path.name for path in tmp_path.iterdir()] == ["made.md"]
 
 
-def test_the_quick_version_is_recorded_as_such():
+def test_the_quick_version_is_recorded_as_such_and_where_nothing_is_measured_nothing_is_written(
+    tmp_path, capsys
+):
     args = parse("--quick")
     vars(args).update(BENCHMARK.quick)
     assert BENCHMARK.command_line(args) == "python scripts/benchmark.py made --quick"
-
-
-def test_where_nothing_is_measured_nothing_is_written(tmp_path, capsys):
     assert BENCHMARK.run(parse("--out", tmp_path / "made.md", "--only", "three")) == 0
     assert capsys.readouterr().err == "three: it is not there\n"
     assert list(tmp_path.iterdir()) == []

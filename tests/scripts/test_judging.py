@@ -29,9 +29,6 @@ def row_of(text, heading, name):
     return [cell.strip() for cell in line.strip("|").split("|")]
 
 
-# --- real scenes -----------------------------------------------------------------------------------
-
-
 def errors(mean=0.03, missing=0):
     return real.Errors(median=0.02, mean=mean, max=0.08, num_missing=missing)
 
@@ -74,8 +71,6 @@ def test_bundle_adjustment_must_come_within_15_percent_of_the_better_rival(exces
     assert f"| {excess:.2f} |" in show(real.BENCHMARK, one)
     assert real.adjusted_checks(measured_castle()) == []  # not asked for
 
-
-# --- solver ----------------------------------------------------------------------------------------
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
 
@@ -135,18 +130,11 @@ def test_only_a_real_graph_of_cameras_alone_is_held_to_the_limit_of_time():
     assert verdicts(measured(250, 0.05)) == {"gap": True, "factorizations": True}
 
 
-# --- scale -----------------------------------------------------------------------------------------
-
-
-def test_close_is_where_the_objective_stays():
+def test_close_is_where_the_objective_stays_and_an_exponent_is_the_slope_of_the_logarithms():
     assert scale.find_settled([3.0, 1.0, 2.0, 1.0, 1.0], 1.5) == 4
     assert scale.find_settled([1.0, 1.0], 1.5) == 1
-    assert scale.find_settled([1.0, 2.0], 1.5) is None
-    assert scale.find_settled([1.0, math.nan], 1.5) is None
-    assert scale.find_settled([], 1.5) is None
-
-
-def test_an_exponent_is_the_slope_of_the_logarithms():
+    for objectives in ([1.0, 2.0], [1.0, math.nan], []):
+        assert scale.find_settled(objectives, 1.5) is None
     sizes = [1e3, 1e4, 1e5]
     assert scale.exponent(sizes, [2e-4 * n**1.3 for n in sizes]) == pytest.approx(1.3)
     assert math.isnan(scale.exponent([1e3], [1.0]))
@@ -195,12 +183,10 @@ def test_rigid_pieces_and_single_pairs_are_told_apart_and_limits_are_judged(monk
     assert verdict(scale.checks(free)) == "no target"
 
 
-# --- graphs ----------------------------------------------------------------------------------------
-
 CHAIN = graphs.QUICK["seqv-60"]
 
 
-def test_the_oracle_is_where_the_sum_of_squares_is_stationary():
+def test_the_oracle_is_where_the_sum_of_squares_is_stationary_and_one_right_direction_does_not_stop_it():
     one = graphs.draw_graph(CHAIN, 0)
     t = graphs.oracle(one)
     right = one.right > 0.0
@@ -216,14 +202,9 @@ def test_the_oracle_is_where_the_sum_of_squares_is_stationary():
         # At a minimum both ways lead up; elsewhere the linear part, of either sign, is the larger one.
         assert cost(t + shift) > cost(t) < cost(t - shift)
     assert relative_error(t, one.truth) > 1e-4  # and it has left the truth
-
-
-def test_a_node_with_one_right_direction_does_not_stop_the_oracle():
-    one = graphs.draw_graph(CHAIN, 1)
-    ends = np.flatnonzero((one.graph.edges == 7).any(axis=1))
-    right = one.right.copy()
-    right[ends[1:]] = 0.0
-    t = graphs.oracle(dataclasses.replace(one, right=right))
+    single = one.right.copy()
+    single[np.flatnonzero((one.graph.edges == 7).any(axis=1))[1:]] = 0.0
+    t = graphs.oracle(dataclasses.replace(one, right=single))
     np.testing.assert_array_equal(t[7], one.truth[7])
 
 
@@ -246,15 +227,9 @@ def test_medians_are_checked_and_the_worst_mean_over_median():
     assert missed(worse, worse) == ["/ oracle", "error", "placed against LUD", "seconds"]
 
 
-# --- coherent --------------------------------------------------------------------------------------
-
-
-def test_a_method_breaks_where_it_stays_broken():
+def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_missed_limits():
     assert coherent.breaking_share({0.0: 0.01, 0.1: 0.3, 0.2: 0.1, 0.3: 0.5, 0.4: 1.0}) == 0.3
     assert coherent.breaking_share({0.0: 0.01, 0.5: coherent.BROKEN}) is None
-
-
-def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_missed_limits():
     values = {"shapefit": 0.01, "lud": 0.01, "placed_false": 1.4, "contradicting": 0.0}
     right = coherent.Trial(placed=0.01, warned=True, **values)
     wrong = coherent.Trial(placed=1.0, warned=False, **values)
@@ -265,16 +240,13 @@ def test_a_broken_answer_without_a_warning_and_a_warning_without_a_cause_are_mis
     assert "| small | never | never | 0.4 |" in show(coherent.BENCHMARK, clean, corrupted)
 
 
-# --- trust -----------------------------------------------------------------------------
-
-
 def test_the_area_under_the_curve_counts_pairs_in_order_and_ties_half():
     bad = np.array([True, False, False, True])
     assert trust.area_under_curve(np.array([0.1, 0.5, 0.9, 0.5]), bad) == pytest.approx(3.5 / 4)
     assert trust.area_under_curve(np.array([0.9, 0.5, 0.1, 0.95]), bad) == 0.0
 
 
-def test_errors_are_taken_after_shift_and_scale():
+def test_errors_are_taken_after_shift_and_scale_and_those_of_rotations_after_the_best_common_turn():
     rng = np.random.default_rng(0)
     truth, sigmas = rng.standard_normal((20, 3)), np.ones((20, 3))
     np.testing.assert_allclose(trust.error_ratios(3.0 * truth + 1.0, truth, sigmas), 0.0, atol=1e-12)
@@ -282,20 +254,14 @@ def test_errors_are_taken_after_shift_and_scale():
     moved = truth.copy()
     moved[4] += 100.0  # a camera that nothing holds neither counts nor disturbs the others
     np.testing.assert_allclose(trust.error_ratios(moved, truth, sigmas), 0.0, atol=1e-12)
-
-
-def test_rotation_errors_are_taken_after_the_best_common_turn():
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     theirs = np.tile(np.eye(3), (5, 1, 1))
     ours = theirs @ turn
     ours[2] = np.diag([-1.0, -1.0, 1.0]) @ ours[2]
     model = SimpleNamespace(names=("a", "b", "c", "d", "e"), rotations=ours)
-    truth = SimpleNamespace(names=("e", "d", "c", "b"), rotations=theirs[:4])
-    errors = trust.rotation_errors_deg(model, truth)
+    reference = SimpleNamespace(names=("e", "d", "c", "b"), rotations=theirs[:4])
+    errors = trust.rotation_errors_deg(model, reference)
     np.testing.assert_allclose(errors, [np.nan, 0.0, 180.0, 0.0, 0.0], atol=1e-5)
-
-
-# --- rigs, onedsfm, endtoend -----------------------------------------------------------------------
 
 
 def test_scale_and_errors_are_those_of_the_model(tmp_path):
@@ -314,12 +280,18 @@ def test_scale_and_errors_are_those_of_the_model(tmp_path):
     np.testing.assert_allclose(larger.errors_m, 0.01 * size, rtol=1e-6)
 
 
-def test_what_a_stage_takes_is_added_up_where_it_comes_again():
+def test_stages_are_added_up_and_have_an_exponent_forecasts_a_factor_and_the_largest_limits():
     stages = endtoend.Stages()
     for stage in ("read", "solve", "solve", "read", "end"):
         stages(stage)
     assert list(stages.found) == ["imports", "read", "solve"]
     assert all(used.wall_s >= 0.0 and used.peak_mb > 10.0 for used in stages.found.values())
+    assert "| 1.50 |" in show(endtoend.BENCHMARK, located(100, 2.0), located(400, 16.0))
+    assert "| - |" in show(endtoend.BENCHMARK, located(100, 0.2), located(400, 1.6))  # too short to tell
+    assert verdict(endtoend.checks(located(100, 1.0))) == "met"
+    assert "forecast, factor 1.60" in verdict(endtoend.checks(located(100, 1.0, forecast_mb=62.5)))
+    largest = endtoend.checks(located(endtoend.LARGEST, 1.0))
+    assert [check.name for check in largest] == ["forecast, factor", "s", "MB"]
 
 
 def located(size, cpu_s, **changes):
@@ -327,15 +299,3 @@ def located(size, cpu_s, **changes):
     values = {"name": f"{size} images", "num_images": size, "num_pairs": 30 * size, "num_placed": size}
     values |= {"num_matches": 3000 * size, "median_error": 1e-3, "forecast_mb": 140.0}
     return endtoend.Located(**{**values, **changes}, stages={"solve": used})
-
-
-def test_the_exponent_of_a_stage_is_that_of_its_processor_time():
-    assert "| 1.50 |" in show(endtoend.BENCHMARK, located(100, 2.0), located(400, 16.0))
-    assert "| - |" in show(endtoend.BENCHMARK, located(100, 0.2), located(400, 1.6))  # too short to tell
-
-
-def test_the_forecast_of_memory_may_be_off_by_its_factor_either_way_and_the_largest_has_limits():
-    assert verdict(endtoend.checks(located(100, 1.0))) == "met"
-    assert "forecast, factor 1.60" in verdict(endtoend.checks(located(100, 1.0, forecast_mb=62.5)))
-    largest = endtoend.checks(located(endtoend.LARGEST, 1.0))
-    assert [check.name for check in largest] == ["forecast, factor", "s", "MB"]

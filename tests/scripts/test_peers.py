@@ -19,8 +19,6 @@ from tests.scenes import RING, fingerprint, real_scene
 
 SMALL = GraphSpec(family="er2", n=14, sigma=0.02, q=0.1)
 
-# --- pycolmap --------------------------------------------------------------------------------------
-
 
 def test_tracks_need_three_images_and_one_place_in_each():
     image_of = np.array([0, 0, 0, 1, 1, 1, 2, 2, 2])
@@ -32,23 +30,18 @@ def test_tracks_need_three_images_and_one_place_in_each():
     assert colmap.consistent_tracks(near[:2], image_of, xy) == []  # two images
 
 
-def test_a_database_is_copied_with_its_log_and_stays_as_it_is(tmp_path):
+def test_a_database_is_copied_with_its_log_and_without_relative_poses_glomap_fails_with_a_reason(tmp_path):
     source, target = tmp_path / "source", tmp_path / "target"
     source.mkdir()
     target.mkdir()
     (source / "database.db").write_bytes(b"data")
     (source / "database.db-wal").write_bytes(b"log")
-    before = fingerprint(source)
-    copied = colmap.copy_database(source / "database.db", target)
-    assert copied == target / "database.db"
+    before, ring = fingerprint(source), fingerprint(RING)
+    assert colmap.copy_database(source / "database.db", target) == target / "database.db"
     assert fingerprint(target) == fingerprint(source) == before
-
-
-def test_glomap_fails_with_a_reason_where_the_database_stores_no_relative_poses():
-    before = fingerprint(RING)
     with quiet_log(), pytest.raises(RuntimeError, match="no pair of the database stores a relative pose"):
         colmap.position(RING / "database.db", RING / "sparse" / "0", colmap.SETTINGS[0])
-    assert fingerprint(RING) == before
+    assert fingerprint(RING) == ring
 
 
 @pytest.mark.slow
@@ -60,9 +53,6 @@ def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie():
     assert len(errors.names) == 106
     assert errors.position.median == pytest.approx(0.0114, rel=0.2)
     assert errors.position.mean == pytest.approx(0.0351, rel=0.2)
-
-
-# --- bare graphs -----------------------------------------------------------------------------------
 
 
 def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it():
@@ -101,6 +91,8 @@ def test_a_peer_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
     found = on_graphs.answer(peer, SMALL, 1)
     assert found.note == "skipped: gtsam is not installed"
     assert math.isnan(found.error)
+    row = on_scenes.answer("pytheia LUD", Path(), None, "no directions", 1)
+    assert row.note == "skipped: pytheia is not installed"
 
 
 def test_our_contenders_place_a_bare_graph():
@@ -119,9 +111,6 @@ def test_peers_that_are_installed_point_the_right_way(package):
         if contender.package == package:
             locations, _ = contender.prepare(view_graph(problem))()
             assert relative_error(locations, problem.locations) < 0.1  # a wrong sign gives 2
-
-
-# --- real scenes -----------------------------------------------------------------------------------
 
 
 def errors(median, mean, missing=0):
@@ -143,16 +132,7 @@ def test_ours_must_not_be_worse_than_the_best_peer_beyond_what_the_truth_can_tel
     median, mean = checks(rows(errors(1.06, 2.0), errors(1.0, 2.0)))
     assert not median.met
     assert mean.met
-
-
-def test_without_peers_there_is_no_limit():
     assert checks(rows(errors(1.0, 1.0), None)) == []
-
-
-def test_a_peer_of_scenes_that_is_not_installed_is_skipped_with_a_sentence(monkeypatch):
-    monkeypatch.setattr(on_graphs, "find_spec", lambda _package: None)
-    row = on_scenes.answer("pytheia LUD", Path(), None, "no directions", 1)
-    assert row.note == "skipped: pytheia is not installed"
 
 
 def test_peers_see_the_cameras_of_the_model_by_name(monkeypatch):

@@ -130,7 +130,7 @@ def test_clipping_goes_on_until_the_exact_repair_will_not_spoil_it(
     assert gap == pytest.approx(1e-5 + (0.2 * excess[rounds - 1] if hopeless > 1.0 else 0.0), rel=1e-2)
 
 
-def test_no_spoilt_dual_proves_more_than_the_optimum():
+def test_no_spoilt_dual_proves_more_than_the_optimum_and_wrong_locations_still_prove_a_bound():
     graph = draw_family("geo", 300, 24)
     t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
     optimum = objective(graph, t)
@@ -147,10 +147,13 @@ def test_no_spoilt_dual_proves_more_than_the_optimum():
     assert certify(graph, t, -y).dual_bound == 0.0  # the zero dual is the floor
     one_wrong = y.copy()
     one_wrong[7] = 1e6
-    certificate = certify(graph, t, one_wrong)
-    assert_feasible(graph, certificate)
+    elsewhere = t + 0.3 * rng.normal(size=t.shape)
+    noisy = y + 1e-4 * rng.normal(size=y.shape)
     # Clipped, a single pair of 3600 that is wrong by its whole ball moves the bound little.
-    assert 0.9 * optimum <= certificate.dual_bound <= optimum
+    for locations, dual, share in ((t, one_wrong, 0.9), (elsewhere, noisy, 0.5)):
+        certificate = certify(graph, locations, dual)
+        assert_feasible(graph, certificate)
+        assert share * optimum <= certificate.dual_bound <= optimum
 
 
 @pytest.mark.parametrize("size", [1e155, 1e300])
@@ -169,15 +172,6 @@ def test_a_violation_that_is_not_a_number_is_the_largest(row):
     total = np.ones((2, 3))
     total[row, 1] = np.nan
     assert certificate._unbalanced(total, np.zeros((2, 3)), 0.0) == np.inf
-
-
-def test_the_metric_of_wrong_locations_still_proves_a_bound():
-    graph = draw_family("geo", 300, 24)
-    t, y, _ = solve_newton_sparse(graph, 1e-10, 60)
-    elsewhere = t + 0.3 * np.random.default_rng(2).normal(size=t.shape)
-    certificate = certify(graph, elsewhere, y + 1e-4 * np.random.default_rng(3).normal(size=y.shape))
-    assert_feasible(graph, certificate)
-    assert 0.5 * objective(graph, t) <= certificate.dual_bound <= objective(graph, t)
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 12])
@@ -264,16 +258,21 @@ def test_a_graph_in_two_pieces_is_refused():
         certify(twice, np.concatenate([t, t]), dual)
 
 
-def test_a_solver_without_fill_serves_as_well():
+def test_a_solver_without_fill_serves_as_well_and_takes_other_weights_as_if_it_were_new():
     graph = draw_family("geo", 600, 24)
     split = solve_admm(graph, 1e-5, 200)
     direct = certify(graph, split.locations, split.dual)
-    iterative = IterativeSolver(adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges)))
-    resources = Resources(factor=iterative)
-    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, resources)
+    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
+    used, new = IterativeSolver(neighbors), IterativeSolver(neighbors)
+    certificate = certify_in_place(graph, split.locations, split.dual, 0.0, np.inf, Resources(factor=used))
     assert_feasible(graph, certificate)
     # The rounds stop at a tenth of the violation, not at the same point of it.
     assert certificate.gap <= 3.0 * direct.gap
+    weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
+    for solver in (used, new):
+        solver.refactor(weights)
+    c = scale_functional(graph)
+    assert np.array_equal(used.solve(c), new.solve(c))
 
 
 def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
@@ -286,18 +285,6 @@ def test_a_dual_may_be_made_feasible_in_place_and_is_otherwise_left_alone():
     assert np.shares_memory(in_place.dual, split.dual)
     assert np.array_equal(in_place.dual, aside.dual)
     assert in_place.dual_bound == aside.dual_bound
-
-
-def test_a_solver_without_fill_takes_other_weights_as_if_it_were_new():
-    graph = draw_family("geo", 300, 16)
-    neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
-    weights = np.random.default_rng(3).uniform(0.5, 2.0, graph.num_edges)
-    used, new = IterativeSolver(neighbors), IterativeSolver(neighbors)
-    used.refactor(graph.weights)
-    for solver in (used, new):
-        solver.refactor(weights)
-    c = scale_functional(graph)
-    assert np.array_equal(used.solve(c), new.solve(c))
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.01])
@@ -320,13 +307,18 @@ def test_the_hybrid_proves_the_gap_it_was_asked_for(family, degree, sigma):
     assert certify(graph, result.locations, result.certificate.dual).gap <= 1e-8
 
 
-def test_the_hybrid_leaves_a_collapsing_chain_to_newton():
-    graph = draw_family("seq", 300, 36, q=0.1)
-    result = solve_hybrid(graph, 1e-8, 2000)
+def test_the_hybrid_leaves_a_collapsing_chain_to_newton_whose_steps_are_counted_on_and_can_be_cancelled():
+    graph, seen = draw_family("seq", 300, 36, q=0.1), []
+    result = solve_hybrid(graph, 1e-8, 2000, on_iteration=seen.append)
     assert result.stop is HybridStop.NEWTON
     assert result.factorizations > 0
     assert result.certificate.gap <= 1e-8
     assert solve_hybrid(graph, 1e-8, 2000, Resources(memory_bytes=300_000)).stop is HybridStop.TOO_LARGE
+    assert len(seen) == result.iterations + result.factorizations
+    assert [info.iteration for info in seen[: result.iterations + 1]] == list(range(1, result.iterations + 2))
+    last = result.iterations + 2
+    cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < last)
+    assert (cancelled.stop, cancelled.factorizations) == (HybridStop.CANCELLED, 2)
 
 
 def test_the_hybrid_ends_where_it_is_told_to():
@@ -363,17 +355,6 @@ def test_a_certificate_within_reach_is_the_whole_one_and_one_out_of_reach_is_giv
     assert_feasible(graph, within)
     monkeypatch.setattr(certificate, "_restore_exactly", None)  # out of reach, it comes to no exact repair
     assert certify_within(0.3 * whole.gap) is None
-
-
-def test_newton_steps_are_counted_on_and_can_be_cancelled():
-    graph, seen = draw_family("seq", 300, 36, q=0.1), []
-    result = solve_hybrid(graph, 1e-8, 2000, on_iteration=seen.append)
-    assert result.stop is HybridStop.NEWTON
-    assert len(seen) == result.iterations + result.factorizations
-    assert [info.iteration for info in seen[: result.iterations + 1]] == list(range(1, result.iterations + 2))
-    last = result.iterations + 2
-    cancelled = solve_hybrid(graph, 1e-8, 2000, on_iteration=lambda info: info.iteration < last)
-    assert (cancelled.stop, cancelled.factorizations) == (HybridStop.CANCELLED, 2)
 
 
 @pytest.mark.parametrize("cheap", [True, False])

@@ -138,7 +138,7 @@ def test_bound_and_objective_before_the_first_step_are_those_of_the_formulas():
     problem, iterate, _, _ = steps.allocate(graph)
     rng = np.random.default_rng(7)
     iterate.r[:], iterate.feasible[:] = rng.standard_normal((2, *iterate.r.shape))
-    progress = steps.measure(problem, iterate)
+    progress = steps.Progress(*steps.measure(problem, iterate))
     kappa = graph.weights.sum()
     expected = graph.weights @ np.linalg.norm(iterate.r, axis=1) / kappa
     assert progress.objective == pytest.approx(expected, rel=1e-12)
@@ -162,34 +162,26 @@ def test_directions_that_cancel_or_do_not_determine_anything_are_refused_or_solv
 
 
 @SOLVERS
-def test_the_callback_sees_bounds_that_hold_and_can_cancel(solver):
+def test_the_callback_sees_bounds_that_hold_changes_no_bit_and_can_cancel(solver):
     graph, _ = draw_graph(43, sigma=0.05, n=30)
     seen: list[IterationInfo] = []
-    t, _, count = solver(graph, TOL, 100, seen.append)
+    t, y, count = solver(graph, TOL, 100, seen.append)  # a callback makes it return every cycle
     assert [info.iteration for info in seen] == list(range(1, count + 1))
     assert all(info.dual_bound <= objective(graph, t) + 1e-15 for info in seen)
     assert seen[-1].objective - seen[-1].dual_bound <= TOL
-    assert solver(graph, TOL, 100, lambda _: False)[2] == 1
-
-
-@SOLVERS
-def test_two_runs_and_the_runs_in_between_agree_to_the_last_bit(solver):
-    graph, _ = draw_graph(47, sigma=0.05, n=30)
-    t, y, _ = solver(graph, TOL, 100)
-    again, dual, _ = solver(graph, TOL, 100, lambda _: None)  # a callback makes it return every cycle
+    again, dual, _ = solver(graph, TOL, 100)
     assert (t == again).all()
     assert (y == dual).all()
-
-
-@SOLVERS
-def test_the_iteration_limit_is_kept(solver):
-    graph, _ = draw_graph(53, sigma=0.05, n=30)
+    assert solver(graph, TOL, 100, lambda _: False)[2] == 1
     t, y, count = solver(graph, 1e-10, 2)
     assert count == 2
-    assert 0.0 < certify(graph, t, y).gap < 0.2  # a bound even so
+    assert 0.0 < certify(graph, t, y).gap < 0.2  # a bound even where the limit ends it
 
 
-def test_the_dense_solver_goes_on_in_double_precision_where_single_takes_no_step(monkeypatch):
+def test_graphs_begun_in_single_precision_are_recovered_to_rounding_even_where_it_takes_no_step(monkeypatch):
+    graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
+    t, _ = solved(graph, tol=1e-13)
+    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
     graph, truth = draw_graph(67, n=24, q=0.1)
     monkeypatch.setattr(dense, "_SINGLE_FROM", 0)
     monkeypatch.setitem(dense._REFINEMENTS, 4, 0)  # without refinement, no step fulfils its equations
@@ -203,12 +195,6 @@ def test_one_refinement_suffices_for_steps_by_a_factor_in_double_precision(monke
     _, _, count = solve_newton_dense(graph, 1e-8, 100)
     monkeypatch.undo()
     assert count == solve_newton_dense(graph, 1e-8, 100)[2]
-
-
-def test_larger_noiseless_graphs_are_recovered_to_rounding_too():
-    graph, truth = draw_graph(67, n=160, p=0.15, q=0.1)  # 480 unknowns: it begins in single precision
-    t, _ = solved(graph, tol=1e-13)
-    assert np.linalg.norm(shape(t) - shape(truth)) < 1e-12
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.05])

@@ -30,17 +30,12 @@ def centered(t):
     return t - t.mean(axis=0)
 
 
-def test_reducing_is_the_adjoint_of_expanding():
+def test_reducing_is_the_adjoint_of_expanding_and_fitting_its_inverse():
     groups = rig_problem(0)[1]
     rng = np.random.default_rng(1)
     x, g = rng.normal(size=groups.num_unknowns), rng.normal(size=groups.offsets.shape)
-    assert np.vdot(groups.expand(x), g) == pytest.approx(np.vdot(x, groups.reduce(g)), rel=1e-13)
-
-
-def test_fitting_finds_the_unknowns_and_how_far_a_node_is_off():
-    groups = rig_problem(0)[1]
-    x = np.random.default_rng(1).normal(size=groups.num_unknowns)
     t = groups.expand(x)
+    assert np.vdot(t, g) == pytest.approx(np.vdot(x, groups.reduce(g)), rel=1e-13)
     found, apart = groups.fit(t)
     np.testing.assert_allclose(found, x, atol=1e-13)
     assert apart < 1e-13
@@ -155,18 +150,14 @@ def test_the_answer_is_that_of_the_conic_program_over_the_same_groups(noise):
     np.testing.assert_allclose(result.locations, centered(locations), atol=1e-6)
 
 
-def test_groups_of_one_node_are_the_plain_program_and_s_stays_zero():
+def test_groups_of_one_node_are_the_plain_program_and_larger_ones_raise_the_optimum():
     graph, _, _ = rig_problem(3, noise=0.01)
     result = solve_groups(graph, separate(graph.num_nodes, 3))
     plain = solve(graph)
     assert result.objective == pytest.approx(plain.objective, abs=2e-8)
     np.testing.assert_allclose(result.locations, plain.locations, atol=1e-6)
-
-
-def test_admitting_fewer_locations_raises_the_optimum():
     graph, groups, _ = rig_problem(4, noise=0.05)
-    between = outer(graph, groups)[0]
-    assert solve_groups(graph, groups).dual_bound > solve(between).objective + 1e-4
+    assert solve_groups(graph, groups).dual_bound > solve(outer(graph, groups)[0]).objective + 1e-4
 
 
 def test_the_dual_balances_over_each_group_and_for_the_scale():
@@ -186,17 +177,23 @@ def test_the_dual_balances_over_each_group_and_for_the_scale():
     assert not result.dual[~kept].any()
 
 
-def test_any_dual_gives_a_bound_below_the_optimum_and_a_near_one_a_close_bound():
+def test_a_dual_that_balances_is_kept_and_any_gives_a_bound_below_the_optimum_a_near_one_a_close_one():
     graph, groups, _ = rig_problem(6, noise=0.02)
     result = solve_groups(graph, groups)
     rng = np.random.default_rng(0)
-    for size, loss in ((1e-4, 1e-2), (1.0, np.inf)):
+    for size, loss in ((0.0, 1e-13), (1e-4, 1e-2), (1.0, np.inf)):
         spoilt = result.dual + size * rng.normal(size=result.dual.shape)
         found = certify_groups(graph, groups, result.locations, spoilt)
         assert found.dual_bound <= result.objective
         assert found.equality_residual < 1e-11
         assert result.dual_bound - found.dual_bound < loss
+        if size == 0.0:
+            np.testing.assert_allclose(found.dual, result.dual, atol=1e-13)
     assert certify_groups(graph, groups, result.locations, 0.0 * result.dual).dual_bound == 0.0
+    large = certify_groups(graph, groups, result.locations, 3.0 * result.dual)  # is shrunk into its balls
+    assert (np.linalg.norm(large.dual, axis=1) / graph.weights).max() == pytest.approx(1.0, abs=1e-12)
+    largest = (np.linalg.norm(result.dual, axis=1) / graph.weights).max()
+    assert large.dual_bound == pytest.approx(result.dual_bound / largest, rel=1e-9)
 
 
 def test_what_cannot_be_certified_is_refused():
@@ -221,21 +218,15 @@ def test_what_cannot_be_certified_is_refused():
         solve_groups(inner, groups)
 
 
-def test_a_dual_that_balances_is_kept_as_it_is_and_any_is_shrunk_into_its_balls():
+def test_what_is_not_certified_is_not_called_converged_and_iterations_are_told_and_cancelled(monkeypatch):
     graph, groups, _ = rig_problem(6, noise=0.02)
-    result = solve_groups(graph, groups)
-    again = certify_groups(graph, groups, result.locations, result.dual)
-    np.testing.assert_allclose(again.dual, result.dual, atol=1e-13)
-    large = certify_groups(graph, groups, result.locations, 3.0 * result.dual)
-    ratios = np.linalg.norm(large.dual, axis=1) / graph.weights
-    assert ratios.max() == pytest.approx(1.0, abs=1e-12)
-    assert large.dual_bound == pytest.approx(
-        result.dual_bound / (np.linalg.norm(result.dual, axis=1) / graph.weights).max(), rel=1e-9
-    )
-
-
-def test_what_is_not_certified_is_not_called_converged(monkeypatch):
-    graph, groups, _ = rig_problem(6, noise=0.02)
+    seen = []
+    whole = solve_groups(graph, groups, on_iteration=seen.append)
+    assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
+    assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
+    assert {info.limit for info in seen} == {100}
+    cancelled = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
+    assert (cancelled.status, cancelled.iterations) == (Status.CANCELLED, 2)
     early = solve_groups(graph, groups, SolverOptions(max_iterations=2))
     assert (early.status, early.iterations) == (Status.MAX_ITERATIONS, 2)
     assert early.gap > SolverOptions().tol
@@ -262,33 +253,17 @@ def test_the_options_hold_over_groups_or_are_refused_in_a_sentence():
         ReducedFactor(outer(graph, groups)[0].edges, groups, max_bytes=1000)
 
 
-def test_iterations_over_groups_are_reported_and_may_be_cancelled():
-    graph, groups, _ = rig_problem(6, noise=0.02)
-    seen = []
-    whole = solve_groups(graph, groups, on_iteration=seen.append)
-    assert [info.iteration for info in seen] == list(range(1, whole.iterations + 1))
-    assert seen[-1].objective - seen[-1].dual_bound == pytest.approx(whole.gap, abs=1e-10)
-    assert {info.limit for info in seen} == {100}
-    early = solve_groups(graph, groups, on_iteration=lambda info: info.iteration < 2)
-    assert (early.status, early.iterations) == (Status.CANCELLED, 2)
-
-
-def test_a_group_that_one_pair_holds_hangs_free_and_two_pairs_hold_it():
+def test_a_group_that_one_pair_holds_hangs_free_two_pairs_hold_it_and_without_offsets_nothing_is_tied():
     graph, groups, _ = rig_problem(9, frames=6, share=1.0)
     ends = groups.group_of[graph.edges]
     to_last = np.flatnonzero((ends == 5).any(axis=1) & (ends[:, 0] != ends[:, 1]))
     sizes = np.bincount(groups.group_of)
     for count, expected in ((1, 5), (2, 6)):
         # Pairs of different sensors: in three dimensions two directions fix a group whose scale is known.
-        dropped = np.delete(to_last, [0, 7][:count])
-        kept = np.setdiff1d(np.arange(graph.num_edges), dropped)
+        kept = np.setdiff1d(np.arange(graph.num_edges), np.delete(to_last, [0, 7][:count]))
         assert len(largest_tied(graph.edges[kept], groups, sizes)) == expected
-
-
-def test_without_offsets_nothing_is_tied_for_the_scale_is_open():
-    graph, groups, _ = rig_problem(10)
     flat = RigidGroups(group_of=groups.group_of, offsets=np.zeros_like(groups.offsets))
-    assert len(largest_tied(graph.edges, flat, np.bincount(flat.group_of))) == 1
+    assert len(largest_tied(graph.edges, flat, sizes)) == 1
     with pytest.raises(UnsolvableError, match="nothing determines the scale"):
         place(MeasuredGraph(graph, groups=flat))
 
@@ -317,17 +292,13 @@ def test_at_straight_baselines_the_test_at_the_solution_sees_what_the_general_on
     assert len(largest_tied(edges, groups, sizes, t)) == 1
 
 
-def test_lud_over_groups_stays_with_the_groups_and_near_the_truth():
+def test_lud_over_groups_stays_with_them_near_the_truth_and_over_single_nodes_is_lud():
     graph, groups, t = rig_problem(14, frames=12)  # whose optimum of LUD is exact
-    between = outer(graph, groups)[0]
-    locations = lud_over_groups(between, groups)
+    locations = lud_over_groups(outer(graph, groups)[0], groups)
     x, apart = groups.fit(locations)
     assert apart < 1e-9 * np.abs(locations).max()
     errors = np.linalg.norm(locations / x[-1] - centered(t), axis=1)
     assert np.median(errors) < 0.02 * np.median(np.linalg.norm(centered(t), axis=1))
-
-
-def test_lud_over_single_nodes_has_the_optimum_of_lud():
     graph, _, _ = rig_problem(14, noise=0.05)
 
     def value(t):

@@ -50,9 +50,8 @@ def test_scenes_are_made_once_and_differ_by_shape_and_change(
     assert scene_of("ring", seed=1) is not ring_scene
     shapes = [s.options.shape for s in (ring_scene, facade_scene, courtyard_scene, drive_scene)]
     assert shapes == ["ring", "facade", "courtyard", "drive"]
-    assert scene_of("facade", corrupted_pair_fraction=0.5).pair_is_corrupted.mean() == pytest.approx(
-        0.5, abs=0.02
-    )
+    share = scene_of("facade", corrupted_pair_fraction=0.5).pair_is_corrupted.mean()
+    assert share == pytest.approx(0.5, abs=0.02)
 
 
 def test_workspaces_are_folders_of_the_tests_own(
@@ -71,7 +70,10 @@ def test_rendered_scenes_have_workspaces_too(rendered_scene_of, workspace_of):
     scene = rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small)
     assert rendered_scene_of("ring", RenderOptions(gray_noise=0.0), **small) is scene
     folder = workspace_of(scene, WorkspaceOptions(database=False))
+    assert sorted(path.name for path in folder.iterdir()) == ["images", "sparse"]
     assert len(list((folder / "images").iterdir())) == 2
+    model = pycolmap.Reconstruction(folder / "sparse/0")
+    assert (model.num_reg_images(), model.num_points3D()) == (2, 0)
 
 
 def test_graphs_have_the_corruption_asked_for(random_graph, graph_of, street_graph):
@@ -103,6 +105,8 @@ def test_a_reconstruction_is_near_itself_and_not_near_one_with_a_camera_moved():
     with pytest.raises(AssertionError, match=r"0001\.jpg is 0\.5 off, limit 0\.1"):
         assert_reconstruction_near(far, truth, max_error=0.1)
     assert_reconstruction_near(far, truth, max_median_error=0.1)
+    with pytest.raises(ValueError, match="give max_error"):
+        assert_reconstruction_near(Path("a"), Path("b"))
 
 
 def test_cameras_that_are_missing_or_turned_are_named():
@@ -118,11 +122,6 @@ def test_cameras_that_are_missing_or_turned_are_named():
     image.frame.rig_from_world = turn * image.cam_from_world()
     with pytest.raises(AssertionError, match=r"0005\.jpg is turned by 1\.15 deg, limit 0\.5 deg"):
         assert_reconstruction_near(turned, truth, max_rotation_error_deg=0.5)
-
-
-def test_a_comparison_without_a_limit_is_refused():
-    with pytest.raises(ValueError, match="give max_error"):
-        assert_reconstruction_near(Path("a"), Path("b"))
 
 
 def test_locations_are_compared_up_to_shift_and_scale_only():

@@ -14,25 +14,10 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from scripts.make_data import SCENES, write_scene
+from sfm_shapefit import synthetic
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
-from sfm_shapefit.synthetic import (
-    GraphProblem,
-    Scene,
-    SceneOptions,
-    WorkspaceOptions,
-    box_graph_problem,
-    community_graph_problem,
-    corridor_graph_problem,
-    lawn_graph_problem,
-    make_scene,
-    measured_problem,
-    project_points,
-    random_graph_problem,
-    ring_graph_problem,
-    street_problem,
-    trajectory_graph_problem,
-)
+from sfm_shapefit.solver.program import differences
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.scenes import BUNDLED
 
@@ -40,12 +25,12 @@ SHAPES = ("ring", "facade", "drive", "cloud", "courtyard")
 
 
 @cache
-def scene_of(shape, **changes) -> Scene:
-    options = SceneOptions(shape=shape, num_images=12, num_points=1200, pixel_noise_px=0.5, seed=3)
-    return make_scene(replace(options, **changes))
+def scene_of(shape, **changes) -> synthetic.Scene:
+    options = synthetic.SceneOptions(shape=shape, num_images=12, num_points=1200, pixel_noise_px=0.5, seed=3)
+    return synthetic.make_scene(replace(options, **changes))
 
 
-def pinhole(scene: Scene, image: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pinhole(scene: synthetic.Scene, image: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pixels and depths by the textbook formula, without OpenCV and without K as a matrix."""
     options = scene.options
     cam = np.array([scene.rotations[image] @ (point - scene.centers[image]) for point in points])
@@ -54,12 +39,12 @@ def pinhole(scene: Scene, image: int, points: np.ndarray) -> tuple[np.ndarray, n
     return np.stack([x, y], axis=1), cam[:, 2]
 
 
-def world_rays(scene: Scene, image: int, xy: np.ndarray) -> np.ndarray:
+def world_rays(scene: synthetic.Scene, image: int, xy: np.ndarray) -> np.ndarray:
     cam = np.column_stack([xy, np.ones(len(xy))]) @ np.linalg.inv(scene.calibration).T
     return normalized(cam @ scene.rotations[image])
 
 
-def estimated_direction(scene: Scene, pair: int) -> tuple[np.ndarray, float, float]:
+def estimated_direction(scene: synthetic.Scene, pair: int) -> tuple[np.ndarray, float, float]:
     """Direction of C_i - C_j from exact lists and rotations; its angular residual and cheirality fraction.
 
     Three rounds of least squares on the angles between the rays and the epipolar plane.
@@ -80,28 +65,20 @@ def estimated_direction(scene: Scene, pair: int) -> tuple[np.ndarray, float, flo
     return sign * direction, residual, max(in_front.mean(), behind.mean())
 
 
-def true_direction(scene: Scene, pair: int) -> np.ndarray:
+def true_direction(scene: synthetic.Scene, pair: int) -> np.ndarray:
     i, j = scene.pairs[pair]
     return normalized(scene.centers[i] - scene.centers[j])
 
 
-# --- keypoints -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shape", SHAPES)
-def test_keypoints_are_pinhole_projections_of_points_in_front(shape):
+def test_keypoints_are_pinhole_projections_of_points_in_front_and_inside_the_image(shape):
     scene = scene_of(shape, pixel_noise_px=0.0)
     for image, (xy, points) in enumerate(zip(scene.keypoints, scene.keypoint_points, strict=True)):
         expected, depth = pinhole(scene, image, scene.points[points])
         assert depth.min() > 0.0
         # The rotation passes through a rotation vector: a few roundings of coordinates of 1e3 px.
         np.testing.assert_allclose(xy, expected, rtol=0.0, atol=1e-9)
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_no_keypoint_lies_outside_its_image_even_with_noise_and_corruption(shape):
-    scene = scene_of(shape, pixel_noise_px=3.0, corrupted_pair_fraction=0.3)
-    for xy in scene.keypoints:
+    for xy in scene_of(shape, pixel_noise_px=3.0, corrupted_pair_fraction=0.3).keypoints:
         assert (xy >= 0.0).all()
         assert (xy <= [scene.options.image_width, scene.options.image_height]).all()
 
@@ -118,7 +95,7 @@ def test_pixel_noise_has_the_size_asked_for():
 def test_a_point_behind_the_camera_is_refused_and_not_projected():
     points = np.array([[0.1, 0.2, 5.0], [0.1, 0.2, -5.0]])
     with pytest.raises(ValueError, match="point 1 is not in front of the camera"):
-        project_points(points, np.eye(3), np.zeros(3), np.eye(3))
+        synthetic.project_points(points, np.eye(3), np.zeros(3), np.eye(3))
 
 
 def test_walls_are_not_seen_from_behind():
@@ -152,9 +129,6 @@ def test_cameras_have_proper_rotations_and_look_where_the_shape_says():
     assert angle_between_deg(ring.rotations[:, 2], inward).max() < 10.0
 
 
-# --- pairs and matches -----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("shape", SHAPES)
 def test_true_matches_join_the_same_point_and_satisfy_the_epipolar_constraint(shape):
     scene = scene_of(shape)
@@ -170,7 +144,7 @@ def test_true_matches_join_the_same_point_and_satisfy_the_epipolar_constraint(sh
         assert np.median(np.abs(residual_px)) < 0.337 + 4.0 * 0.39 / np.sqrt(len(matches))
 
 
-def epipolar_residual_px(scene: Scene, pair: int, baseline: np.ndarray) -> np.ndarray:
+def epipolar_residual_px(scene: synthetic.Scene, pair: int, baseline: np.ndarray) -> np.ndarray:
     """Sampson residuals (pixels) of the pair's matches for the true rotations and a given C_i - C_j."""
     i, j = scene.pairs[pair]
     matches = scene.matches_of(pair)
@@ -216,30 +190,24 @@ def test_wrong_matches_are_as_many_as_asked_and_all_wrong():
 def test_corrupted_pairs_are_as_many_as_asked_and_agree_on_a_wrong_direction(shape):
     scene = scene_of(shape, corrupted_pair_fraction=0.25)
     assert scene.pair_is_corrupted.sum() == round(0.25 * scene.num_pairs)
-    errors_deg, cheirality = [], []
-    for pair in np.flatnonzero(scene.pair_is_corrupted):
+    errors_deg, cheirality = np.zeros(scene.num_pairs), []
+    sound = range(scene.num_pairs) if shape == "courtyard" else ()
+    for pair in {*np.flatnonzero(scene.pair_is_corrupted).tolist(), *sound}:
         assert len(scene.matches_of(pair)) >= 15
-        direction, residual_rad, in_front = estimated_direction(scene, int(pair))
-        errors_deg.append(float(angle_between_deg(direction, true_direction(scene, pair))))
-        cheirality.append(in_front)
-        # Self-consistent: only the 0.5 px noise is left; its root mean square has a standard error of
-        # 0.5 / sqrt(2 k) px, and four of them are granted.
-        bound_px = 0.5 + 4.0 * 0.5 / np.sqrt(2.0 * len(scene.matches_of(pair)))
-        assert residual_rad * scene.options.focal_length_px < bound_px
+        direction, residual_rad, in_front = estimated_direction(scene, pair)
+        errors_deg[pair] = angle_between_deg(direction, true_direction(scene, pair))
+        if scene.pair_is_corrupted[pair]:
+            cheirality.append(in_front)
+            # Self-consistent: only the 0.5 px noise is left; its root mean square has a standard error of
+            # 0.5 / sqrt(2 k) px, and four of them are granted.
+            bound_px = 0.5 + 4.0 * 0.5 / np.sqrt(2.0 * len(scene.matches_of(pair)))
+            assert residual_rad * scene.options.focal_length_px < bound_px
     # False centers are 10 degrees off or more; at 0.5 px the estimate strays by far less than 5 degrees.
-    assert min(errors_deg) > 5.0
-    assert np.median(errors_deg) > 20.0
+    assert errors_deg[scene.pair_is_corrupted].min() > 5.0
+    assert np.median(errors_deg[scene.pair_is_corrupted]) > 20.0
     assert min(cheirality) > 0.9
-
-
-def test_directions_of_sound_pairs_are_right_in_a_corrupted_scene():
-    scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
-    errors_deg = [
-        float(angle_between_deg(estimated_direction(scene, int(pair))[0], true_direction(scene, int(pair))))
-        for pair in np.flatnonzero(~scene.pair_is_corrupted)
-    ]
-    assert np.median(errors_deg) < 0.2
-    assert max(errors_deg) < 5.0
+    assert np.median(errors_deg[~scene.pair_is_corrupted]) < 0.2
+    assert errors_deg[~scene.pair_is_corrupted].max() < 5.0
 
 
 def test_relative_poses_are_exact_without_noise_and_false_where_the_pair_is():
@@ -267,11 +235,15 @@ def turn_angles_deg(rotations: np.ndarray) -> np.ndarray:
 
 
 def test_the_same_seed_makes_the_same_scene_and_another_seed_another():
-    options = SceneOptions(
+    options = synthetic.SceneOptions(
         shape="cloud", num_images=8, num_points=600, wrong_match_fraction=0.1, corrupted_pair_fraction=0.2
     )
-    first, second, other = make_scene(options), make_scene(options), make_scene(replace(options, seed=1))
-    for field in fields(Scene):
+    first, second, other = (
+        synthetic.make_scene(options),
+        synthetic.make_scene(options),
+        synthetic.make_scene(replace(options, seed=1)),
+    )
+    for field in fields(synthetic.Scene):
         one, two = getattr(first, field.name), getattr(second, field.name)
         for a, b in zip(one, two, strict=True) if isinstance(one, tuple) else [(one, two)]:
             np.testing.assert_array_equal(a, b, err_msg=field.name)
@@ -280,10 +252,7 @@ def test_the_same_seed_makes_the_same_scene_and_another_seed_another():
 
 def test_a_scene_with_too_few_points_says_so():
     with pytest.raises(InputError, match="no two images of this scene share 30 points"):
-        make_scene(SceneOptions(num_points=20))
-
-
-# --- workspaces ------------------------------------------------------------------------------------------
+        synthetic.make_scene(synthetic.SceneOptions(num_points=20))
 
 
 def table_rows(database: Path) -> dict[str, list[tuple]]:
@@ -298,7 +267,7 @@ def table_rows(database: Path) -> dict[str, list[tuple]]:
 
 def test_pycolmap_reads_back_the_scene_from_a_workspace(tmp_path):
     scene = scene_of("facade", corrupted_pair_fraction=0.25)
-    write_workspace(scene, tmp_path / "made/out", WorkspaceOptions(relative_poses=True))
+    write_workspace(scene, tmp_path / "made/out", synthetic.WorkspaceOptions(relative_poses=True))
     files = sorted(path.name for path in (tmp_path / "made/out").iterdir())
     assert files == ["database.db", "sparse"]  # no -wal or -shm, and no truth beside an exact model
     assert [path.name for path in (tmp_path / "made").iterdir()] == ["out"]
@@ -329,7 +298,7 @@ def test_pycolmap_reads_back_the_scene_from_a_workspace(tmp_path):
 
 def test_model_points_have_the_tracks_and_colors_of_the_scene(tmp_path):
     scene = scene_of("courtyard", corrupted_pair_fraction=0.25)
-    write_workspace(scene, tmp_path / "out", WorkspaceOptions(database=False))
+    write_workspace(scene, tmp_path / "out", synthetic.WorkspaceOptions(database=False))
     assert not (tmp_path / "out/database.db").exists()
     model = pycolmap.Reconstruction(tmp_path / "out/sparse/0")
     seen = np.bincount(np.concatenate([ids[ids >= 0] for ids in scene.keypoint_points]))
@@ -369,7 +338,10 @@ def test_stored_e_and_f_annul_the_true_matches_and_poses_are_null_by_default(tmp
 
 @pytest.mark.parametrize(
     ("shape", "options"),
-    [("courtyard", WorkspaceOptions(model="rotations")), ("facade", WorkspaceOptions(database=False))],
+    [
+        ("courtyard", synthetic.WorkspaceOptions(model="rotations")),
+        ("facade", synthetic.WorkspaceOptions(database=False)),
+    ],
     ids=["rotations", "full"],
 )
 def test_a_perturbed_model_has_the_truth_beside_it_and_of_rotations_only_no_points(tmp_path, shape, options):
@@ -392,9 +364,6 @@ def test_a_perturbed_model_has_the_truth_beside_it_and_of_rotations_only_no_poin
     else:
         assert set(model.points3D) == set(truth.points3D)
         assert model.compute_mean_reprojection_error() > 3.0 * truth.compute_mean_reprojection_error()
-
-
-# --- bundled scenes --------------------------------------------------------------------------------------
 
 
 def assert_models_equal(made: Path, bundled: Path) -> None:
@@ -420,44 +389,45 @@ def assert_databases_equal(made: Path, bundled: Path) -> None:
     assert one.keys() == two.keys()
     real_valued = {"keypoints": (3, np.float32), "two_view_geometries": (5, np.float64)}
     for name, rows in one.items():
-        assert len(rows) == len(two[name]), name
-        column, dtype = real_valued.get(name, (None, None))
+        column, dtype = real_valued.get(name, (len(rows[0]) if rows else 0, None))
         for row, other in zip(rows, two[name], strict=True):
-            if column is None:
-                assert row == other, name
-                continue
             assert row[:column] == other[:column], name
             for value, expected in zip(row[column:], other[column:], strict=True):
-                assert (value is None) == (expected is None)
-                if isinstance(value, bytes):
+                if isinstance(value, bytes) and isinstance(expected, bytes):
                     a, b = np.frombuffer(value, dtype), np.frombuffer(expected, dtype)
                     np.testing.assert_allclose(a, b, rtol=2e-7, atol=1e-10)
                 else:
                     assert value == expected
 
 
-@pytest.mark.parametrize("name", ["courtyard", "ring8", "facade9"])
+@pytest.mark.parametrize(
+    "name", ["courtyard", "ring8", "facade9", pytest.param("photographed", marks=pytest.mark.slow)]
+)
 def test_a_bundled_scene_is_what_its_command_makes(name, tmp_path):
-    bundled = BUNDLED / name
-    write_scene(name, tmp_path / name)
-    files = [sorted(p.relative_to(r) for p in r.rglob("*")) for r in (tmp_path / name, bundled)]
+    made, bundled = tmp_path / name, BUNDLED / name
+    write_scene(name, made)
+    files = [sorted(p.relative_to(root) for p in root.rglob("*")) for root in (made, bundled)]
     assert files[0] == files[1]
-    assert (bundled / "SOURCE.md").read_text() == (tmp_path / name / "SOURCE.md").read_text()
+    assert (bundled / "SOURCE.md").read_text() == (made / "SOURCE.md").read_text()
+    if name == "photographed":  # another version of OpenCV or COLMAP may find a few other keypoints
+        one, two = (pycolmap.Reconstruction(root / "truth") for root in (made, bundled))
+        for image_id, image in one.images.items():
+            poses = (m.cam_from_world().matrix() for m in (image, two.images[image_id]))
+            np.testing.assert_allclose(*poses, rtol=0.0, atol=1e-10)
+        assert one.num_points3D() == pytest.approx(two.num_points3D(), rel=0.05)
+        assert one.compute_num_observations() == pytest.approx(two.compute_num_observations(), rel=0.05)
+        return
     for folder in ("sparse/0", "truth"):
         if (bundled / folder).exists():
-            assert_models_equal(tmp_path / name / folder, bundled / folder)
+            assert_models_equal(made / folder, bundled / folder)
     if (bundled / "database.db").exists():
         shutil.copy(bundled / "database.db", tmp_path / "bundled.db")
-        assert_databases_equal(tmp_path / name / "database.db", tmp_path / "bundled.db")
+        assert_databases_equal(made / "database.db", tmp_path / "bundled.db")
 
 
-def test_bundled_scenes_stay_under_five_megabytes():
-    files = [path for path in BUNDLED.rglob("*") if path.is_file()]
-    assert sum(path.stat().st_size for path in files) < 5e6
-
-
-def test_the_noise_free_ring_is_bundled_with_enough_pairs_to_be_rigid():
-    scene = make_scene(SCENES["ring8"].scene)
+def test_bundled_scenes_stay_under_five_megabytes_and_the_ring_has_enough_pairs_to_be_rigid():
+    assert sum(path.stat().st_size for path in BUNDLED.rglob("*") if path.is_file()) < 5e6
+    scene = synthetic.make_scene(SCENES["ring8"].scene)
     # A direction in space is two equations; n positions up to shift and scale are 3 n - 4 unknowns.
     assert 2 * scene.num_pairs >= 3 * scene.num_images - 4
     assert np.bincount(scene.pairs.ravel()).min() >= 3
@@ -465,32 +435,28 @@ def test_the_noise_free_ring_is_bundled_with_enough_pairs_to_be_rigid():
 
 @pytest.mark.slow
 def test_500_cameras_and_20000_points_make_a_workspace(tmp_path):
-    options = SceneOptions(
+    options = synthetic.SceneOptions(
         num_images=500, num_points=20_000, corrupted_pair_fraction=0.25, wrong_match_fraction=0.1
     )
-    scene = make_scene(options)
+    scene = synthetic.make_scene(options)
     write_workspace(scene, tmp_path / "out")
     assert np.bincount(scene.pairs.ravel(), minlength=500).min() >= options.max_pairs_per_image
 
 
-# --- bare graphs -----------------------------------------------------------------------------------------
-
-
 FAMILIES = {
-    "random": partial(random_graph_problem, 120, p=0.5),
-    "box": partial(box_graph_problem, 500, degree=20.0),
-    "trajectory": partial(trajectory_graph_problem, 500, degree=20.0),
-    "varying speed": partial(trajectory_graph_problem, 500, degree=20.0, speed_ratio=4.0),
-    "ring": partial(ring_graph_problem, 300, degree=20.0),
-    "lawn": partial(lawn_graph_problem, 500, degree=20.0),
-    "corridor": partial(corridor_graph_problem, 500, degree=20.0),
-    "community": partial(community_graph_problem, 1200, degree=30.0),
+    "random": partial(synthetic.random_graph_problem, 120, p=0.5),
+    "box": partial(synthetic.box_graph_problem, 500, degree=20.0),
+    "trajectory": partial(synthetic.trajectory_graph_problem, 500, degree=20.0),
+    "varying speed": partial(synthetic.trajectory_graph_problem, 500, degree=20.0, speed_ratio=4.0),
+    "ring": partial(synthetic.ring_graph_problem, 300, degree=20.0),
+    "lawn": partial(synthetic.lawn_graph_problem, 500, degree=20.0),
+    "corridor": partial(synthetic.corridor_graph_problem, 500, degree=20.0),
+    "community": partial(synthetic.community_graph_problem, 1200, degree=30.0),
 }
 
 
-def true_directions(problem: GraphProblem) -> np.ndarray:
-    i, j = problem.edges.T
-    return normalized(problem.locations[i] - problem.locations[j])
+def true_directions(problem: synthetic.GraphProblem) -> np.ndarray:
+    return normalized(differences(problem.locations, problem.edges))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -531,39 +497,36 @@ def test_graph_problems_have_about_the_degree_asked_for(family, degree):
 
 @pytest.mark.parametrize("d", [2, 3, 10])
 def test_the_paper_model_has_any_dimension_and_one_answer_per_seed(d):
-    problem = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=9)
+    problem = synthetic.random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=9)
     assert problem.locations.shape == (30, d)
     assert problem.directions.shape == (len(problem.edges), d)
-    again = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=np.random.default_rng(9))
+    again = synthetic.random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=np.random.default_rng(9))
     np.testing.assert_array_equal(problem.directions, again.directions)
-    other = random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=10)
+    other = synthetic.random_graph_problem(30, 0.5, d=d, sigma=0.05, q=0.2, seed=10)
     assert not np.array_equal(problem.locations, other.locations)
 
 
-def smooth_speeds(problem: GraphProblem) -> np.ndarray:
+def smooth_speeds(problem: synthetic.GraphProblem) -> np.ndarray:
     steps = np.linalg.norm(np.diff(problem.locations, axis=0), axis=1)
     return np.convolve(steps, np.ones(50) / 50, "valid")
 
 
 def test_the_speed_of_a_trajectory_varies_by_the_factor_asked_for():
-    varying = smooth_speeds(trajectory_graph_problem(900, seed=1, speed_ratio=4.0))
+    varying = smooth_speeds(synthetic.trajectory_graph_problem(900, seed=1, speed_ratio=4.0))
     assert 2.5 < varying.max() / varying.min() < 5.0  # jitter of 0.3 per axis adds more to short steps
-    even = smooth_speeds(trajectory_graph_problem(900, seed=1))
+    even = smooth_speeds(synthetic.trajectory_graph_problem(900, seed=1))
     assert even.max() / even.min() < 1.5
 
 
-def test_a_ring_closes_and_has_five_far_links():
+def test_a_ring_closes_with_five_far_links_and_strips_of_a_lawn_are_tied_to_the_next_ones_only():
     n = 300
-    edges = ring_graph_problem(n, degree=20.0, seed=2).edges
+    edges = synthetic.ring_graph_problem(n, degree=20.0, seed=2).edges
     apart = np.minimum(edges[:, 1] - edges[:, 0], n - (edges[:, 1] - edges[:, 0]))
     assert np.sum(apart > 10) == 5
     assert apart[apart > 10].min() >= n // 4
     assert np.sum(apart <= 10) == 10 * n
     assert any((edges == [0, n - 1]).all(axis=1))
-
-
-def test_strips_of_a_lawn_are_tied_to_the_next_ones_only():
-    strip = lawn_graph_problem(500, degree=20.0, seed=3).edges // 50
+    strip = synthetic.lawn_graph_problem(500, degree=20.0, seed=3).edges // 50
     apart = strip[:, 1] - strip[:, 0]
     assert set(np.unique(apart).tolist()) == {0, 1}
     assert np.bincount(apart)[1] == pytest.approx(np.bincount(apart)[0], rel=0.1)
@@ -571,7 +534,7 @@ def test_strips_of_a_lawn_are_tied_to_the_next_ones_only():
 
 def test_a_corridor_falls_apart_at_its_junctions_only():
     """Each branch of 50 cameras is tied to the main corridor near its junction, and to no other branch."""
-    edges = corridor_graph_problem(500, degree=20.0, seed=4).edges
+    edges = synthetic.corridor_graph_problem(500, degree=20.0, seed=4).edges
     part = np.where(edges < 250, -1, (edges - 250) // 50)
     crossing = edges[part[:, 0] != part[:, 1]]
     assert (crossing[:, 0] < 250).all()
@@ -584,14 +547,14 @@ def test_a_corridor_falls_apart_at_its_junctions_only():
 def test_given_pairs_and_locations_are_kept():
     t = np.random.default_rng(1).standard_normal((20, 3))
     edges = np.array([(i, i + 1) for i in range(19)])
-    problem = measured_problem(t, edges, sigma=0.0, q=0.0, seed=1)
+    problem = synthetic.measured_problem(t, edges, sigma=0.0, q=0.0, seed=1)
     np.testing.assert_array_equal(problem.edges, edges)
     np.testing.assert_allclose(problem.directions, true_directions(problem), atol=1e-15)
-    assert measured_problem(t, edges, q=1.0, seed=1).corrupted.all()
+    assert synthetic.measured_problem(t, edges, q=1.0, seed=1).corrupted.all()
 
 
 def test_a_street_is_straight_and_its_points_stand_beside_it():
-    street = street_problem(60, 5, seed=5)
+    street = synthetic.street_problem(60, 5, seed=5)
     cameras, points = street.locations[:60], street.locations[60:]
     assert np.abs(cameras[:, 1:]).max() == 0.0
     speed = np.diff(cameras[:, 0])
@@ -602,13 +565,12 @@ def test_a_street_is_straight_and_its_points_stand_beside_it():
 
 
 def test_street_tracks_have_four_to_eight_views_and_noise_as_the_covariance_says():
-    street = street_problem(200, 10, seed=6)
+    street = synthetic.street_problem(200, 10, seed=6)
     to_point = street.edges[:, 1] >= street.num_cameras
     assert np.flatnonzero(to_point).min() == np.sum(~to_point)  # pairs of cameras come first
     views = np.bincount(street.edges[to_point, 1])[street.num_cameras :]
     assert set(np.unique(views).tolist()) == {4, 5, 6, 7, 8}
-    i, j = street.edges.T
-    off = np.linalg.norm(street.directions - normalized(street.locations[i] - street.locations[j]), axis=1)
+    off = np.linalg.norm(street.directions - true_directions(street), axis=1)
     for kind, share in ((~to_point, 0.1), (to_point, 0.15)):
         assert street.corrupted[kind].mean() == pytest.approx(share, abs=0.02)
         right = kind & ~street.corrupted
