@@ -99,7 +99,7 @@ def test_memory_stays_sound_whichever_of_pycolmap_and_this_package_is_imported_f
 
 
 def is_kernel(function):
-    return any(isinstance(d, ast.Call) and ast.unparse(d.func) == "kernel" for d in function.decorator_list)
+    return any(ast.unparse(d) in ("kernel", "inner_kernel") for d in function.decorator_list)
 
 
 def crossings(modules):
