@@ -153,7 +153,7 @@ def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray
 
 
 def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
-    """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
+    """Return `edges` as a contiguous, read-only (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
     checked = np.ascontiguousarray(edges, dtype=np.int64).reshape(-1, 2)
@@ -165,7 +165,7 @@ def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
             f"edge {index} ({checked[index, 0]}, {checked[index, 1]}) must join two different cameras "
             f"of 0..{num_nodes - 1}"
         )
-    return checked
+    return frozen(checked)
 
 
 def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
