@@ -30,6 +30,7 @@ from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
 from numba.core.event import Listener, install_listener
+from numba.core.types.functions import BaseFunction
 from numba.extending import get_cython_function_address, intrinsic
 
 
@@ -43,6 +44,27 @@ if "pycolmap" in _loaded and _loaded.index("pycolmap") < _loaded.index("zlib"):
     # pycolmap's library brings a zlib of its own and exports it; the system's, loaded after it, then runs
     # half of either and corrupts memory. numba compresses the names of symbols with it, so it must not.
     targetconfig.TargetConfig.get_mangle_string = _names_without_zlib
+
+_search_signature = BaseFunction.get_call_type
+_signatures: dict[Any, Any] = {}
+
+
+def _find_signature(function: Any, context: Any, args: Any, keywords: Any) -> Any:
+    """Return the signature of a function for types, as numba's own method does.
+
+    That method tries a hundred templates for every `a * b` and every `a[i]`, which is half of what compiling
+    takes. What it finds for numbers and arrays is always the same, and is remembered here.
+    """
+    is_operator = getattr(function.typing_key, "__module__", "") == "_operator"
+    if keywords or not is_operator or not isinstance(args[0], (types.Number, types.Boolean, types.Array)):
+        return _search_signature(function, context, args, keywords)
+    key = function, context, tuple(args)
+    if key not in _signatures:
+        _signatures[key] = _search_signature(function, context, args, keywords)
+    return _signatures[key]
+
+
+BaseFunction.get_call_type = _find_signature
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
