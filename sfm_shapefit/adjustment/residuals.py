@@ -9,8 +9,7 @@ the 2 x 2 weight M of the loss (see `adjustment`), a pass over the points writes
     U_q += J_f^T M J_l                                  for each link of a frame with a lens.
 
 Points are cut into the same chunks whatever the number of threads, and the sums of the chunks are added in
-order: the same bits always. Three kernels run; all others are inlined into them, so that each of the three is
-one piece of code (see `jit`).
+order: the same bits always.
 """
 
 from collections.abc import Callable
@@ -163,13 +162,15 @@ def _look(given: Any, camera: int, point: Any, body: Any, seen: Any) -> bool:
 
 
 @kernel
-def _project(seen: Any, lens: Any, pixel: Any) -> None:
-    """Write the pixel of a point in front of the camera."""
+def _miss(seen: Any, lens: Any, observed: Any, residual: Any) -> None:
+    """Write the pixel of a point in front of the camera, less the observed one."""
     u, v = seen[0] / seen[2], seen[1] / seen[2]
     s = u * u + v * v
     radial = 1.0 + s * (lens[4] + s * lens[5])
-    pixel[0] = lens[0] * (u * radial + 2.0 * lens[6] * u * v + lens[7] * (s + 2.0 * u * u)) + lens[2]
-    pixel[1] = lens[1] * (v * radial + 2.0 * lens[7] * u * v + lens[6] * (s + 2.0 * v * v)) + lens[3]
+    p1, p2 = lens[6], lens[7]
+    x = lens[0] * (u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)) + lens[2]
+    y = lens[1] * (v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)) + lens[3]
+    residual[0], residual[1] = x - observed[0], y - observed[1]
 
 
 @kernel
@@ -200,15 +201,15 @@ def _differentiate(seen: Any, lens: Any, by_seen: Any, by_lens: Any) -> None:
 def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
     """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length."""
     first, cameras, pixels, _, lens_of_camera, _, _, _, _, points, lenses, scale = given
-    body, seen, pixel = np.empty(3), np.empty(3), np.empty(2)
+    body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
     plain = scale == np.inf
     for p in range(begin, end):
         for k in range(first[p], first[p + 1]):
             lens = lenses[lens_of_camera[cameras[k]]]
             square = lens[0] * lens[0]
             if _look(given, cameras[k], points[p], body, seen):
-                _project(seen, lens, pixel)
-                square = (pixel[0] - pixels[k, 0]) ** 2 + (pixel[1] - pixels[k, 1]) ** 2
+                _miss(seen, lens, pixels[k], residual)
+                square = residual[0] * residual[0] + residual[1] * residual[1]
             total[0] += 0.5 * square if plain else 0.5 * scale * np.log1p(square / scale)
 
 
@@ -221,8 +222,7 @@ def _write_residuals(given: Any, out: Any) -> None:
         for k in range(first[p], first[p + 1]):
             out[k] = np.nan
             if _look(given, cameras[k], points[p], body, seen):
-                _project(seen, lenses[lens_of_camera[cameras[k]]], out[k])
-                out[k] -= pixels[k]
+                _miss(seen, lenses[lens_of_camera[cameras[k]]], pixels[k], out[k])
 
 
 @kernel
@@ -245,8 +245,7 @@ def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
             frame, lens = frame_of_camera[camera], lens_of_camera[camera]
             if not _look(given, camera, points[p], body, seen):
                 continue
-            _project(seen, lenses[lens], residual)
-            residual -= pixels[k]
+            _miss(seen, lenses[lens], pixels[k], residual)
             _differentiate(seen, lenses[lens], by_seen, by_values)
             _turn_derivatives(given, camera, body, by_seen, turns, by_point, by_frame)
             weights = _weigh(residual, scale, least_curvature)
