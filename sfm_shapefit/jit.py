@@ -69,7 +69,7 @@ def kernel(function: Kernel) -> Kernel:
 
 
 def inner_kernel(function: Kernel) -> Kernel:
-    """Let kernels call a function, which is compiled as a part of them; Python calls it as it is written."""
+    """Let kernels call a function: it is compiled as a part of them, and for Python stays as it is."""
     return cast(Kernel, register_jitable(**_OPTIONS)(function))
 
 
@@ -141,7 +141,15 @@ array_address = intrinsic(_array_address)
 """In a kernel: the address of the first entry of a contiguous array, as int64."""
 
 
-@kernel
+@inner_kernel
+def cross(a: Any, b: Any, out: Any) -> None:
+    """Fill `out` (3,) with a x b."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
+
+
+@inner_kernel
 def mix_bits(z: Any) -> Any:
     """Return a hash of 64 bits, uint64: the finalizer of splitmix64 (Steele, Lea, Flood 2014)."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)

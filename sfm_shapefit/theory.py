@@ -37,7 +37,7 @@ from scipy.sparse import coo_array
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.viewgraph import connected_components
 
 Part = TypeVar("Part")
@@ -297,7 +297,7 @@ def _spread_in_space(t: FloatArray, adjacency: BoolArray, low: int, high: int) -
     return worst
 
 
-@kernel
+@inner_kernel
 def _orthogonal_axis(x: float, y: float, z: float) -> tuple[float, float, float]:
     """Return a unit vector orthogonal to a unit vector."""
     if abs(x) < 0.6:
@@ -307,7 +307,7 @@ def _orthogonal_axis(x: float, y: float, z: float) -> tuple[float, float, float]
     return y / size, -x / size, 0.0
 
 
-@kernel
+@inner_kernel
 def _least_sum_of_sines(phi: FloatArray) -> float:
     """Return min over s of sum_k |sin(phi_k - phi_s)| for sorted angles in [0, pi)."""
     sines, cosines = np.sin(phi), np.cos(phi)

@@ -205,7 +205,9 @@ def _pairs(
     _meet(*structure, first, np.empty(0, np.int64))
     seconds = np.empty(int(first[-1]), np.int64)
     _meet(*structure, first.copy(), seconds)
-    return first, seconds
+    num_nodes = len(first) - 1
+    firsts = np.repeat(np.arange(num_nodes), np.diff(first))
+    return first, np.sort(firsts * num_nodes + seconds) - firsts * num_nodes
 
 
 @kernel
@@ -234,6 +236,7 @@ def _meet(
                     found[count] = j
                     count += 1
         if len(out) > 0:
-            out[total : total + count] = np.sort(found[:count])
+            for q in range(count):
+                out[total + q] = found[q]
         total += count
         first[i + 1] = total

@@ -9,8 +9,7 @@ the 2 x 2 weight M of the loss (see `adjustment`), a pass over the points writes
     U_q += J_f^T M J_l                                  for each link of a frame with a lens.
 
 Points are cut into the same chunks whatever the number of threads, and the sums of the chunks are added in
-order: the same bits always. Three kernels run; all others are inlined into them, so that each of the three is
-one piece of code (see `jit`).
+order: the same bits always.
 """
 
 from collections.abc import Callable
@@ -22,7 +21,7 @@ import numpy as np
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.problem import NUM_VALUES
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
 
 CHUNKS = 4
@@ -145,36 +144,45 @@ def _chunks(layout: Layout) -> list[tuple[int, int]]:
     return list(zip([0, *cuts], [*cuts, layout.num_points], strict=True))
 
 
-@kernel
-def _look(given: Any, camera: int, point: Any, body: Any, seen: Any) -> bool:
+@inner_kernel
+def _look(
+    rotation: Any,
+    center: Any,
+    sensor_rotation: Any,
+    sensor_translation: Any,
+    point: Any,
+    body: Any,
+    seen: Any,
+) -> bool:
     """Write the point in axes of the frame and of the camera; return whether it is in front."""
-    _, _, _, frame_of_camera, _, sensor_rotations, sensor_translations, rotations, centers, _, _, _ = given
-    frame = frame_of_camera[camera]
-    x, y, z = point[0] - centers[frame, 0], point[1] - centers[frame, 1], point[2] - centers[frame, 2]
+    x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     for a in range(3):
-        axis = rotations[frame, a]
-        body[a] = axis[0] * x + axis[1] * y + axis[2] * z
+        body[a] = rotation[a, 0] * x + rotation[a, 1] * y + rotation[a, 2] * z
+    x, y, z = body[0], body[1], body[2]
     for a in range(3):
-        axis = sensor_rotations[camera, a]
-        turned = axis[0] * body[0] + axis[1] * body[1] + axis[2] * body[2]
-        seen[a] = turned + sensor_translations[camera, a]
+        turned = sensor_rotation[a, 0] * x + sensor_rotation[a, 1] * y + sensor_rotation[a, 2] * z
+        seen[a] = turned + sensor_translation[a]
     distance = np.sqrt(seen[0] ** 2 + seen[1] ** 2 + seen[2] ** 2)
     return bool(seen[2] > _LEAST_DEPTH * distance)
 
 
-@kernel
-def _project(seen: Any, lens: Any, pixel: Any) -> None:
-    """Write the pixel of a point in front of the camera."""
+@inner_kernel
+def _miss(seen: Any, lens: Any, observed: Any, residual: Any) -> None:
+    """Write the pixel of a point in front of the camera, less the observed one."""
     u, v = seen[0] / seen[2], seen[1] / seen[2]
     s = u * u + v * v
     radial = 1.0 + s * (lens[4] + s * lens[5])
-    pixel[0] = lens[0] * (u * radial + 2.0 * lens[6] * u * v + lens[7] * (s + 2.0 * u * u)) + lens[2]
-    pixel[1] = lens[1] * (v * radial + 2.0 * lens[7] * u * v + lens[6] * (s + 2.0 * v * v)) + lens[3]
+    p1, p2 = lens[6], lens[7]
+    x = lens[0] * (u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)) + lens[2]
+    y = lens[1] * (v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)) + lens[3]
+    residual[0], residual[1] = x - observed[0], y - observed[1]
 
 
-@kernel
-def _differentiate(seen: Any, lens: Any, by_seen: Any, by_lens: Any) -> None:
-    """Write the derivatives of the pixel by the point (2, 3) and by the OPENCV parameters (2, 8)."""
+@inner_kernel
+def _differentiate(
+    seen: Any, body: Any, lens: Any, rotation: Any, sensor: Any, turns: bool, by_point: Any, by_frame: Any
+) -> None:
+    """Write the derivatives of the pixel by the point (2, 3) and by its frame (2, 6)."""
     inverse = 1.0 / seen[2]
     u, v = seen[0] * inverse, seen[1] * inverse
     s = u * u + v * v
@@ -182,59 +190,95 @@ def _differentiate(seen: Any, lens: Any, by_seen: Any, by_lens: Any) -> None:
     slope = 2.0 * (lens[4] + 2.0 * s * lens[5])  # of the radial factor, by s, times 2
     p1, p2 = lens[6], lens[7]
     mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
-    uu = lens[0] * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u)
-    uv = lens[0] * mixed
-    vu = lens[1] * mixed
-    vv = lens[1] * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v)
-    by_seen[0, 0], by_seen[0, 1], by_seen[0, 2] = uu * inverse, uv * inverse, -(uu * u + uv * v) * inverse
-    by_seen[1, 0], by_seen[1, 1], by_seen[1, 2] = vu * inverse, vv * inverse, -(vu * u + vv * v) * inverse
-    by_lens[0, 0] = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
-    by_lens[1, 1] = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
-    by_lens[0, 4], by_lens[1, 4] = lens[0] * u * s, lens[1] * v * s
-    by_lens[0, 5], by_lens[1, 5] = lens[0] * u * s * s, lens[1] * v * s * s
-    by_lens[0, 6], by_lens[1, 6] = lens[0] * 2.0 * u * v, lens[1] * (s + 2.0 * v * v)
-    by_lens[0, 7], by_lens[1, 7] = lens[0] * (s + 2.0 * u * u), lens[1] * 2.0 * u * v
+    for row in range(2):
+        # by u and v, then by the point in axes of the camera, then in those of the frame
+        if row == 0:
+            by_u, by_v = lens[0] * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u), lens[0] * mixed
+        else:
+            by_u, by_v = lens[1] * mixed, lens[1] * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v)
+        x, y, z = by_u * inverse, by_v * inverse, -(by_u * u + by_v * v) * inverse
+        g0 = x * sensor[0, 0] + y * sensor[1, 0] + z * sensor[2, 0]
+        g1 = x * sensor[0, 1] + y * sensor[1, 1] + z * sensor[2, 1]
+        g2 = x * sensor[0, 2] + y * sensor[1, 2] + z * sensor[2, 2]
+        for a in range(3):
+            by_point[row, a] = g0 * rotation[0, a] + g1 * rotation[1, a] + g2 * rotation[2, a]
+            by_frame[row, a] = -by_point[row, a]
+        if turns:
+            by_frame[row, 3] = body[1] * g2 - body[2] * g1
+            by_frame[row, 4] = body[2] * g0 - body[0] * g2
+            by_frame[row, 5] = body[0] * g1 - body[1] * g0
+
+
+@inner_kernel
+def _differentiate_by_lens(seen: Any, lens: Any, slots: Any, by_values: Any, by_lens: Any) -> None:
+    """Write the derivatives of the pixel by the unknowns of a lens (2, 6).
+
+    Each of these is the sum over the OPENCV parameters that it stands for, see `by_values` (2, 8).
+    """
+    inverse = 1.0 / seen[2]
+    u, v = seen[0] * inverse, seen[1] * inverse
+    s = u * u + v * v
+    radial = 1.0 + s * (lens[4] + s * lens[5])
+    p1, p2 = lens[6], lens[7]
+    by_values[0, 0] = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
+    by_values[1, 1] = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
+    by_values[0, 4], by_values[1, 4] = lens[0] * u * s, lens[1] * v * s
+    by_values[0, 5], by_values[1, 5] = lens[0] * u * s * s, lens[1] * v * s * s
+    by_values[0, 6], by_values[1, 6] = lens[0] * 2.0 * u * v, lens[1] * (s + 2.0 * v * v)
+    by_values[0, 7], by_values[1, 7] = lens[0] * (s + 2.0 * u * u), lens[1] * 2.0 * u * v
+    by_lens[:] = 0.0
+    for q in range(NUM_VALUES):
+        if slots[q] >= 0:
+            by_lens[0, slots[q]] += by_values[0, q]
+            by_lens[1, slots[q]] += by_values[1, q]
 
 
 @kernel
 def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
     """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length."""
-    first, cameras, pixels, _, lens_of_camera, _, _, _, _, points, lenses, scale = given
-    body, seen, pixel = np.empty(3), np.empty(3), np.empty(2)
+    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
+    sensor_rotations, sensor_translations, rotations, centers, points, lenses, scale = given[5:]
+    body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
     plain = scale == np.inf
     for p in range(begin, end):
         for k in range(first[p], first[p + 1]):
-            lens = lenses[lens_of_camera[cameras[k]]]
+            camera = cameras[k]
+            frame, lens = frame_of_camera[camera], lenses[lens_of_camera[camera]]
+            sensor, shift = sensor_rotations[camera], sensor_translations[camera]
             square = lens[0] * lens[0]
-            if _look(given, cameras[k], points[p], body, seen):
-                _project(seen, lens, pixel)
-                square = (pixel[0] - pixels[k, 0]) ** 2 + (pixel[1] - pixels[k, 1]) ** 2
+            if _look(rotations[frame], centers[frame], sensor, shift, points[p], body, seen):
+                _miss(seen, lens, pixels[k], residual)
+                square = residual[0] * residual[0] + residual[1] * residual[1]
             total[0] += 0.5 * square if plain else 0.5 * scale * np.log1p(square / scale)
 
 
 @kernel
 def _write_residuals(given: Any, out: Any) -> None:
     """Write the residuals in the order of the points; NaN behind the camera."""
-    first, cameras, pixels, _, lens_of_camera, _, _, _, _, points, lenses, _ = given
+    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
+    sensor_rotations, sensor_translations, rotations, centers, points, lenses, _ = given[5:]
     body, seen = np.empty(3), np.empty(3)
     for p in range(len(first) - 1):
         for k in range(first[p], first[p + 1]):
             out[k] = np.nan
-            if _look(given, cameras[k], points[p], body, seen):
-                _project(seen, lenses[lens_of_camera[cameras[k]]], out[k])
-                out[k] -= pixels[k]
+            camera = cameras[k]
+            frame, lens = frame_of_camera[camera], lenses[lens_of_camera[camera]]
+            sensor, shift = sensor_rotations[camera], sensor_translations[camera]
+            if _look(rotations[frame], centers[frame], sensor, shift, points[p], body, seen):
+                _miss(seen, lens, pixels[k], out[k])
 
 
 @kernel
 def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_point_sums: Any) -> None:
     """Add the observations of the points begin..end-1 to the normal equations."""
-    first, cameras, pixels, frame_of_camera, lens_of_camera, _, _, _, _, points, lenses, scale = given
+    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
+    sensor_rotations, sensor_translations, rotations, centers, points, lenses, scale = given[5:]
     lens_slots, turns, node_of_frame, node_of_lens, frame_entry, lens_entry = structure[:6]
     link_of_camera, first_entry, least_curvature = structure[6:]
     nodes, gradients, links = sums
     blocks, point_gradients, entries = by_point_sums
     body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
-    by_seen, by_values, by_point = np.empty((2, 3)), np.zeros((2, NUM_VALUES)), np.empty((2, 3))
+    by_point, by_values = np.empty((2, 3)), np.zeros((2, NUM_VALUES))
     by_frame, by_lens, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS)), np.empty((2, SLOTS))
     for p in range(begin, end):
         blocks[p] = 0.0
@@ -243,51 +287,32 @@ def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_p
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
             frame, lens = frame_of_camera[camera], lens_of_camera[camera]
-            if not _look(given, camera, points[p], body, seen):
+            rotation, sensor, shift = rotations[frame], sensor_rotations[camera], sensor_translations[camera]
+            if not _look(rotation, centers[frame], sensor, shift, points[p], body, seen):
                 continue
-            _project(seen, lenses[lens], residual)
-            residual -= pixels[k]
-            _differentiate(seen, lenses[lens], by_seen, by_values)
-            _turn_derivatives(given, camera, body, by_seen, turns, by_point, by_frame)
+            _miss(seen, lenses[lens], pixels[k], residual)
+            _differentiate(seen, body, lenses[lens], rotation, sensor, turns, by_point, by_frame)
             weights = _weigh(residual, scale, least_curvature)
             _add_point(by_point, weights, residual, blocks[p], point_gradients[p])
             if frame_entry[k] >= 0:
                 node = node_of_frame[frame]
-                _add_node(by_frame, weights, residual, weighted, nodes[node], gradients[node])
-                _add_product(by_point, weighted, entries[frame_entry[k]])
+                entry = entries[frame_entry[k]]
+                _add_node(
+                    by_frame, by_point, weights, residual, weighted, nodes[node], gradients[node], entry
+                )
             if lens_entry[k] >= 0:
                 node = node_of_lens[lens]
-                _collect_slots(by_values, lens_slots[lens], by_lens)
-                _add_node(by_lens, weights, residual, weighted, nodes[node], gradients[node])
-                _add_product(by_point, weighted, entries[lens_entry[k]])
+                entry = entries[lens_entry[k]]
+                _differentiate_by_lens(seen, lenses[lens], lens_slots[lens], by_values, by_lens)
+                _add_node(by_lens, by_point, weights, residual, weighted, nodes[node], gradients[node], entry)
                 if link_of_camera[camera] >= 0:
-                    _add_product(by_frame, weighted, links[link_of_camera[camera]])
+                    link = links[link_of_camera[camera]]
+                    for a in range(SLOTS):
+                        for c in range(SLOTS):
+                            link[a, c] += by_frame[0, a] * weighted[0, c] + by_frame[1, a] * weighted[1, c]
 
 
-@kernel
-def _turn_derivatives(
-    given: Any, camera: int, body: Any, by_seen: Any, turns: bool, by_point: Any, by_frame: Any
-) -> None:
-    """Write the derivatives of the pixel by the point (2, 3) and by its frame (2, 6), from those in axes of
-    the camera."""
-    frame = given[3][camera]
-    sensor, rotation = given[5][camera], given[7][frame]
-    for row in range(2):
-        x, y, z = by_seen[row, 0], by_seen[row, 1], by_seen[row, 2]
-        g0 = x * sensor[0, 0] + y * sensor[1, 0] + z * sensor[2, 0]
-        g1 = x * sensor[0, 1] + y * sensor[1, 1] + z * sensor[2, 1]
-        g2 = x * sensor[0, 2] + y * sensor[1, 2] + z * sensor[2, 2]
-        for a in range(3):
-            by_point[row, a] = g0 * rotation[0, a] + g1 * rotation[1, a] + g2 * rotation[2, a]
-            by_frame[row, a] = -by_point[row, a]
-            by_frame[row, 3 + a] = 0.0
-        if turns:
-            by_frame[row, 3] = body[1] * g2 - body[2] * g1
-            by_frame[row, 4] = body[2] * g0 - body[0] * g2
-            by_frame[row, 5] = body[0] * g1 - body[1] * g0
-
-
-@kernel
+@inner_kernel
 def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, float, float]:
     """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature.
 
@@ -302,7 +327,7 @@ def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, flo
     return w, w * (1.0 - bend * x * x), -w * bend * x * y, w * (1.0 - bend * y * y)
 
 
-@kernel
+@inner_kernel
 def _add_point(by_point: Any, weights: Any, residual: Any, block: Any, gradient: Any) -> None:
     """Add J^T M J, packed, and J^T w r to a point."""
     w, m00, m01, m11 = weights
@@ -316,32 +341,29 @@ def _add_point(by_point: Any, weights: Any, residual: Any, block: Any, gradient:
             at += 1
 
 
-@kernel
-def _add_node(by_node: Any, weights: Any, residual: Any, weighted: Any, block: Any, gradient: Any) -> None:
-    """Add J^T M J and J^T w r to a node, and leave M J in `weighted`."""
+@inner_kernel
+def _add_node(
+    by_node: Any,
+    by_point: Any,
+    weights: Any,
+    residual: Any,
+    weighted: Any,
+    block: Any,
+    gradient: Any,
+    entry: Any,
+) -> None:
+    """Add J^T M J and J^T w r to a node and J_p^T M J to its entry; leave M J in `weighted`."""
     w, m00, m01, m11 = weights
     for c in range(SLOTS):
         x, y = by_node[0, c], by_node[1, c]
         gradient[c] += w * (x * residual[0] + y * residual[1])
         weighted[0, c] = m00 * x + m01 * y
         weighted[1, c] = m01 * x + m11 * y
-    _add_product(by_node, weighted, block)
-
-
-@kernel
-def _collect_slots(by_values: Any, slots: Any, by_lens: Any) -> None:
-    """Write the derivatives by a lens' unknowns: the sum over the OPENCV parameters that each of them is."""
-    by_lens[:] = 0.0
-    for q in range(NUM_VALUES):
-        if slots[q] >= 0:
-            by_lens[0, slots[q]] += by_values[0, q]
-            by_lens[1, slots[q]] += by_values[1, q]
-
-
-@kernel
-def _add_product(left: Any, right: Any, out: Any) -> None:
-    """Add left^T right to out; left is (2, a), right (2, 6)."""
-    for a in range(left.shape[1]):
-        x, y = left[0, a], left[1, a]
+    for a in range(SLOTS):
+        x, y = by_node[0, a], by_node[1, a]
         for c in range(SLOTS):
-            out[a, c] += x * right[0, c] + y * right[1, c]
+            block[a, c] += x * weighted[0, c] + y * weighted[1, c]
+    for a in range(3):
+        x, y = by_point[0, a], by_point[1, a]
+        for c in range(SLOTS):
+            entry[a, c] += x * weighted[0, c] + y * weighted[1, c]

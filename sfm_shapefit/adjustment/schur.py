@@ -107,7 +107,7 @@ def _reduce(
     first_entry: Any, first_pair: Any, pair_nodes: Any, entries: Any, inverses: Any, point_gradients: Any,
     diagonal: Any, pairs: Any, right: Any,
 ) -> None:  # fmt: skip
-    """Subtract what the points explain from the rows begin..end-1; calls nothing, hence may be fast."""
+    """Subtract what the points explain from the rows begin..end-1."""
     place = np.empty(len(first_of_node) - 1, np.int64)
     solved = np.empty((3, SLOTS))
     for i in range(begin, end):
@@ -121,7 +121,8 @@ def _reduce(
             g0, g1, g2 = point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2]
             for a in range(SLOTS):
                 w0, w1, w2 = entries[e, 0, a], entries[e, 1, a], entries[e, 2, a]
-                x, y, z = v00 * w0 + v01 * w1 + v02 * w2, v01 * w0 + v11 * w1 + v12 * w2, 0.0
+                x = v00 * w0 + v01 * w1 + v02 * w2
+                y = v01 * w0 + v11 * w1 + v12 * w2
                 z = v02 * w0 + v12 * w1 + v22 * w2
                 solved[0, a], solved[1, a], solved[2, a] = x, y, z
                 right[i, a] += x * g0 + y * g1 + z * g2

@@ -35,7 +35,7 @@ import pycolmap
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import refuse_irregular_file
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
 
@@ -308,7 +308,7 @@ def _check_points(file: _BinaryFile, images: _Images) -> UInt64Array:
     return ids
 
 
-@kernel
+@inner_kernel
 def _read_u64(data: npt.NDArray[np.uint8], offset: int) -> np.uint64:
     """Return the little-endian uint64 at `offset`."""
     value = np.uint64(0)

@@ -4,7 +4,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, frozen
 from sfm_shapefit.directions.kernels import MEASURES, MIN_MATCHES, estimate_pairs
 from sfm_shapefit.directions.matches import RayMatches, RelativePoses
 from sfm_shapefit.directions.options import DirectionOptions
@@ -28,20 +28,20 @@ def estimate_directions(
     options = options or DirectionOptions()
     k = len(matches.pairs)
     directions, measures, moments = np.zeros((k, 3)), np.zeros((k, len(MEASURES))), np.zeros((k, 2, 3, 3))
-    rays = np.ascontiguousarray(matches.rays_i), np.ascontiguousarray(matches.rays_j)
-    given = (matches.offsets, *rays, matches.pixel_angles)
+    rays = frozen(np.ascontiguousarray(matches.rays_i)), frozen(np.ascontiguousarray(matches.rays_j))
+    given = (frozen(matches.offsets), *rays, frozen(matches.pixel_angles))
     settings = (options.inlier_threshold_px, options.num_hypotheses)
 
-    def run(rows: IntArray) -> None:
-        estimate_pairs(rows, *given, *settings, directions, measures, moments)
+    def run(begin: int, end: int) -> None:
+        estimate_pairs(begin, end, *given, *settings, directions, measures, moments)
 
-    shares = np.array_split(np.arange(k, dtype=np.int64), max(1, threads))
-    if len(shares) == 1:
+    if threads <= 1:
         # Where memory is short, Python waits for ever for a thread that could not begin.
-        run(shares[0])
+        run(0, k)
     else:
-        with ThreadPoolExecutor(len(shares)) as pool:
-            list(pool.map(run, shares))
+        cuts = [k * share // threads for share in range(threads + 1)]
+        with ThreadPoolExecutor(threads) as pool:
+            list(pool.map(run, cuts[:-1], cuts[1:]))
     return _judge(matches, directions, measures, moments, options)
 
 

@@ -1,16 +1,15 @@
 """The estimator of one direction from the matches of one pair, compiled; the package's header has the math.
 
-Every kernel works on the matches of one pair: (n, 3) unit rays a and b in world axes and their epipolar
-normals, the cross products in pixels. Lengths and residuals are in pixels.
+Every kernel works on the matches of one pair, a row of ten numbers each: the unit rays a and b in world axes,
+their epipolar normal, which is a x b in pixels, and its length, the parallax. Lengths and residuals are in
+pixels.
 """
-
-from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 
 # Two matches fix a direction; below this number a robust fit means nothing.
 MIN_MATCHES = 5
@@ -37,19 +36,10 @@ _MIN_VOTE_PX = 2.0
 _VOTE_SIGMAS = 6.0
 
 
-class _Pair(NamedTuple):
-    """The matches of one pair."""
-
-    a: FloatArray
-    b: FloatArray
-    """(n, 3) unit rays of both images."""
-    normals: FloatArray
-    """(n, 3) a x b in pixels."""
-
-
 @kernel
 def estimate_pairs(
-    rows: IntArray,
+    begin: int,
+    end: int,
     offsets: IntArray,
     rays_i: FloatArray,
     rays_j: FloatArray,
@@ -60,225 +50,255 @@ def estimate_pairs(
     measures: FloatArray,
     moments: FloatArray,
 ) -> None:
-    """Fill the output rows of the given pairs; rows with fewer than MIN_MATCHES stay zero.
+    """Fill the output rows of the pairs begin..end-1, which hold zeros; MIN_MATCHES at least change them.
 
     Outputs: directions (k, 3); measures (k, 8) in the order of MEASURES; moments (k, 2, 3, 3), the curvature
     of the cost and the variance of its slope, both in rad^-2.
     """
-    for p in rows:
+    for p in range(begin, end):
         first, last = offsets[p], offsets[p + 1]
         if last - first < MIN_MATCHES:
             continue
-        a, b = rays_i[first:last], rays_j[first:last]
-        pair = _Pair(a, b, _epipolar_normals(a, b, pixel_angles[p]))
-        d = _best_hypothesis(pair, np.arange(last - first), threshold_px, num_hypotheses)
+        matches = np.empty((last - first, 10))
+        _fill_matches(rays_i[first:last], rays_j[first:last], pixel_angles[p], matches)
+        d = directions[p]
+        _find_hypothesis(matches, threshold_px, num_hypotheses, d)
         residuals = np.empty(last - first)
-        noise_px, cap_px = _refine(pair, threshold_px, d, residuals)
-        _fill_moments(pair, d, residuals, noise_px, cap_px, moments[p])
-        vote_px = max(_MIN_VOTE_PX, _VOTE_SIGMAS * noise_px)
-        inliers = np.flatnonzero(np.abs(residuals) <= threshold_px)
-        sign = _count_sides(pair, d, inliers, vote_px, measures[p])
-        _measure(pair, residuals, inliers, pixel_angles[p], measures[p])
-        others = np.flatnonzero(np.abs(residuals) > 2.0 * max(threshold_px, 2.0 * noise_px))
-        _count_rivals(pair, inliers, others, threshold_px, num_hypotheses, vote_px, measures[p])
-        directions[p] = sign * d
+        noise_px, cap_px = _refine(matches, threshold_px, d, residuals)
+        _fill_moments(matches, d, residuals, noise_px, cap_px, moments[p])
+        sign = _measure(matches, d, residuals, threshold_px, noise_px, pixel_angles[p], measures[p])
+        _count_rivals(matches, residuals, threshold_px, noise_px, num_hypotheses, measures[p])
+        for c in range(3):
+            d[c] *= sign
 
 
-@kernel
-def cross(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Fill `out` with a x b."""
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@kernel
-def _epipolar_normals(a: FloatArray, b: FloatArray, pixel_angle: float) -> FloatArray:
-    """Return (a x b) / pixel_angle for every match: its length is the parallax in pixels."""
-    normals = np.empty_like(a)
+@inner_kernel
+def _fill_matches(a: FloatArray, b: FloatArray, pixel_angle: float, matches: FloatArray) -> None:
+    """Fill the rows of matches with rays a and b (n, 3)."""
     for k in range(len(a)):
-        cross(a[k], b[k], normals[k])
-    return normals / pixel_angle
+        match = matches[k]
+        for c in range(3):
+            match[c], match[3 + c] = a[k, c], b[k, c]
+        match[6] = (a[k, 1] * b[k, 2] - a[k, 2] * b[k, 1]) / pixel_angle
+        match[7] = (a[k, 2] * b[k, 0] - a[k, 0] * b[k, 2]) / pixel_angle
+        match[8] = (a[k, 0] * b[k, 1] - a[k, 1] * b[k, 0]) / pixel_angle
+        match[9] = np.sqrt(match[6] * match[6] + match[7] * match[7] + match[8] * match[8])
 
 
 @kernel
-def _dot(rows: FloatArray, k: int, d: FloatArray) -> float:
-    """Return the inner product of row k with d."""
-    return float(rows[k, 0] * d[0] + rows[k, 1] * d[1] + rows[k, 2] * d[2])
+def _residual(match: FloatArray, d: FloatArray) -> float:
+    """Return the signed Sampson error in px.
+
+    |a x d|^2 + |b x d|^2 has a floor where both rays run along the baseline.
+    """
+    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
+    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
+    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+    return float((match[6] * d[0] + match[7] * d[1] + match[8] * d[2]) / np.sqrt(square))
 
 
-@kernel
-def _length(rows: FloatArray, k: int) -> float:
-    """Return the norm of row k."""
-    return float(np.sqrt(rows[k, 0] ** 2 + rows[k, 1] ** 2 + rows[k, 2] ** 2))
-
-
-@kernel
-def _squared_gradient(along_a: float, along_b: float) -> float:
-    """Return |a x d|^2 + |b x d|^2 from <a, d> and <b, d>, floored where both rays run along the baseline."""
-    return float(max(2.0 - along_a * along_a - along_b * along_b, 1e-12))
-
-
-@kernel
-def _residual(pair: _Pair, d: FloatArray, k: int) -> float:
-    """Return the signed Sampson error of match k in px."""
-    return float(
-        _dot(pair.normals, k, d) / np.sqrt(_squared_gradient(_dot(pair.a, k, d), _dot(pair.b, k, d)))
-    )
-
-
-@kernel
-def _best_hypothesis(pair: _Pair, members: IntArray, threshold_px: float, num_hypotheses: int) -> FloatArray:
-    """Return the two-match direction of least truncated cost over the members; its draws are fixed."""
-    count = np.uint64(len(members))
-    best, d = np.zeros(3), np.zeros(3)
-    best[0] = 1.0
+@inner_kernel
+def _find_hypothesis(matches: FloatArray, threshold_px: float, num_hypotheses: int, best: FloatArray) -> None:
+    """Fill `best` with the two-match direction of least truncated cost; its draws are fixed."""
+    count = np.uint64(len(matches))
+    best[0], best[1], best[2] = 1.0, 0.0, 0.0
     best_cost = np.inf
+    d = np.empty(3)
     limit = threshold_px * threshold_px
     state = np.uint64(0x9E3779B97F4A7C15)
     for _ in range(num_hypotheses):
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        m = pair.normals[members[np.int64((state >> np.uint64(33)) % count)]]
+        m = matches[np.int64((state >> np.uint64(33)) % count)]
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
-        n = pair.normals[members[np.int64((state >> np.uint64(33)) % count)]]
-        cross(m, n, d)
-        length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        n = matches[np.int64((state >> np.uint64(33)) % count)]
+        x = m[7] * n[8] - m[8] * n[7]
+        y = m[8] * n[6] - m[6] * n[8]
+        z = m[6] * n[7] - m[7] * n[6]
+        length = np.sqrt(x * x + y * y + z * z)
         if length <= 1e-12:
             continue
-        d /= length
+        d[0], d[1], d[2] = x / length, y / length, z / length
         cost = 0.0
-        for k in members:
-            cost += min(_residual(pair, d, k) ** 2, limit)
+        for k in range(len(matches)):
+            residual = _residual(matches[k], d)
+            cost += min(residual * residual, limit)
             if cost >= best_cost:
                 break
         if cost < best_cost:
             best_cost = cost
-            best[:] = d
-    return best
+            best[0], best[1], best[2] = d[0], d[1], d[2]
 
 
-@kernel
-def _refine(pair: _Pair, threshold_px: float, d: FloatArray, residuals: FloatArray) -> tuple[float, float]:
+@inner_kernel
+def _refine(
+    matches: FloatArray, threshold_px: float, d: FloatArray, residuals: FloatArray
+) -> tuple[float, float]:
     """Move d to the nearest minimum of the robust cost; fill its residuals.
+
+    A step solves the weighted Gauss-Newton equations in the plane orthogonal to d.
 
     Returns:
         The standard deviation of the residuals, and the parallax up to which a match has full weight, in px.
     """
     noise_px, cap_px = threshold_px, np.inf
-    basis, normal_matrix = np.empty((2, 3)), np.empty(5)
-    _fill_residuals(pair, d, residuals)
+    basis, work = np.empty((2, 3)), np.empty(len(matches))
+    for k in range(len(matches)):
+        residuals[k] = _residual(matches[k], d)
     for step in range(_STEPS):
         if step < _RESCALINGS:
-            noise_px, cap_px = _noise(pair.normals, residuals, _width(noise_px))
+            noise_px, cap_px = _measure_noise(matches, residuals, _width(noise_px), work)
+        width = _width(noise_px)
         _fill_basis(d, basis)
-        _fill_normal_matrix(pair, d, basis, residuals, noise_px, cap_px, normal_matrix)
-        h00, h01, h11, g0, g1 = normal_matrix
+        h00, h01, h11, g0, g1 = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(len(matches)):
+            r = residuals[k]
+            x, y, _, leverage = _linearize(matches[k], d, basis, r, cap_px)
+            weight = leverage / (1.0 + (r / width) ** 2) ** 2
+            h00 += weight * x * x
+            h01 += weight * x * y
+            h11 += weight * y * y
+            g0 += weight * x * r
+            g1 += weight * y * r
         determinant = h00 * h11 - h01 * h01
         if not determinant > 1e-14 * (h00 + h11) ** 2:
             break  # exactly degenerate, such as identical rays
         x, y = (h01 * g1 - h11 * g0) / determinant, (h01 * g0 - h00 * g1) / determinant
         length = np.sqrt(x * x + y * y)
         shorter = min(1.0, _LONGEST_STEP_RAD / max(length, 1e-300))
-        d += shorter * (x * basis[0] + y * basis[1])
-        d /= np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-        _fill_residuals(pair, d, residuals)
+        for c in range(3):
+            d[c] += shorter * (x * basis[0, c] + y * basis[1, c])
+        norm = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        for c in range(3):
+            d[c] /= norm
+        for k in range(len(matches)):
+            residuals[k] = _residual(matches[k], d)
         if step >= _RESCALINGS and length < 1e-10:
             break
     return noise_px, cap_px
 
 
-@kernel
+@inner_kernel
 def _width(noise_px: float) -> float:
     """Return the width of the kernel in px."""
     return float(min(max(_WIDTH * noise_px, _MIN_WIDTH_PX), _MAX_WIDTH_PX))
 
 
-@kernel
-def _fill_residuals(pair: _Pair, d: FloatArray, residuals: FloatArray) -> None:
-    """Fill the signed Sampson error of every match in px."""
-    for k in range(len(pair.normals)):
-        residuals[k] = _residual(pair, d, k)
-
-
-@kernel
-def _noise(normals: FloatArray, residuals: FloatArray, cutoff_px: float) -> tuple[float, float]:
+@inner_kernel
+def _measure_noise(
+    matches: FloatArray, residuals: FloatArray, cutoff_px: float, work: FloatArray
+) -> tuple[float, float]:
     """Return the noise and the leverage cap in px, from the matches whose residual is below the cutoff.
 
     A fit of two unknowns leaves residuals that are too small by about (n - 2) / n in the median. The cap is
     taken from matches with parallax: few near points among many far ones are not suspicious.
     """
-    near = np.flatnonzero(np.abs(residuals) < cutoff_px)
-    count = len(near)
+    count = 0
+    for k in range(len(matches)):
+        if abs(residuals[k]) < cutoff_px:
+            work[count] = abs(residuals[k])
+            count += 1
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
-    noise_px = SIGMA_PER_MEDIAN * np.median(np.abs(residuals[near])) * count / (count - 2.0)
-    noise_px = max(noise_px, _MIN_NOISE_PX)
-    parallaxes, seen = np.empty(count), 0
-    for row in range(count):
-        length = _length(normals, near[row])
-        if length > _VOTE_SIGMAS * noise_px:
-            parallaxes[seen] = length
+    noise_px = max(SIGMA_PER_MEDIAN * _median(work, count) * count / (count - 2.0), _MIN_NOISE_PX)
+    seen = 0
+    for k in range(len(matches)):
+        if abs(residuals[k]) < cutoff_px and matches[k, 9] > _VOTE_SIGMAS * noise_px:
+            work[seen] = matches[k, 9]
             seen += 1
     if seen < MIN_MATCHES:
         return noise_px, np.inf
-    rank = int(_LEVERAGE_QUANTILE * (seen - 1))
-    return noise_px, _LEVERAGE * np.partition(parallaxes[:seen], rank)[rank]
+    return noise_px, _LEVERAGE * _select(work, seen, int(_LEVERAGE_QUANTILE * (seen - 1)))
 
 
-@kernel
-def _leverage_weight(pair: _Pair, k: int, cap_px: float) -> float:
-    """Return the weight of match k by its parallax alone: (cap / parallax)^2 beyond the cap."""
-    ratio = cap_px / max(_length(pair.normals, k), 1e-300)
-    return float(min(1.0, ratio * ratio))
+@inner_kernel
+def _median(values: FloatArray, count: int) -> float:
+    """Return the median of the first `count` values, at least one; reorders them."""
+    half = count >> 1
+    upper = _select(values, count, half)
+    if count & 1:
+        return upper
+    lower = values[0]
+    for k in range(1, half):
+        lower = max(lower, values[k])
+    return float((lower + upper) / 2.0)
 
 
-@kernel
-def _slope(pair: _Pair, d: FloatArray, residual: float, k: int, axis: FloatArray) -> float:
-    """Return the derivative of the Sampson error of match k as d moves along an axis orthogonal to it."""
-    along_a, along_b = _dot(pair.a, k, d), _dot(pair.b, k, d)
-    square = _squared_gradient(along_a, along_b)
-    turn = along_a * _dot(pair.a, k, axis) + along_b * _dot(pair.b, k, axis)
-    return float(_dot(pair.normals, k, axis) / np.sqrt(square) + residual * turn / square)
+@inner_kernel
+def _select(values: FloatArray, count: int, rank: int) -> float:
+    """Return the value of a rank, from 0, among the first `count`; none before it is larger then (Hoare)."""
+    low, high = 0, count - 1
+    while low < high:
+        pivot = values[(low + high) >> 1]
+        i, j = low, high
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i += 1
+                j -= 1
+        if rank <= j:
+            high = j
+        elif rank >= i:
+            low = i
+        else:
+            break
+    return float(values[rank])
 
 
-@kernel
+@inner_kernel
 def _fill_basis(d: FloatArray, basis: FloatArray) -> None:
     """Fill the rows of `basis` (2, 3) with an orthonormal basis of the plane orthogonal to d."""
-    smallest = np.argmin(np.abs(d))
-    first = -d[smallest] * d
+    smallest = 0
+    for c in range(1, 3):
+        if abs(d[c]) < abs(d[smallest]):
+            smallest = c
+    first, second = basis[0], basis[1]
+    for c in range(3):
+        first[c] = -d[smallest] * d[c]
     first[smallest] += 1.0
-    basis[0] = first / np.sqrt(np.sum(first * first))
-    cross(d, basis[0], basis[1])
+    norm = np.sqrt(first[0] * first[0] + first[1] * first[1] + first[2] * first[2])
+    for c in range(3):
+        first[c] /= norm
+    second[0] = d[1] * first[2] - d[2] * first[1]
+    second[1] = d[2] * first[0] - d[0] * first[2]
+    second[2] = d[0] * first[1] - d[1] * first[0]
 
 
-@kernel
-def _fill_normal_matrix(
-    pair: _Pair,
+@inner_kernel
+def _linearize(
+    match: FloatArray, d: FloatArray, basis: FloatArray, residual: float, cap_px: float
+) -> tuple[float, float, float, float]:
+    """Return what a match says as d moves orthogonally to itself.
+
+    The derivatives of its Sampson error along the two axes of the basis; |a x d|^2 + |b x d|^2, which divides
+    the error's square; its weight by its parallax alone, (cap / parallax)^2 beyond the cap.
+    """
+    along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
+    along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
+    square = max(2.0 - along_a * along_a - along_b * along_b, 1e-12)
+    root = np.sqrt(square)
+    x, y = basis[0], basis[1]
+    turn_x = along_a * (match[0] * x[0] + match[1] * x[1] + match[2] * x[2])
+    turn_x += along_b * (match[3] * x[0] + match[4] * x[1] + match[5] * x[2])
+    turn_y = along_a * (match[0] * y[0] + match[1] * y[1] + match[2] * y[2])
+    turn_y += along_b * (match[3] * y[0] + match[4] * y[1] + match[5] * y[2])
+    by_x = (match[6] * x[0] + match[7] * x[1] + match[8] * x[2]) / root + residual * turn_x / square
+    by_y = (match[6] * y[0] + match[7] * y[1] + match[8] * y[2]) / root + residual * turn_y / square
+    ratio = cap_px / max(match[9], 1e-300)
+    return by_x, by_y, square, min(1.0, ratio * ratio)
+
+
+@inner_kernel
+def _fill_moments(
+    matches: FloatArray,
     d: FloatArray,
-    basis: FloatArray,
     residuals: FloatArray,
     noise_px: float,
     cap_px: float,
-    out: FloatArray,
-) -> None:
-    """Fill the weighted Gauss-Newton equations in the tangent plane: h00, h01, h11, g0, g1."""
-    out[:] = 0.0
-    width = _width(noise_px)
-    for k in range(len(pair.normals)):
-        r = residuals[k]
-        weight = _leverage_weight(pair, k, cap_px) / (1.0 + (r / width) ** 2) ** 2
-        x = _slope(pair, d, r, k, basis[0])
-        y = _slope(pair, d, r, k, basis[1])
-        out[0] += weight * x * x
-        out[1] += weight * x * y
-        out[2] += weight * y * y
-        out[3] += weight * x * r
-        out[4] += weight * y * r
-
-
-@kernel
-def _fill_moments(
-    pair: _Pair, d: FloatArray, residuals: FloatArray, noise_px: float, cap_px: float, moments: FloatArray
+    moments: FloatArray,
 ) -> None:
     """Fill the expected curvature of the cost (slice 0) and the variance of its slope (slice 1) at d.
 
@@ -288,97 +308,107 @@ def _fill_moments(
     """
     width = _width(noise_px)
     total, curved, squared, count = 0.0, 0.0, 0.0, 0
-    feigned, steep, basis, jacobian = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((2, 3)), np.empty(3)
+    feigned, basis, jacobian = np.empty((3, 3)), np.empty((2, 3)), np.empty(3)
     _fill_basis(d, basis)
-    flat = np.zeros((3, 3))
-    for k in range(len(pair.normals)):
-        r, leverage = residuals[k], _leverage_weight(pair, k, cap_px)
+    flat, steep = moments[0], moments[1]
+    feigned[:] = 0.0
+    for k in range(len(matches)):
+        r, match = residuals[k], matches[k]
+        x, y, square, leverage = _linearize(match, d, basis, r, cap_px)
         u = (r / width) ** 2
         w = 1.0 / (1.0 + u) ** 2
         count += u < 1.0
         total += w
         curved += (1.0 - 3.0 * u) / (1.0 + u) ** 3
         squared += (w * r) ** 2
-        square = _squared_gradient(_dot(pair.a, k, d), _dot(pair.b, k, d))
-        x = _slope(pair, d, r, k, basis[0])
-        y = _slope(pair, d, r, k, basis[1])
         for axis in range(3):
             jacobian[axis] = x * basis[0, axis] + y * basis[1, axis]
         for row in range(3):
             for column in range(3):
                 outer = w * leverage * jacobian[row] * jacobian[column]
-                noise = (
-                    (2.0 if row == column else 0.0)
-                    - pair.a[k, row] * pair.a[k, column]
-                    - pair.b[k, row] * pair.b[k, column]
-                )
+                noise = 2.0 if row == column else 0.0
+                noise = noise - match[row] * match[column] - match[3 + row] * match[3 + column]
                 flat[row, column] += outer
                 steep[row, column] += leverage * outer
                 feigned[row, column] += leverage * w * r * r * noise / square
     total = max(total, 1e-300)
     few = count / (count - 5.0) if count > 5 else 6.0  # of the variance; see the package's header
-    moments[0] = (curved / total) * flat - feigned
-    moments[1] = (few * squared / total) * steep
+    for row in range(3):
+        for column in range(3):
+            flat[row, column] = (curved / total) * flat[row, column] - feigned[row, column]
+            steep[row, column] *= few * squared / total
 
 
-@kernel
-def _depth_sign(pair: _Pair, d: FloatArray, k: int) -> int:
-    """Return 1 if match k meets in front of both cameras for the baseline +d, -1 if behind both, else 0."""
-    cosine = _dot(pair.a, k, pair.b[k])
-    along_a, along_b = _dot(pair.a, k, d), _dot(pair.b, k, d)
-    depth_i, depth_j = cosine * along_b - along_a, along_b - cosine * along_a
-    return int(depth_i > 0.0 and depth_j > 0.0) - int(depth_i < 0.0 and depth_j < 0.0)
-
-
-@kernel
+@inner_kernel
 def _count_sides(
-    pair: _Pair, d: FloatArray, members: IntArray, vote_px: float, measures: FloatArray
-) -> float:
-    """Fill front, behind and voters among the members; return the sign with more points in front."""
+    matches: FloatArray, d: FloatArray, threshold_px: float, noise_px: float
+) -> tuple[int, int, int]:
+    """Return how many matches that agree with d meet in front of both cameras for the baseline +d, how many
+    behind both, and how many have the parallax to tell.
+    """
     front, behind, voters = 0, 0, 0
-    for k in members:
-        if _length(pair.normals, k) > vote_px:
-            side = _depth_sign(pair, d, k)
+    vote_px = max(_MIN_VOTE_PX, _VOTE_SIGMAS * noise_px)
+    for k in range(len(matches)):
+        match = matches[k]
+        if match[9] > vote_px and abs(_residual(match, d)) <= threshold_px:
+            cosine = match[0] * match[3] + match[1] * match[4] + match[2] * match[5]
+            along_a = match[0] * d[0] + match[1] * d[1] + match[2] * d[2]
+            along_b = match[3] * d[0] + match[4] * d[1] + match[5] * d[2]
+            depth_i, depth_j = cosine * along_b - along_a, along_b - cosine * along_a
             voters += 1
-            front += side == 1
-            behind += side == -1
-    measures[1], measures[2], measures[3] = max(front, behind), min(front, behind), voters
+            front += depth_i > 0.0 and depth_j > 0.0
+            behind += depth_i < 0.0 and depth_j < 0.0
+    return front, behind, voters
+
+
+@inner_kernel
+def _measure(
+    matches: FloatArray,
+    d: FloatArray,
+    residuals: FloatArray,
+    threshold_px: float,
+    noise_px: float,
+    pixel_angle: float,
+    measures: FloatArray,
+) -> float:
+    """Fill what the inliers say, see MEASURES; return the sign of d with more points in front."""
+    front, behind, voters = _count_sides(matches, d, threshold_px, noise_px)
+    sizes, angles, count = np.empty(len(matches)), np.empty(len(matches)), 0
+    for k in range(len(matches)):
+        if abs(residuals[k]) <= threshold_px:
+            match = matches[k]
+            cosine = match[0] * match[3] + match[1] * match[4] + match[2] * match[5]
+            sizes[count], angles[count] = abs(residuals[k]), np.arctan2(match[9] * pixel_angle, cosine)
+            count += 1
+    measures[0], measures[1], measures[2], measures[3] = count, max(front, behind), min(front, behind), voters
+    if count > 0:
+        measures[6], measures[7] = _median(sizes, count), _median(angles, count)
     return -1.0 if behind > front else 1.0
 
 
-@kernel
-def _measure(
-    pair: _Pair, residuals: FloatArray, inliers: IntArray, pixel_angle: float, measures: FloatArray
-) -> None:
-    """Fill the number of inliers and their median residual and parallax."""
-    measures[0] = len(inliers)
-    if len(inliers) == 0:
-        return
-    angles = np.empty(len(inliers))
-    for row in range(len(inliers)):
-        k = inliers[row]
-        cosine = _dot(pair.a, k, pair.b[k])
-        angles[row] = np.arctan2(_length(pair.normals, k) * pixel_angle, cosine)
-    measures[6], measures[7] = np.median(np.abs(residuals[inliers])), np.median(angles)
-
-
-@kernel
+@inner_kernel
 def _count_rivals(
-    pair: _Pair,
-    inliers: IntArray,
-    others: IntArray,
+    matches: FloatArray,
+    residuals: FloatArray,
     threshold_px: float,
+    noise_px: float,
     num_hypotheses: int,
-    vote_px: float,
     measures: FloatArray,
 ) -> None:
     """Fill how many of the others agree on a second direction, in front, and how many inliers do not."""
-    measures[5] = len(inliers)
-    if len(others) < MIN_MATCHES:
+    measures[5] = measures[0]
+    others, count = np.empty((len(matches), 10)), 0
+    for k in range(len(matches)):
+        if abs(residuals[k]) > 2.0 * max(threshold_px, 2.0 * noise_px):
+            for c in range(10):
+                others[count, c] = matches[k, c]
+            count += 1
+    if count < MIN_MATCHES:
         return
-    d = _best_hypothesis(pair, others, threshold_px, num_hypotheses)
-    residuals = np.empty(len(pair.normals))
-    _fill_residuals(pair, d, residuals)
-    sides = np.zeros(4)
-    _count_sides(pair, d, others[np.abs(residuals[others]) <= threshold_px], vote_px, sides)
-    measures[4], measures[5] = sides[1], np.sum(np.abs(residuals[inliers]) > threshold_px)
+    d = np.empty(3)
+    _find_hypothesis(others[:count], threshold_px, num_hypotheses, d)
+    front, behind, _ = _count_sides(others[:count], d, threshold_px, noise_px)
+    loyal = 0
+    for k in range(len(matches)):
+        loyal += abs(residuals[k]) <= threshold_px and abs(_residual(matches[k], d)) > threshold_px
+    measures[4], measures[5] = max(front, behind), loyal

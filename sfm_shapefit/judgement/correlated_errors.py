@@ -21,7 +21,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.geometry import tangent_bases
-from sfm_shapefit.jit import kernel, mix_bits
+from sfm_shapefit.jit import cross, inner_kernel, kernel, mix_bits
 
 NUM_SAMPLES = 96
 """Standard deviations from so many samples are right to 7 %."""
@@ -76,55 +76,75 @@ def _add_scores(
     scores: Any,
 ) -> None:
     """Add (a x b) r / gradient over the inlier matches of each pair, for every sample."""
-    factors = np.empty(4)
-    score = np.empty(3)
+    a, b, normal = np.empty(3), np.empty(3), np.empty(3)
+    across_a, across_b, factors = np.empty(3), np.empty(3), np.empty(4)
     for p in range(len(pairs)):
         if not known[p]:
             continue
         v = directions[p]
         for k in range(offsets[p], offsets[p + 1]):
-            a, b = rays_i[k], rays_j[k]
-            across_a, across_b = np.cross(v, a), np.cross(b, v)
-            square = np.sum(across_a * across_a) + np.sum(across_b * across_b)
-            normal = np.cross(a, b) / pixel_angles[p]
-            error = np.sum(normal * v)
+            for c in range(3):
+                a[c], b[c] = rays_i[k, c], rays_j[k, c]
+            cross(v, a, across_a)
+            cross(b, v, across_b)
+            cross(a, b, normal)
+            square = _dot(across_a, across_a) + _dot(across_b, across_b)
+            for c in range(3):
+                normal[c] /= pixel_angles[p]
+            error = _dot(normal, v)
             if error * error > threshold_px * threshold_px * square or square < 1e-12:
                 continue
+            for c in range(3):
+                normal[c] /= square
             _tangential(a, across_b, factors[:2])
             _tangential(b, across_a, factors[2:])
-            score[:] = normal / square
-            _add_samples(pairs[p], keypoints[k], factors, score, scores[p])
+            _add_samples(pairs[p], keypoints[k], factors, normal, scores[p])
 
 
-@kernel
+@inner_kernel
+def _dot(a: Any, b: Any) -> float:
+    """Return the inner product of two vectors in space."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
+
+
+@inner_kernel
 def _tangential(ray: Any, vector: Any, out: Any) -> None:
     """Write the components of a vector along two axes across a ray that depend on the ray alone."""
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(ray))] = 1.0
-    first = np.cross(ray, axis)
-    first /= np.sqrt(np.sum(first * first))
-    out[0] = np.sum(first * vector)
-    out[1] = np.sum(np.cross(ray, first) * vector)
+    axis, first, second = np.empty(3), np.empty(3), np.empty(3)
+    smallest = 0
+    for c in range(3):
+        axis[c] = 0.0
+        if abs(ray[c]) < abs(ray[smallest]):
+            smallest = c
+    axis[smallest] = 1.0
+    cross(ray, axis, first)
+    length = np.sqrt(_dot(first, first))
+    for c in range(3):
+        first[c] /= length
+    cross(ray, first, second)
+    out[0], out[1] = _dot(first, vector), _dot(second, vector)
 
 
-@kernel
+@inner_kernel
 def _add_samples(pair: Any, match: Any, factors: Any, score: Any, scores: Any) -> None:
     """Add the score of one match times its residual in each sample."""
+    one, two = np.uint64(1), np.uint64(2)
+    f0, f1, f2, f3 = factors[0], factors[1], factors[2], factors[3]
     for first in range(0, len(scores), _SIGNS_PER_HASH):
         bits_i = _hash(pair[0], match[0], first)
         bits_j = _hash(pair[1], match[1], first)
         for k in range(first, min(first + _SIGNS_PER_HASH, len(scores))):
-            residual = factors[0] if bits_i & np.uint64(1) else -factors[0]
-            residual += factors[1] if bits_i & np.uint64(2) else -factors[1]
-            residual += factors[2] if bits_j & np.uint64(1) else -factors[2]
-            residual += factors[3] if bits_j & np.uint64(2) else -factors[3]
-            bits_i >>= np.uint64(2)
-            bits_j >>= np.uint64(2)
+            residual = f0 if bits_i & one else -f0
+            residual += f1 if bits_i & two else -f1
+            residual += f2 if bits_j & one else -f2
+            residual += f3 if bits_j & two else -f3
+            bits_i >>= two
+            bits_j >>= two
             for c in range(3):
                 scores[k, c] += residual * score[c]
 
 
-@kernel
+@inner_kernel
 def _hash(image: int, keypoint: int, sample: int) -> Any:
     """Return 64 random bits of a keypoint."""
     x = np.uint64(image) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(keypoint)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.jit import kernel, mix_bits
+from sfm_shapefit.jit import inner_kernel, kernel, mix_bits
 from sfm_shapefit.laplacian.operators import Adjacency, Int32Array
 
 # A residual so many times the least so far shows that rounding leads, and no longer the system.
@@ -91,14 +91,14 @@ def approximate_cholesky(graph: Adjacency, weights: FloatArray, seed: int) -> Ap
     return ApproximateCholesky(*(frozen(part) for part in parts))
 
 
-@kernel
+@inner_kernel
 def _uniform(state: Any) -> float:
     """Return the next draw from [0, 1), by splitmix64."""
     state[0] += np.uint64(0x9E3779B97F4A7C15)
     return (mix_bits(state[0]) >> np.uint64(11)) * (1.0 / 9007199254740992.0)  # type: ignore[no-any-return]
 
 
-@kernel
+@inner_kernel
 def _push(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
     """Put node v first into the bucket of its degree."""
     first = bucket[degree[v]]
@@ -109,7 +109,7 @@ def _push(bucket: Any, above: Any, below: Any, degree: Any, v: int) -> None:
     bucket[degree[v]] = v
 
 
-@kernel
+@inner_kernel
 def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
     """Take node v out of the bucket of its degree."""
     if above[v] >= 0:
@@ -120,7 +120,7 @@ def _remove(bucket: Any, above: Any, below: Any, degree: Any, v: Any) -> None:
         above[below[v]] = above[v]
 
 
-@kernel
+@inner_kernel
 def _enlarge(array: Any, size: int) -> Any:
     """Return a copy of an array with room for `size` entries."""
     larger = np.empty((size, *array.shape[1:]), array.dtype)
@@ -128,7 +128,7 @@ def _enlarge(array: Any, size: int) -> Any:
     return larger
 
 
-@kernel
+@inner_kernel
 def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> Any:
     """Store the edges of positive weight as linked lists, one per node; both ends hold an edge.
 
@@ -152,7 +152,7 @@ def _edge_lists(pointers: Any, neighbors: Any, edge_of: Any, weights: Any) -> An
     return head, links, values, degree, np.array([-1, used])
 
 
-@kernel
+@inner_kernel
 def _add_entry(
     head: Any, links: Any, values: Any, degree: Any, pool: Any, here: int, there: int, w: float
 ) -> None:
@@ -168,7 +168,7 @@ def _add_entry(
     degree[here] += 1
 
 
-@kernel
+@inner_kernel
 def _merge_star(
     v: int, head: Any, links: Any, values: Any, degree: Any, pool: Any, bucket: Any, above: Any,
     below: Any, step: Any, place: Any, star: Any, star_weight: Any,
@@ -198,7 +198,7 @@ def _merge_star(
     return size
 
 
-@kernel
+@inner_kernel
 def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
     """Sort the neighbors by weight, ascending, equal ones by node; sum the weights from each to the last.
 
@@ -217,7 +217,7 @@ def _sort_star(size: int, star: Any, star_weight: Any, tail: Any) -> None:
         tail[i] = tail[i + 1] + star_weight[i]
 
 
-@kernel
+@inner_kernel
 def _sample_clique(
     size: int, star: Any, star_weight: Any, tail: Any, head: Any, links: Any, values: Any, degree: Any,
     pool: Any, state: Any,

@@ -31,7 +31,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import array_address, call_address, carray, kernel, leaf_address
+from sfm_shapefit.jit import array_address, call_address, carray, inner_kernel, kernel, leaf_address
 from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
 from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
@@ -408,7 +408,7 @@ def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
     _add_children(s, panels, parts, arena, width, width + below, mine, leading)
 
 
-@kernel
+@inner_kernel
 def _add_children(
     s: int, panels: Any, parts: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
@@ -434,7 +434,7 @@ def _subtract_strip(blas: Any, a: Any, shape: Any, c: Any, accumulate: bool) -> 
         gemm(blas, lower, a, (rows - strip, strip, columns), (c[0], c[1] + strip, c[2]), accumulate)
 
 
-@kernel
+@inner_kernel
 def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None:
     """Subtract the edges' weights from the panel of a supernode at their slots."""
     index, row, column, weights = parts.edge_index, parts.edge_row, parts.edge_column, parts.weights
@@ -446,7 +446,7 @@ def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None
                 panel[at + a] -= weights[e, c * b + a]
 
 
-@kernel
+@inner_kernel
 def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, diagonal: Any) -> None:
     """Add the diagonal blocks of the nodes start..stop-1 to a panel."""
     for q in range(stop - start):
@@ -471,7 +471,7 @@ def _check_pivots(s: int, panels: Any, parts: Any, pivot: Any) -> None:
             pivot[1] = start * b + k
 
 
-@kernel
+@inner_kernel
 def _add_update(
     update: Any, there: Any, b: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
@@ -501,7 +501,7 @@ def _add_update(
                 skip = 0
 
 
-@kernel
+@inner_kernel
 def _add(target: Any, values: Any) -> None:
     """Add one contiguous vector to another."""
     for i in range(len(target)):
@@ -561,7 +561,7 @@ def _ascend(
         _store_front(b, s, first, x, work)
 
 
-@kernel
+@inner_kernel
 def _load_front(
     b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
 ) -> Any:
@@ -580,7 +580,7 @@ def _load_front(
     return at
 
 
-@kernel
+@inner_kernel
 def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
     """Copy a front's own unknowns back to `x`."""
     start, width = first[s] * b, (first[s + 1] - first[s]) * b
@@ -589,7 +589,7 @@ def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
             x[start + i, k] = work[k, i]
 
 
-@kernel
+@inner_kernel
 def _add_below(
     b: int, s: int, first: Any, row_pointers: Any, rows: Any, limit: int, x: Any, outer: Any, work: Any
 ) -> None:
@@ -604,7 +604,7 @@ def _add_below(
         at += b
 
 
-@kernel
+@inner_kernel
 def _forward(
     panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
@@ -627,7 +627,7 @@ def _forward(
         _call_leaf(leaves[0], panels, offset, height, width - 4, work, sizes, numbers)
 
 
-@kernel
+@inner_kernel
 def _backward(
     panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
 ) -> None:
@@ -650,7 +650,7 @@ def _backward(
             _finish(panels[offset + q * height :][:height], q, j + 4, work)
 
 
-@kernel
+@inner_kernel
 def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
     """Finish unknown q and subtract its column from the rows q+1..end-1."""
     for k in range(3):
@@ -659,7 +659,7 @@ def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
             work[k, i] -= column[i] * work[k, q]
 
 
-@kernel
+@inner_kernel
 def _finish(column: Any, q: int, end: int, work: Any) -> None:
     """Subtract the rows q+1..end-1 of column q from unknown q and finish it."""
     for k in range(3):
@@ -669,7 +669,7 @@ def _finish(column: Any, q: int, end: int, work: Any) -> None:
         work[k, q] = total / column[q]
 
 
-@kernel
+@inner_kernel
 def _call_leaf(
     leaf: int, panels: Any, offset: int, height: int, j: int, work: Any, sizes: Any, numbers: Any
 ) -> None:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
 from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.jit import array_address, call_address, function_address, kernel
+from sfm_shapefit.jit import array_address, call_address, function_address, inner_kernel, kernel
 
 _POTRF, _TRSM, _SYRK, _GEMM, _TRSV = range(5)
 
@@ -115,7 +115,7 @@ def trsm(blas: Any, triangle: Any, below: Any, rows: int, columns: int) -> None:
     call_address(blas.routines[_TRSM], pointers)
 
 
-@kernel
+@inner_kernel
 def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -> None:
     """Subtract a a^T, a of so many rows and columns, from the lower triangle of c, or store -a a^T there."""
     integers = blas.integers
@@ -133,7 +133,7 @@ def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -
     call_address(blas.routines[_SYRK], pointers)
 
 
-@kernel
+@inner_kernel
 def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool) -> None:
     """Subtract left right^T from a block c, or store it negated; shape: (rows, columns, depth)."""
     integers = blas.integers
@@ -152,7 +152,7 @@ def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool)
     call_address(blas.routines[_GEMM], pointers)
 
 
-@kernel
+@inner_kernel
 def solve_factored(blas: Any, a: Any, order: int, b: Any) -> None:
     """Solve L L^T x = b in place for one right-hand side; the array `a` holds L as one block.
 

@@ -76,15 +76,14 @@ def group_by(labels: Any, count: int) -> Any:
 
     Items of one label stay in their order.
     """
-    pointers = np.zeros(count + 1, np.int64)
-    for label in labels:
-        pointers[label + 1] += 1
-    pointers = np.cumsum(pointers)
-    fill = pointers[:-1].copy()
-    items = np.empty(len(labels), np.int64)
+    pointers, items = np.zeros(count + 1, np.int64), np.empty(len(labels), np.int64)
     for k in range(len(labels)):
-        items[fill[labels[k]]] = k
-        fill[labels[k]] += 1
+        pointers[labels[k]] += 1
+    for label in range(count):
+        pointers[label + 1] += pointers[label]
+    for k in range(len(labels) - 1, -1, -1):
+        pointers[labels[k]] -= 1
+        items[pointers[labels[k]]] = k
     return pointers, items
 
 

@@ -33,7 +33,7 @@ from scipy.special import chdtri
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread, tangent_bases
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.cholesky import allocate_factor
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
@@ -392,7 +392,7 @@ def _linearize_pairs(
         _congruence(weight, across, information[e], half, blocks[e])
 
 
-@kernel
+@inner_kernel
 def _congruence(weight: float, a: Any, middle: Any, half: Any, out: Any) -> None:
     """Write weight * a^T middle a of symmetric a into `out`."""
     d = len(a)

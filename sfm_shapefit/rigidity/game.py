@@ -9,9 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.jit import kernel
-from sfm_shapefit.rigidity.growth import compact, find_root, incidence, unite
+from sfm_shapefit.arrays import BoolArray, IntArray
+from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.rigidity.growth import compact, incidence, roots, unite
+from sfm_shapefit.viewgraph import connected_components
 
 # A game is contracted and restarted when so many times its nodes have been marked.
 _GAME_WORK = 20
@@ -67,12 +68,14 @@ def contract(num_nodes: int, edges: IntArray, set_of: IntArray, part: int, dimen
 
 
 def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
-    """Play a game and unite sets by what it shows.
+    """Play a game and unite sets by what it shows: those that lie in the same rigid set.
 
     Returns:
         The rigid set that each set lies in, (number of sets,), compact; and whether these sets are
         all that there are. If not, two sets at least were united, and the game has to be played again.
     """
+    if len(game.ends) == 0:
+        return np.arange(game.num_sets), True
     n = game.num_nodes
     links = np.bincount(game.ends.ravel(), minlength=n)
     board = _Board(
@@ -84,14 +87,20 @@ def play(game: Game, dimension: int) -> tuple[IntArray, bool]:
         np.zeros(2, dtype=np.int64),
         *np.zeros((7, n), dtype=np.int64),
     )
-    mark = _place_links(board, game.copies, _GAME_WORK * n)
+    mark = np.full(n, -1)
+    _place_links(board, game.copies, _GAME_WORK * n, mark)
     if board.free.sum() == dimension + 1:  # the whole is one rigid set
         united = np.arange(game.num_sets)
         united[game.owner] = game.owner.min()
         return compact(united), True
     if (mark >= 0).any():
-        return compact(_sets_by_marks(board, game.owner, game.num_sets, mark)), False
-    return compact(_sets_by_search(board, game.owner, game.num_sets)), True
+        first, second = mark[game.ends.T]
+        inside = (first >= 0) & (first == second)
+        both = np.column_stack([game.owner[inside], game.owner[first[inside]]])
+        return connected_components(game.num_sets, both), False
+    united = np.arange(game.num_sets)
+    _search_sets(board, game.owner, np.zeros(game.num_sets, np.bool_), united)
+    return compact(roots(united)), True
 
 
 class _Board(NamedTuple):
@@ -118,57 +127,7 @@ class _Board(NamedTuple):
     """Marks of the running rigid set, valid where they equal clock[1]; its nodes."""
 
 
-@kernel
-def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
-    """Move one free pebble to node u along a path of copies, sparing node v; False if none is left."""
-    board.clock[0] += 1
-    now = board.clock[0]
-    board.seen[u] = now
-    board.seen[v] = now
-    board.queue[0] = u
-    head, tail = 0, 1
-    while head < tail:
-        x = board.queue[head]
-        head += 1
-        for s in range(board.target.shape[1]):
-            w = board.target[x, s]
-            if w < 0 or board.seen[w] == now:
-                continue
-            board.seen[w] = now
-            board.came_from[w] = x
-            board.came_by[w] = s
-            if board.free[w] > 0:
-                _reverse_path(board, u, w)
-                return True
-            board.queue[tail] = w
-            tail += 1
-    return False
-
-
-@kernel
-def _reverse_path(board: _Board, u: int, w: int) -> None:
-    """Turn the copies on the path found from u to w, so that a pebble of w becomes free at u."""
-    slot = _free_slot(board, w)
-    board.free[w] -= 1
-    while w != u:
-        x = board.came_from[w]
-        board.target[w, slot] = x
-        slot = board.came_by[w]
-        w = x
-    board.target[u, slot] = -1
-    board.free[u] += 1
-
-
-@kernel
-def _free_slot(board: _Board, u: int) -> int:
-    """Return the first free pebble of a node that has one."""
-    slot = 0
-    while board.target[u, slot] >= 0:
-        slot += 1
-    return slot
-
-
-@kernel
+@inner_kernel
 def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
     """Bring free pebbles to u and v until they hold `wanted` in all, or no more can come; return how many."""
     dimension = board.target.shape[1]
@@ -180,8 +139,45 @@ def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
     return int(board.free[u] + board.free[v])
 
 
+@inner_kernel
+def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
+    """Move one free pebble to node u along a path of copies, sparing node v; False if none is left.
+
+    The copies on the path are turned, so that a pebble of its last node becomes free at u.
+    """
+    target, seen, queue = board.target, board.seen, board.queue
+    board.clock[0] += 1
+    now = board.clock[0]
+    seen[u], seen[v], queue[0] = now, now, u
+    head, tail = 0, 1
+    while head < tail:
+        x = queue[head]
+        head += 1
+        for s in range(target.shape[1]):
+            w = target[x, s]
+            if w < 0 or seen[w] == now:
+                continue
+            seen[w], board.came_from[w], board.came_by[w] = now, x, s
+            if board.free[w] == 0:
+                queue[tail] = w
+                tail += 1
+                continue
+            board.free[w] -= 1
+            board.free[u] += 1
+            slot = 0
+            while target[w, slot] >= 0:
+                slot += 1
+            while w != u:
+                target[w, slot] = board.came_from[w]
+                slot = board.came_by[w]
+                w = board.came_from[w]
+            target[u, slot] = -1
+            return True
+    return False
+
+
 @kernel
-def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
+def _place_links(board: _Board, copies: IntArray, max_work: int, mark: IntArray) -> None:
     """Play the game: place as many copies of each link as are independent of those before.
 
     Gathering g pebbles on the ends of a link shows that g - (d + 1) more copies are independent. If
@@ -189,12 +185,10 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
     it are passed over at once. The game ends early when the whole is rigid, or when `max_work` nodes
     have been marked: contracting what was found is then cheaper than going on.
 
-    Returns:
-        (n,) the link by which a node was found to lie in a rigid set, -1 for none.
+    Fills `mark` (n,), which holds -1, with the link by which a node was found to lie in a rigid set.
     """
     n, dimension = board.target.shape
     room = dimension * n - (dimension + 1)
-    mark = np.full(n, -1, np.int64)
     size_at = np.zeros(len(copies), np.int64)
     for k in range(len(copies)):
         u, v = board.ends[k, 0], board.ends[k, 1]
@@ -204,7 +198,10 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
         placed = min(copies[k], gathered - (dimension + 1))
         for _ in range(placed):
             a, b = (u, v) if board.free[u] > 0 else (v, u)
-            board.target[a, _free_slot(board, a)] = b
+            slot = 0
+            while board.target[a, slot] >= 0:
+                slot += 1
+            board.target[a, slot] = b
             board.free[a] -= 1
         room -= placed
         if placed < copies[k]:
@@ -216,90 +213,69 @@ def _place_links(board: _Board, copies: IntArray, max_work: int) -> IntArray:
                     mark[w] = k
         if room == 0 or max_work < 0:
             break
-    return mark
 
 
-@kernel
+@inner_kernel
 def _rigid_set(board: _Board, u: int, v: int) -> int:
     """Collect the largest rigid set around u and v, which hold all the d + 1 pebbles that they can.
 
     It consists of the nodes that no path of copies leads from to a free pebble elsewhere. Returns
     its size; its nodes stand in `members`, and `inside` marks them.
     """
+    members, inside = board.members, board.inside
     board.clock[1] += 1
     now = board.clock[1]
-    board.members[0] = u
-    board.members[1] = v
-    board.inside[u] = now
-    board.inside[v] = now
+    members[0], members[1] = u, v
+    inside[u], inside[v] = now, now
     head, size = 0, 2
     while head < size:
-        x = board.members[head]
+        x = members[head]
         head += 1
         for s in range(board.start[x], board.start[x + 1]):
             k = board.link_of[s]
             w = board.ends[k, 0] + board.ends[k, 1] - x
-            if board.inside[w] != now and board.escapes[w] != now:
+            if inside[w] != now and board.escapes[w] != now:
                 size = _join_unless_escaping(board, w, size)
     return size
 
 
-@kernel
+@inner_kernel
 def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
     """Follow all copies from w: if none escapes to a free pebble, all nodes met join the rigid set."""
+    seen, came_from, queue = board.seen, board.came_from, board.queue
     rigid = board.clock[1]
     board.clock[0] += 1
     now = board.clock[0]
-    board.seen[w] = now
-    board.came_from[w] = -1
-    board.queue[0] = w
+    seen[w], came_from[w], queue[0] = now, -1, w
     head, tail = 0, 1
     while head < tail:
-        x = board.queue[head]
+        x = queue[head]
         head += 1
         if board.free[x] > 0 or board.escapes[x] == rigid:
             while x >= 0:
                 board.escapes[x] = rigid
-                x = board.came_from[x]
+                x = came_from[x]
             return size
         for s in range(board.target.shape[1]):
             y = board.target[x, s]
-            if y >= 0 and board.seen[y] != now and board.inside[y] != rigid:
-                board.seen[y] = now
-                board.came_from[y] = x
-                board.queue[tail] = y
+            if y >= 0 and seen[y] != now and board.inside[y] != rigid:
+                seen[y], came_from[y], queue[tail] = now, x, y
                 tail += 1
     for q in range(tail):
-        board.inside[board.queue[q]] = rigid
-        board.members[size] = board.queue[q]
+        board.inside[queue[q]] = rigid
+        board.members[size] = queue[q]
         size += 1
     return size
 
 
 @kernel
-def _sets_by_marks(board: _Board, owner: IntArray, num_sets: int, mark: IntArray) -> IntArray:
-    """Return a root set for each set: sets with two nodes of the same mark have the same."""
-    parent = np.arange(num_sets)
-    for k in range(len(owner)):
-        u, v = board.ends[k, 0], board.ends[k, 1]
-        if mark[u] >= 0 and mark[u] == mark[v]:
-            unite(parent, owner[k], owner[mark[u]])
-    for b in range(num_sets):
-        parent[b] = find_root(parent, b)
-    return parent
-
-
-@kernel
-def _sets_by_search(board: _Board, owner: IntArray, num_sets: int) -> IntArray:
-    """Return a root set for each set after a full game: sets in the same rigid set have the same."""
-    parent = np.arange(num_sets)
-    done = np.zeros(num_sets, np.bool_)
+def _search_sets(board: _Board, owner: IntArray, done: BoolArray, parent: IntArray) -> None:
+    """Unite the sets that lie in the same rigid set, after a full game; `done` holds False."""
     for k in range(len(owner)):
         if done[owner[k]]:
             continue
-        u, v = board.ends[k, 0], board.ends[k, 1]
-        _gather(board, u, v, 2 * board.target.shape[1])
-        for q in range(_rigid_set(board, u, v)):
+        _gather(board, board.ends[k, 0], board.ends[k, 1], 2 * board.target.shape[1])
+        for q in range(_rigid_set(board, board.ends[k, 0], board.ends[k, 1])):
             x = board.members[q]
             for s in range(board.start[x], board.start[x + 1]):
                 link = board.link_of[s]
@@ -307,6 +283,3 @@ def _sets_by_search(board: _Board, owner: IntArray, num_sets: int) -> IntArray:
                 if board.inside[w] == board.clock[1]:
                     done[owner[link]] = True
                     unite(parent, owner[k], owner[link])
-    for b in range(num_sets):
-        parent[b] = find_root(parent, b)
-    return parent

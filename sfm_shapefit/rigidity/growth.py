@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import IntArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import group_by
 
 # A later round rarely unites anything; the pebble game is exact anyway.
@@ -26,49 +26,53 @@ def compact(label: IntArray) -> IntArray:
     return np.asarray((np.cumsum(used) - 1)[label], dtype=np.int64)
 
 
-@kernel
-def find_root(parent: IntArray, item: int) -> int:
-    """Return the root of an item, halving its path."""
-    while parent[item] != item:
-        parent[item] = parent[parent[item]]
-        item = parent[item]
-    return item
+def roots(parent: IntArray) -> IntArray:
+    """Return the root of each item of a forest: the smallest member of its tree."""
+    while (parent[parent] != parent).any():
+        parent = parent[parent]
+    return parent
 
 
-@kernel
+@inner_kernel
 def unite(parent: IntArray, a: int, b: int) -> None:
-    """Unite the sets of two items under the smaller root."""
-    a = find_root(parent, a)
-    b = find_root(parent, b)
+    """Unite the sets of two items under the smaller root, halving the paths to both roots."""
+    while parent[a] != a:
+        parent[a] = parent[parent[a]]
+        a = parent[a]
+    while parent[b] != b:
+        parent[b] = parent[parent[b]]
+        b = parent[b]
     if a < b:
         parent[b] = a
     else:
         parent[a] = b
 
 
-@kernel
 def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
-    """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same.
+    """Return a root edge for each edge (m,): edges joined by a chain of triangles have the same."""
+    parent = np.arange(len(edges))
+    _unite_triangles(edges, np.bincount(edges.ravel(), minlength=num_nodes), parent)
+    return roots(parent)
+
+
+@kernel
+def _unite_triangles(edges: IntArray, degree: IntArray, parent: IntArray) -> None:
+    """Unite the pairs of each triangle.
 
     Each pair is directed to its end of higher degree, which leaves at most sqrt(2 m) pairs at any
     node, and each triangle is met once, at its lowest end.
     """
-    m = len(edges)
-    degree = np.zeros(num_nodes, np.int64)
-    for e in range(m):
-        degree[edges[e, 0]] += 1
-        degree[edges[e, 1]] += 1
-    tail = np.empty(m, np.int64)
+    n, m = len(degree), len(edges)
+    tail, head_of = np.empty(m, np.int64), np.empty(m, np.int64)
     for e in range(m):
         i, j = edges[e, 0], edges[e, 1]
-        tail[e] = i if (degree[i], i) < (degree[j], j) else j
-    start, edge_of = group_by(tail, num_nodes)
-    head_of = (edges[:, 0] + edges[:, 1] - tail)[edge_of]
-
-    parent = np.arange(m)
-    seen_from = np.full(num_nodes, -1, np.int64)
-    seen_edge = np.empty(num_nodes, np.int64)
-    for a in range(num_nodes):
+        tail[e] = i if degree[i] < degree[j] or (degree[i] == degree[j] and i < j) else j
+    start, edge_of = group_by(tail, n)
+    for s in range(m):
+        e = edge_of[s]
+        head_of[s] = edges[e, 0] + edges[e, 1] - tail[e]
+    seen_from, seen_edge = np.full(n, -1, np.int64), np.empty(n, np.int64)
+    for a in range(n):
         for s in range(start[a], start[a + 1]):
             seen_from[head_of[s]] = a
             seen_edge[head_of[s]] = edge_of[s]
@@ -79,9 +83,6 @@ def triangle_sets(num_nodes: int, edges: IntArray) -> IntArray:
                 if seen_from[c] == a:
                     unite(parent, edge_of[s], edge_of[r])
                     unite(parent, edge_of[s], seen_edge[c])
-    for e in range(m):
-        parent[e] = find_root(parent, e)
-    return parent
 
 
 @kernel
@@ -91,11 +92,11 @@ def incidence(
     """Return which nodes each set has, and which sets each node, as two (start, items) lists."""
     m = len(edges)
     edge_start, edge_of = group_by(set_of, num_sets)
-    start = np.zeros(num_sets + 1, np.int64)
+    start, last = np.empty(num_sets + 1, np.int64), np.full(num_nodes, -1, np.int64)
     nodes, owner = np.empty(2 * m, np.int64), np.empty(2 * m, np.int64)
-    last = np.full(num_nodes, -1, np.int64)
     count = 0
     for b in range(num_sets):
+        start[b] = count
         for s in range(edge_start[b], edge_start[b + 1]):
             for side in range(2):
                 node = edges[edge_of[s], side]
@@ -103,15 +104,20 @@ def incidence(
                     last[node] = b
                     nodes[count], owner[count] = node, b
                     count += 1
-        start[b + 1] = count
+    start[num_sets] = count
     back_start, entries = group_by(nodes[:count], num_nodes)
-    return start, nodes[:count].copy(), back_start, owner[entries]
+    rigid_sets = np.empty(count, np.int64)
+    for s in range(count):
+        rigid_sets[s] = owner[entries[s]]
+    return start, nodes[:count], back_start, rigid_sets
 
 
 def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
     """Return set labels after growing every set of at least 3 nodes, largest first (step 2)."""
     for _ in range(_GROWTH_ROUNDS):
         num_sets = int(set_of.max(initial=-1)) + 1
+        if num_sets < 2:
+            break
         growth = _Growth(
             *incidence(num_nodes, edges, set_of, num_sets),
             np.arange(num_sets),
@@ -123,7 +129,7 @@ def grow_sets(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:
         _grow(growth, seeds, _GROWTH_WORK * len(growth.nodes))
         if (growth.parent == np.arange(num_sets)).all():
             break
-        set_of = compact(growth.parent[set_of])
+        set_of = compact(roots(growth.parent)[set_of])
     return set_of
 
 
@@ -152,45 +158,39 @@ class _Growth(NamedTuple):
 
 @kernel
 def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
-    """Let each seed absorb what step 2 allows; leave a root set for each set in `parent`."""
-    for seed in seeds:
-        if growth.parent[seed] == seed and growth.taken[seed] < 0 and max_work >= 0:
-            max_work -= _grow_seed(growth, seed)
-    for b in range(len(growth.parent)):
-        growth.parent[b] = find_root(growth.parent, b)
-
-
-@kernel
-def _grow_seed(growth: _Growth, seed: int) -> int:
-    """Absorb each set that meets the seed's nodes a second time; return the work done.
+    """Let each seed absorb each set that meets its nodes a second time, or closes a triangle with another.
 
     A set larger than what has grown so far is not searched for nodes that it shares with
     others, which bounds the work of small seeds beside large sets.
     """
-    work = 0
-    tail = _absorb(growth, seed, seed, 0)
-    head = 0
-    while head < tail:
-        node = growth.queue[head]
-        head += 1
-        for s in range(growth.back_start[node], growth.back_start[node + 1]):
-            b = growth.rigid_sets[s]
-            work += 1
-            if growth.taken[b] == seed:
-                continue
-            size = growth.start[b + 1] - growth.start[b]
-            if growth.met[b] == seed:
-                tail = _absorb(growth, seed, b, tail)
-            elif size <= tail:
-                work += size
-                tail = _reach_out(growth, seed, b, node, tail)
-            growth.met[b] = seed
-    return work
+    start, back_start, met = growth.start, growth.back_start, growth.met
+    for seed in seeds:
+        if growth.parent[seed] != seed or growth.taken[seed] >= 0 or max_work < 0:
+            continue
+        tail = _absorb(growth, seed, seed, 0)
+        head = 0
+        while head < tail:
+            node = growth.queue[head]
+            head += 1
+            for s in range(back_start[node], back_start[node + 1]):
+                b = growth.rigid_sets[s]
+                max_work -= 1
+                if growth.taken[b] == seed:
+                    continue
+                size = start[b + 1] - start[b]
+                partner = b if met[b] == seed else -1
+                if partner < 0 and size <= tail:
+                    max_work -= size
+                    partner = _reach_out(growth, seed, b, node)
+                if partner >= 0:
+                    tail = _absorb(growth, seed, partner, tail)
+                    tail = _absorb(growth, seed, b, tail)
+                met[b] = seed
 
 
-@kernel
-def _reach_out(growth: _Growth, seed: int, b: int, node: int, tail: int) -> int:
-    """Mark the nodes of a set that meets the seed at `node`; absorb it if that closes a triangle.
+@inner_kernel
+def _reach_out(growth: _Growth, seed: int, b: int, node: int) -> int:
+    """Mark the nodes of a set that meets the seed at `node`; return which set closes a triangle, or -1.
 
     The triangle is the seed, this set, and one that meets the seed elsewhere and this set outside.
     Two sets that meet the seed at the same node, and each other outside, share two nodes.
@@ -206,12 +206,11 @@ def _reach_out(growth: _Growth, seed: int, b: int, node: int, tail: int) -> int:
         elif growth.reached_at[other] == node:
             unite(growth.parent, growth.reached_by[other], b)
         else:
-            tail = _absorb(growth, seed, growth.reached_by[other], tail)
-            return _absorb(growth, seed, b, tail)
-    return tail
+            return int(growth.reached_by[other])
+    return -1
 
 
-@kernel
+@inner_kernel
 def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
     """Unite a set with the seed and queue the nodes that it brings; return the queue's new tail."""
     if growth.taken[eaten] == seed:
@@ -219,8 +218,9 @@ def _absorb(growth: _Growth, seed: int, eaten: int, tail: int) -> int:
     growth.taken[eaten] = seed
     unite(growth.parent, seed, eaten)
     for s in range(growth.start[eaten], growth.start[eaten + 1]):
-        if growth.inside[growth.nodes[s]] != seed:
-            growth.inside[growth.nodes[s]] = seed
-            growth.queue[tail] = growth.nodes[s]
+        node = growth.nodes[s]
+        if growth.inside[node] != seed:
+            growth.inside[node] = seed
+            growth.queue[tail] = node
             tail += 1
     return tail

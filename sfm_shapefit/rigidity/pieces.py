@@ -153,10 +153,10 @@ def _among_first_links(num_nodes: int, edges: IntArray, few: int) -> npt.NDArray
 
 
 def _check_edges(num_nodes: int, edges: IntArray, dimension: int) -> IntArray:
-    """Return `edges` as a contiguous (m, 2) int64 array, or raise InputError."""
+    """Return `edges` as a contiguous, read-only (m, 2) int64 array, or raise InputError."""
     if dimension < 2:
         raise InputError(f"parallel rigidity needs dimension >= 2, got {dimension}")
-    return check_edges(num_nodes, edges)
+    return frozen(check_edges(num_nodes, edges))
 
 
 def _rank(num_nodes: int, edges: IntArray, set_of: IntArray) -> IntArray:

@@ -30,9 +30,8 @@ from scipy.sparse.linalg import splu
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.directions.kernels import cross
 from sfm_shapefit.directions.matches import RayMatches
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import cross, inner_kernel, kernel
 from sfm_shapefit.laplacian.dense import one_blas_thread
 from sfm_shapefit.laplacian.operators import block_matrix
 from sfm_shapefit.solver.damping import DampingRange, take_damped_step
@@ -65,7 +64,7 @@ class State(NamedTuple):
         return State(turned, self.centers + step[:, 3:])
 
 
-@kernel
+@inner_kernel
 def _residual_and_gradient(
     p: FloatArray,
     q: FloatArray,

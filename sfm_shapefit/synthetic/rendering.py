@@ -28,7 +28,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.synthetic.layouts import LAYOUTS, ByteArray, SceneCameras, turn_at_random
 from sfm_shapefit.synthetic.options import RenderOptions, SceneOptions
 from sfm_shapefit.synthetic.surfaces import Surfaces, make_surfaces
@@ -319,7 +319,7 @@ def _paint(
                 colors[r, c, a] = brightness[k] * ((1.0 - weight) * sharp + weight * blurred)
 
 
-@kernel
+@inner_kernel
 def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float, float]:
     """Return where in the picture of a triangle its plane is met by a ray."""
     x, y = ray[0], ray[1]
@@ -329,7 +329,7 @@ def _picture_position(img_from_ray: FloatArray, ray: FloatArray) -> tuple[float,
     return u / w, v / w
 
 
-@kernel
+@inner_kernel
 def _bilinear(pyramid: ByteArray, levels: IntArray, level: int, u: float, v: float, channel: int) -> float:
     """Return one color of a picture that repeats for ever, at a position in pixels of its first level."""
     offset, height, width = levels[level, 0], levels[level, 1], levels[level, 2]

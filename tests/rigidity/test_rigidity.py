@@ -405,7 +405,7 @@ def test_growth_ends_with_the_seed_at_which_its_work_is_used_up(monkeypatch):
 def test_the_game_ends_where_the_whole_is_rigid(monkeypatch):
     ends = np.array([[0, 1], [0, 2], [1, 2], [0, 3], [1, 3], [2, 3]])  # in the plane five of the six suffice
     seen, place = [], rigidity.game._place_links
-    monkeypatch.setattr(rigidity.game, "_place_links", lambda *given: seen.append(place(*given)) or seen[-1])
+    monkeypatch.setattr(rigidity.game, "_place_links", lambda *given: seen.append(given[-1]) or place(*given))
     game = rigidity.game.Game(
         num_nodes=4, ends=ends, copies=np.ones(6, np.int64), owner=np.arange(6), num_sets=6, is_whole=False
     )

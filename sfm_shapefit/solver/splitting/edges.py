@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import inner_kernel, kernel
 from sfm_shapefit.laplacian.operators import Workers
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -186,7 +186,7 @@ class EdgePasses:
         self._workers.run([partial(run, k, bounds[k], bounds[k + 1]) for k in range(len(bounds) - 1)])
 
 
-@kernel
+@inner_kernel
 def _clip_factor(axes: Any, x: Any, v: Any, e: int, least: float, radius: float) -> Any:
     """Return (a, shrink) of an edge: r = x - a v, clip(r) = shrink * r."""
     d = len(axes)
@@ -230,7 +230,7 @@ def _step(
                 sums[j, k] -= block[k, b]
 
 
-@kernel
+@inner_kernel
 def _advance(axes: Any, block: Any, count: int, least: float, relaxation: float, totals: Any) -> None:
     """Take the step for edges side by side, coordinate by coordinate, so that it is vectorized.
 
