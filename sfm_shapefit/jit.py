@@ -13,7 +13,9 @@ What compiling costs. A kernel with eight arrays takes about 0.15 s, and every k
 copy of it again, so chains of calls are kept short. An assignment of one array to another (`a[:] = b`),
 arithmetic of whole arrays and most functions of numpy bring tens of compilations of their own, where a loop
 brings none. Another type of argument is another compilation: integers are int64 and arrays writable, or
-read-only, wherever a kernel is called; a literal number has a type of its own.
+read-only, wherever a kernel is called; a literal number has a type of its own, and so has a variable that
+begins as one (`int(count)` has not). A small kernel that is called often is given few arrays, since each is
+passed as seven numbers or more, and names none (`seen = board.seen`), since that counts references.
 """
 
 import hashlib
@@ -64,7 +66,7 @@ def _find_signature(function: Any, context: Any, args: Any, keywords: Any) -> An
     return _signatures[key]
 
 
-BaseFunction.get_call_type = _find_signature
+BaseFunction.get_call_type = _find_signature  # type: ignore[assignment, method-assign]
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 

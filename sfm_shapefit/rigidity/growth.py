@@ -184,8 +184,8 @@ def _grow(growth: _Growth, seeds: IntArray, max_work: int) -> None:
     for seed in seeds:
         if growth.parent[seed] != seed or growth.taken[seed] >= 0 or max_work < 0:
             continue
-        tail = _absorb(growth, seed, seed, np.int64(0))
-        head = 0
+        head, tail = 0, 0
+        tail = _absorb(growth, seed, seed, int(tail))
         while head < tail:
             node = growth.queue[head]
             head += 1
