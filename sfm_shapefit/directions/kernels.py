@@ -192,22 +192,21 @@ def _measure_noise(
     A fit of two unknowns leaves residuals that are too small by about (n - 2) / n in the median. The cap is
     taken from matches with parallax: few near points among many far ones are not suspicious.
     """
-    count = 0
+    count, seen = 0, 0
     for k in range(len(matches)):
         if abs(residuals[k]) < cutoff_px:
             work[count] = abs(residuals[k])
             count += 1
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
-    noise_px = max(SIGMA_PER_MEDIAN * _median(work, count) * count / (count - 2.0), _MIN_NOISE_PX)
-    seen = 0
+    noise_px = max(SIGMA_PER_MEDIAN * _median(work, int(count)) * count / (count - 2.0), _MIN_NOISE_PX)
     for k in range(len(matches)):
         if abs(residuals[k]) < cutoff_px and matches[k, 9] > _VOTE_SIGMAS * noise_px:
             work[seen] = matches[k, 9]
             seen += 1
     if seen < MIN_MATCHES:
         return noise_px, np.inf
-    return noise_px, _LEVERAGE * _select(work, seen, int(_LEVERAGE_QUANTILE * (seen - 1)))
+    return noise_px, _LEVERAGE * _select(work, int(seen), int(_LEVERAGE_QUANTILE * (seen - 1)))
 
 
 @inner_kernel
@@ -382,7 +381,7 @@ def _measure(
             count += 1
     measures[0], measures[1], measures[2], measures[3] = count, max(front, behind), min(front, behind), voters
     if count > 0:
-        measures[6], measures[7] = _median(sizes, count), _median(angles, count)
+        measures[6], measures[7] = _median(sizes, int(count)), _median(angles, int(count))
     return -1.0 if behind > front else 1.0
 
 

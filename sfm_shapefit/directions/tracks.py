@@ -164,8 +164,9 @@ def covering_set(tracks: Tracks, num_cameras: int, per_camera: int | None = None
     if per_camera is None:
         per_camera = max(_PER_CAMERA, min(_PER_CAMERA_OF_FEW, _IN_ALL // num_cameras))
     order = np.argsort(-_worth(tracks), kind="stable")
-    chosen = _greedy_cover(order, tracks.offsets, tracks.cameras, num_cameras, per_camera)
-    return np.sort(order[chosen])
+    taken = np.zeros(len(order), dtype=np.bool_)
+    _cover(order, tracks.offsets, tracks.cameras, per_camera, np.zeros(num_cameras, dtype=np.int64), taken)
+    return np.sort(order[taken])
 
 
 def _worth(tracks: Tracks) -> FloatArray:
@@ -177,21 +178,21 @@ def _worth(tracks: Tracks) -> FloatArray:
 
 
 @kernel
-def _greedy_cover(
-    order: IntArray, offsets: IntArray, cameras: IntArray, num_cameras: int, per_camera: int
-) -> BoolArray:
-    """Return, in the given order, which tracks are taken."""
-    seen = np.zeros(num_cameras, dtype=np.int64)
-    taken = np.zeros(len(order), dtype=np.bool_)
+def _cover(
+    order: IntArray, offsets: IntArray, cameras: IntArray, per_camera: int, seen: IntArray, taken: BoolArray
+) -> None:
+    """Write, in the given order, which tracks are taken; both outputs come as zeros.
+
+    `seen` counts how many of these each camera sees.
+    """
     for k in range(len(order)):
-        p = order[k]
-        for row in range(offsets[p], offsets[p + 1]):
+        first, last = offsets[order[k]], offsets[order[k] + 1]
+        for row in range(first, last):
             if seen[cameras[row]] < per_camera:
                 taken[k] = True
         if taken[k]:
-            for row in range(offsets[p], offsets[p + 1]):
+            for row in range(first, last):
                 seen[cameras[row]] += 1
-    return taken
 
 
 def join_points(

@@ -129,51 +129,48 @@ class _Board(NamedTuple):
 
 @inner_kernel
 def _gather(board: _Board, u: int, v: int, wanted: int) -> int:
-    """Bring free pebbles to u and v until they hold `wanted` in all, or no more can come; return how many."""
-    dimension = board.target.shape[1]
-    while board.free[u] + board.free[v] < wanted and (
-        (board.free[u] < dimension and _fetch_pebble(board, u, v))
-        or (board.free[v] < dimension and _fetch_pebble(board, v, u))
-    ):
-        pass
-    return int(board.free[u] + board.free[v])
+    """Bring free pebbles to u and v until they hold `wanted` in all, or no more can come; return how many.
 
-
-@inner_kernel
-def _fetch_pebble(board: _Board, u: int, v: int) -> bool:
-    """Move one free pebble to node u along a path of copies, sparing node v; False if none is left.
-
-    The copies on the path are turned, so that a pebble of its last node becomes free at u.
+    A pebble comes to one of them along a path of copies that spares the other one, and turns these copies. An
+    end that no path leads to stays so: a path to the other end meets none of the nodes reached from it.
     """
-    target, seen, queue = board.target, board.seen, board.queue
-    board.clock[0] += 1
-    now = board.clock[0]
-    seen[u], seen[v], queue[0] = now, now, u
-    head, tail = 0, 1
-    while head < tail:
-        x = queue[head]
-        head += 1
-        for s in range(target.shape[1]):
-            w = target[x, s]
-            if w < 0 or seen[w] == now:
-                continue
-            seen[w], board.came_from[w], board.came_by[w] = now, x, s
-            if board.free[w] == 0:
-                queue[tail] = w
-                tail += 1
-                continue
-            board.free[w] -= 1
-            board.free[u] += 1
-            slot = 0
-            while target[w, slot] >= 0:
-                slot += 1
-            while w != u:
-                target[w, slot] = board.came_from[w]
-                slot = board.came_by[w]
-                w = board.came_from[w]
-            target[u, slot] = -1
-            return True
-    return False
+    dimension = board.target.shape[1]
+    u_open, v_open = True, True
+    while board.free[u] + board.free[v] < wanted:
+        u_open, v_open = u_open and board.free[u] < dimension, v_open and board.free[v] < dimension
+        if not u_open and not v_open:
+            break
+        end = u if u_open else v
+        board.clock[0] += 1
+        now = board.clock[0]
+        board.seen[u], board.seen[v], board.queue[0] = now, now, end
+        head, tail, source = 0, 1, -1
+        while head < tail and source < 0:
+            x = board.queue[head]
+            head += 1
+            for s in range(dimension):
+                w = board.target[x, s]
+                if w >= 0 and board.seen[w] != now:
+                    board.seen[w], board.came_from[w], board.came_by[w] = now, x, s
+                    if board.free[w] > 0:
+                        source = w
+                        break
+                    board.queue[tail] = w
+                    tail += 1
+        if source < 0:
+            u_open, v_open = u_open and end != u, v_open and end != v
+            continue
+        board.free[source] -= 1
+        board.free[end] += 1
+        slot = 0
+        while board.target[source, slot] >= 0:
+            slot += 1
+        while source != end:
+            board.target[source, slot] = board.came_from[source]
+            slot = board.came_by[source]
+            source = board.came_from[source]
+        board.target[end, slot] = -1
+    return int(board.free[u] + board.free[v])
 
 
 @kernel
@@ -219,52 +216,45 @@ def _place_links(board: _Board, copies: IntArray, max_work: int, mark: IntArray)
 def _rigid_set(board: _Board, u: int, v: int) -> int:
     """Collect the largest rigid set around u and v, which hold all the d + 1 pebbles that they can.
 
-    It consists of the nodes that no path of copies leads from to a free pebble elsewhere. Returns
-    its size; its nodes stand in `members`, and `inside` marks them.
+    It consists of the nodes that no path of copies leads from to a free pebble elsewhere. From each neighbor
+    of the set all copies are followed: if none escapes to a free pebble, all nodes met join. Returns the
+    size; the set's nodes stand in `members`, those just met behind them, and `inside` marks them.
     """
-    members, inside = board.members, board.inside
     board.clock[1] += 1
     now = board.clock[1]
-    members[0], members[1] = u, v
-    inside[u], inside[v] = now, now
+    board.members[0], board.members[1] = u, v
+    board.inside[u], board.inside[v] = now, now
     head, size = 0, 2
     while head < size:
-        x = members[head]
+        node = board.members[head]
         head += 1
-        for s in range(board.start[x], board.start[x + 1]):
+        for s in range(board.start[node], board.start[node + 1]):
             k = board.link_of[s]
-            w = board.ends[k, 0] + board.ends[k, 1] - x
-            if inside[w] != now and board.escapes[w] != now:
-                size = _join_unless_escaping(board, w, size)
-    return size
-
-
-@inner_kernel
-def _join_unless_escaping(board: _Board, w: int, size: int) -> int:
-    """Follow all copies from w: if none escapes to a free pebble, all nodes met join the rigid set."""
-    seen, came_from, queue = board.seen, board.came_from, board.queue
-    rigid = board.clock[1]
-    board.clock[0] += 1
-    now = board.clock[0]
-    seen[w], came_from[w], queue[0] = now, -1, w
-    head, tail = 0, 1
-    while head < tail:
-        x = queue[head]
-        head += 1
-        if board.free[x] > 0 or board.escapes[x] == rigid:
-            while x >= 0:
-                board.escapes[x] = rigid
-                x = came_from[x]
-            return size
-        for s in range(board.target.shape[1]):
-            y = board.target[x, s]
-            if y >= 0 and seen[y] != now and board.inside[y] != rigid:
-                seen[y], came_from[y], queue[tail] = now, x, y
-                tail += 1
-    for q in range(tail):
-        board.inside[queue[q]] = rigid
-        board.members[size] = queue[q]
-        size += 1
+            w = board.ends[k, 0] + board.ends[k, 1] - node
+            if board.inside[w] == now or board.escapes[w] == now:
+                continue
+            board.clock[0] += 1
+            search = board.clock[0]
+            board.seen[w], board.came_from[w], board.members[size] = search, -1, w
+            place, tail, escaped = size, size + 1, -1
+            while place < tail:
+                x = board.members[place]
+                place += 1
+                if board.free[x] > 0 or board.escapes[x] == now:
+                    escaped = x
+                    break
+                for slot in range(board.target.shape[1]):
+                    y = board.target[x, slot]
+                    if y >= 0 and board.seen[y] != search and board.inside[y] != now:
+                        board.seen[y], board.came_from[y], board.members[tail] = search, x, y
+                        tail += 1
+            if escaped < 0:
+                for q in range(size, tail):
+                    board.inside[board.members[q]] = now
+                size = tail
+            while escaped >= 0:
+                board.escapes[escaped] = now
+                escaped = board.came_from[escaped]
     return size
 
 
