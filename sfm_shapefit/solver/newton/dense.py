@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import array_address, kernel
 from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
@@ -187,7 +187,7 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     while info != 0 and ridge <= last:
         _lift(problem, factor, size, ridge * size)
         _add_edge_blocks(problem, linearization, factor)
-        info = potrf(factor.blas, (factor.matrix, 0, order), order)
+        info = potrf(factor.blas, (array_address(factor.matrix), order), order)
         ridge *= 100.0
     linearization.a[:] = problem.c
     if info == 0:
@@ -278,6 +278,6 @@ def _solve(factor: Any, nodes: Any) -> None:
     x = nodes.reshape(right.size)
     for k in range(len(right)):
         right[k] = x[k]
-    solve_factored(factor.blas, factor.matrix, right.size, right)
+    solve_factored(factor.blas, (array_address(factor.matrix), right.size), right.size, array_address(right))
     for k in range(len(right)):
         x[k] = right[k]
