@@ -63,7 +63,7 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
         num_nodes: n.
         edges: (m, 2) int64, checked.
     """
-    return Adjacency(*(frozen(part) for part in _adjacency(num_nodes, edges)))
+    return Adjacency(*(frozen(part) for part in _adjacency(num_nodes, frozen(edges))))
 
 
 @kernel
