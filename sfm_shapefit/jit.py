@@ -18,14 +18,12 @@ read-only, wherever a kernel is called; a literal number has a type of its own.
 
 import hashlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import lru_cache
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
-import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
@@ -46,11 +44,11 @@ if "pycolmap" in _loaded and _loaded.index("pycolmap") < _loaded.index("zlib"):
 
 Kernel = TypeVar("Kernel", bound=Callable[..., Any])
 
-carray = numba.carray
-"""In a leaf (see `leaf_address`): `carray(pointer, shape)` is the array behind a pointer."""
-
 # What all kernels have in common. Nothing calls them from C.
 _OPTIONS = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+
+# Four float64 or eight float32: what most processors add at once.
+_LANE_BYTES = 32
 
 
 def kernel(function: Kernel) -> Kernel:
@@ -141,6 +139,81 @@ array_address = intrinsic(_array_address)
 """In a kernel: the address of the first entry of a contiguous array, as int64."""
 
 
+def _multiply_in_lanes(
+    _context: Any, panel: Any, _at: Any, _leading: Any, vectors: Any, _start: Any, _count: Any, sums: Any
+) -> Any:
+    """Type `multiply_in_lanes` and generate its code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integer = context.get_value_type(types.int64)
+        number = context.get_value_type(signature.args[0].dtype)
+        size = context.get_abi_sizeof(number)
+        lanes = ir.VectorType(number, _LANE_BYTES // size)
+        flat, lines, out = (
+            context.make_array(signature.args[k])(context, builder, arguments[k]) for k in (0, 3, 6)
+        )
+        _, at, leading, _, start, count, _ = arguments
+        length = builder.extract_value(lines.shape, 1)
+
+        def place(data: Any, first: Any, stride: Any, k: int) -> Any:
+            return builder.gep(data, [builder.add(first, builder.mul(stride, integer(k)))])
+
+        columns = [place(flat.data, at, leading, q) for q in range(4)]
+        rows = [place(lines.data, start, length, k) for k in range(3)]
+
+        def accumulate(begin: Any, end: Any, kind: Any, step: int) -> list[Any]:
+            totals = [cgutils.alloca_once_value(builder, ir.Constant(kind, None)) for _ in range(12)]
+            with cgutils.for_range_slice(builder, begin, end, integer(step), integer) as (i, _):
+
+                def load(pointer: Any) -> Any:
+                    here = builder.bitcast(builder.gep(pointer, [i]), kind.as_pointer())
+                    return builder.load(here, align=size)
+
+                factors, values = [load(column) for column in columns], [load(row) for row in rows]
+                products = [builder.fmul(factor, value) for value in values for factor in factors]
+                for total, product in zip(totals, products, strict=True):
+                    builder.store(builder.fadd(builder.load(total), product), total)
+            return [builder.load(total) for total in totals]
+
+        def add_lanes(vector: Any) -> Any:
+            width = lanes.count
+            while width > 1:
+                width //= 2
+                low, high = (
+                    builder.shuffle_vector(vector, vector, _indices(range(first, first + width)))
+                    for first in (0, width)
+                )
+                vector = builder.fadd(low, high)
+            return builder.extract_element(vector, integer(0))
+
+        whole = builder.sub(count, builder.srem(count, integer(lanes.count)))
+        vectorial = accumulate(integer(0), whole, lanes, lanes.count)
+        rest = accumulate(whole, count, number, 1)
+        for k in range(12):
+            total = builder.fadd(add_lanes(vectorial[k]), rest[k])
+            builder.store(total, builder.gep(out.data, [integer(k)]))
+        return context.get_dummy_value()
+
+    number = types.int64
+    return types.void(panel, number, number, vectors, number, number, sums), generate
+
+
+def _indices(numbers: Iterable[int]) -> ir.Constant:
+    """Return the mask of a shuffle."""
+    indices = list(numbers)
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(indices)), indices)
+
+
+multiply_in_lanes = intrinsic(_multiply_in_lanes)
+"""In a kernel: the products of four columns with three vectors, summed in lanes of a fixed width.
+
+`multiply_in_lanes(panel, at, leading, vectors, start, count, sums)` writes to sums[k, q] the sum over i <
+count of panel[at + q leading + i] vectors[k, start + i]. A sum in the written order cannot use the vectors of
+a processor. These sums do, and have one order on all of them. `panel` (.,), `vectors` (3, .) and `sums` (3,
+4) are contiguous and of one type, float32 or float64.
+"""
+
+
 @inner_kernel
 def cross(a: Any, b: Any, out: Any) -> None:
     """Fill `out` (3,) with a x b."""
@@ -155,20 +228,3 @@ def mix_bits(z: Any) -> Any:
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
-
-
-@lru_cache(maxsize=32)
-def _compiled_leaf(function: Callable[..., None], dtype: str, num_arrays: int) -> Any:
-    """Compile a leaf for one type, or load it from the disk cache."""
-    number = numba.from_dtype(np.dtype(dtype))
-    signature = types.void(types.CPointer(types.int64), *([types.CPointer(number)] * num_arrays))
-    return numba.cfunc(signature, cache=True, error_model="numpy")(function)
-
-
-def leaf_address(function: Callable[..., None], dtype: npt.DTypeLike, num_arrays: int) -> int:
-    """Compile a small function apart from all others and return its address for `call_address`.
-
-    The function takes pointers: one to int64 sizes, then `num_arrays` to numbers of type `dtype`. It calls no
-    other kernel.
-    """
-    return int(_compiled_leaf(function, np.dtype(dtype).str, num_arrays).address)

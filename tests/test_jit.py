@@ -3,9 +3,10 @@
 import ast
 
 import numba
+import numpy as np
 import pytest
 
-from sfm_shapefit.jit import kernel, on_compilation
+from sfm_shapefit.jit import kernel, multiply_in_lanes, on_compilation
 from tests.program import run_python
 from tests.scenes import ROOT
 
@@ -25,6 +26,37 @@ def test_a_kernel_works_where_nothing_can_be_cached(monkeypatch):
         return 2 * x
 
     assert twice(21) == 42
+
+
+def sum_in_lanes(products):
+    """Add numbers in lanes of 32 bytes, then the lanes by halves, then what is left."""
+    width = 32 // products.itemsize
+    whole = len(products) - len(products) % width
+    lanes, rest = np.zeros(width, products.dtype), products.dtype.type(0)
+    for chunk in products[:whole].reshape(-1, width):
+        lanes = lanes + chunk
+    while len(lanes) > 1:
+        lanes = lanes[: len(lanes) // 2] + lanes[len(lanes) // 2 :]
+    for product in products[whole:]:
+        rest = rest + product
+    return lanes[0] + rest
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_sums_in_lanes_have_one_order_on_every_processor(dtype):
+    @numba.njit
+    def multiply(panel, at, leading, vectors, start, count, sums):
+        multiply_in_lanes(panel, at, leading, vectors, start, count, sums)
+
+    rng = np.random.default_rng(0)
+    panel, vectors = rng.normal(size=400).astype(dtype), rng.normal(size=(3, 90)).astype(dtype)
+    for count in (0, 1, 7, 8, 32, 61):
+        sums = np.full((3, 4), np.nan, dtype)
+        multiply(panel, 5, 95, vectors, 2, count, sums)
+        for k in range(3):
+            for q in range(4):
+                column = panel[5 + 95 * q :][:count]
+                assert sums[k, q] == sum_in_lanes(column * vectors[k, 2 : 2 + count])
 
 
 def test_compilations_are_told_once_and_only_where_there_are_any():

@@ -29,10 +29,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import array_address, call_address, carray, inner_kernel, kernel, leaf_address
-from sfm_shapefit.laplacian.dense import blas_of, gemm, one_blas_thread, potrf, syrk, trsm
+from sfm_shapefit.jit import array_address, inner_kernel, kernel, multiply_in_lanes
+from sfm_shapefit.laplacian.dense import Block, blas_of, gemm, one_blas_thread, potrf, syrk, trsm
 from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
@@ -43,21 +43,21 @@ PIVOT_TOLERANCE = 64.0
 # A front above the tasks of so many rows or more is factored by strips of so many columns.
 _LARGE_FRONT, _STRIP = 768, 256
 
+# What is done with a front, one after the other.
+_ASSEMBLE, _FACTOR, _PASS_ON = range(3)
 
-class _Panels(NamedTuple):
-    """The panels as the kernels take them: the parts of the plan that say where each is, and the numbers."""
+
+class _Input(NamedTuple):
+    """What fronts are assembled from, as the kernels take it, all of one type in either precision.
+
+    Mostly the arrays of the plan. They and the weights are read-only.
+    """
 
     b: int
     first: IntArray
     row_pointers: IntArray
     rows: Int32Array
-    pointers: IntArray
-    entries: npt.NDArray[Any]
-
-
-class _Parts(NamedTuple):
-    """What fronts are assembled from: children's updates by the plan, edges by their slots, the diagonal."""
-
+    panel_pointers: IntArray
     relative: Int32Array
     child_pointers: IntArray
     children: IntArray
@@ -70,8 +70,6 @@ class _Parts(NamedTuple):
     """(m, b^2)"""
     diagonal: FloatArray
     """(n, b^2) in elimination order."""
-    stack: npt.NDArray[Any]
-    """Update matrices that wait for their parents, arenas behind them."""
 
 
 @dataclass(slots=True, eq=False)
@@ -113,11 +111,11 @@ class CholeskyFactor:
         shape = (plan.num_edges,) if b == 1 else (plan.num_edges, b, b)
         if np.shape(weights) != shape:
             raise ValueError(f"weights have shape {np.shape(weights)}, this factor takes {shape}")
-        panels, parts = self._storage(np.ascontiguousarray(weights, dtype=np.float64))
-        _sum_at_nodes(panels, parts)
+        given = self._input(np.ascontiguousarray(weights, dtype=np.float64))
+        _sum_at_nodes(given)
         traces = self._diagonal[:, :: b + 1]
         traces[-1] += float(traces.mean()) if ground is None else ground
-        if not self._factor(panels, parts):
+        if not self._factor(given):
             raise UnsolvableError(
                 f"the Laplacian is singular at node {self.weakest_node} (relative pivot "
                 f"{self.smallest_pivot:.1e}); the graph is disconnected or not rigid there, or its weights "
@@ -141,28 +139,21 @@ class CholeskyFactor:
         weights = -off_diagonal
         i, j = plan.inverse[edges].T
         weights[i > j] = weights[i > j].transpose(0, 2, 1)
-        return self._factor(*self._storage(np.ascontiguousarray(weights)))
+        return self._factor(self._input(np.ascontiguousarray(weights)))
 
-    def _storage(self, weights: FloatArray) -> tuple[_Panels, _Parts]:
-        """Return the panels, and what fronts are assembled from."""
+    def _input(self, weights: FloatArray) -> _Input:
+        """Return what fronts are assembled from."""
         plan, b = self.symbolic, self.block
-        panels = _Panels(b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, self.panels)
-        stack_size = (plan.stack_size + self._num_arenas * plan.arena_size) * b * b
-        parts = _Parts(
-            plan.relative, plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers,
-            plan.edge_index, plan.edge_row, plan.edge_column, weights.reshape(plan.num_edges, b * b),
-            self._diagonal, np.empty(stack_size, dtype=self.dtype),
+        return _Input(
+            b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, plan.relative,
+            plan.child_pointers, plan.children, plan.update_offsets, plan.edge_pointers, plan.edge_index,
+            plan.edge_row, plan.edge_column, frozen(weights.reshape(plan.num_edges, b * b)), self._diagonal,
         )  # fmt: skip
-        return panels, parts
 
-    @property
-    def _num_arenas(self) -> int:
-        return min(self.workers.threads, len(self.symbolic.tasks))
-
-    def _factor(self, panels: _Panels, parts: _Parts) -> bool:
-        """Factor what was assembled; return whether all pivots are positive to working precision."""
+    def _factor(self, given: _Input) -> bool:
+        """Factor what is given; return whether all pivots are positive to working precision."""
         with one_blas_thread():
-            failed, pivot = _factor_all(self, panels, parts, self._num_arenas)
+            failed, pivot = _factor_all(self, given)
         self.smallest_pivot = float(pivot[0])
         self.weakest_node = int(self.symbolic.permutation[int(pivot[1]) // self.block])
         return not failed and bool(pivot[0] > PIVOT_TOLERANCE * np.finfo(self.dtype).eps)
@@ -244,11 +235,12 @@ def factorize(
     return factor
 
 
-def _factor_all(
-    factor: CholeskyFactor, panels: _Panels, parts: _Parts, arenas: int
-) -> tuple[bool, FloatArray]:
+def _factor_all(factor: CholeskyFactor, given: _Input) -> tuple[bool, FloatArray]:
     """Factor all supernodes; return whether a pivot was not positive, and the least pivot and its row."""
     plan = factor.symbolic
+    arenas = min(factor.workers.threads, len(plan.tasks))
+    size = (plan.stack_size + arenas * plan.arena_size) * factor.block**2
+    stack = np.empty(size, dtype=factor.dtype)  # update matrices that wait for their parents, then the arenas
     free = SimpleQueue[int]()
     for k in range(arenas):
         free.put(plan.stack_size + k * plan.arena_size)
@@ -260,7 +252,18 @@ def _factor_all(
             begin, end = plan.tasks[k]
             arena = free.get()
             try:
-                failed[k] = _factorize(begin, end, panels, parts, arena, pivots[k], blas_of(factor.dtype))
+                failed[k] = _factorize(
+                    begin,
+                    end,
+                    _ASSEMBLE,
+                    _PASS_ON,
+                    given,
+                    factor.panels,
+                    stack,
+                    arena,
+                    pivots[k],
+                    blas_of(factor.dtype),
+                )
             finally:
                 free.put(arena)
 
@@ -271,53 +274,79 @@ def _factor_all(
         ready = int(np.searchsorted(plan.tasks[:, 0], begin))
         factor.workers.run([task(k) for k in range(done, ready)])
         done = ready
-        failed[-1] = failed.any() or _factor_above(factor, panels, parts, begin, end, pivots[-1])
+        failed[-1] = failed.any() or _factor_above(factor, given, stack, begin, end, pivots[-1])
         if failed[-1]:
             break
     return bool(failed.any()), pivots[np.argmin(pivots[:, 0])]
 
 
 def _factor_above(
-    factor: CholeskyFactor, panels: _Panels, parts: _Parts, begin: int, end: int, pivot: Any
+    factor: CholeskyFactor, given: _Input, stack: npt.NDArray[Any], begin: int, end: int, pivot: Any
 ) -> bool:
     """Factor a run of supernodes above the tasks: the large ones by strips, the others as in a task."""
     plan = factor.symbolic
+
+    def run(first: int, last: int, from_step: int, to_step: int) -> bool:
+        blas = blas_of(factor.dtype)
+        return _factorize(first, last, from_step, to_step, given, factor.panels, stack, 0, pivot, blas)
+
     heights = np.diff(plan.first)[begin:end] + np.diff(plan.row_pointers)[begin:end]
     large = np.flatnonzero(heights * factor.block >= _LARGE_FRONT) + begin
     at = begin
     for s in [*large.tolist(), end]:
-        if at < s and _factorize(at, s, panels, parts, 0, pivot, blas_of(factor.dtype)):
+        if at < s and run(at, s, _ASSEMBLE, _PASS_ON):
             return True
-        if s < end and _factor_large(factor, panels, parts, s, pivot):
-            return True
+        if s < end:
+            run(s, s + 1, _ASSEMBLE, _ASSEMBLE)
+            if _factor_large(factor, stack, s, pivot):
+                return True
+            run(s, s + 1, _PASS_ON, _PASS_ON)
         at = s + 1
     return False
 
 
-def _factor_large(factor: CholeskyFactor, panels: _Panels, parts: _Parts, s: int, pivot: Any) -> bool:
-    """Factor one front by strips of columns, each strip's update of the rest as parallel jobs."""
+def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot: Any) -> bool:
+    """Factor one assembled front by strips of columns, each strip's update of the rest as parallel jobs."""
     plan, b, workers = factor.symbolic, factor.block, factor.workers
     width = int(plan.first[s + 1] - plan.first[s]) * b
     height = width + int(plan.row_pointers[s + 1] - plan.row_pointers[s]) * b
-    offset, update = int(plan.panel_pointers[s]) * b * b, int(plan.update_offsets[s]) * b * b
-    below = height - width
-    _assemble_front(s, panels, parts, 0)
+    below, size = height - width, factor.panels.itemsize
+    panel = factor.panels.ctypes.data + int(plan.panel_pointers[s]) * b * b * size
+    update = stack.ctypes.data + int(plan.update_offsets[s]) * b * b * size
 
-    def block(row: int, column: int) -> tuple[Any, int, int]:
-        return factor.panels, offset + column * height + row, height
+    def block(row: int, column: int) -> Block:
+        return panel + (column * height + row) * size, height
+
+    def waiting(row: int, column: int) -> Block:
+        return update + (column * below + row) * size, below
 
     def divide(j: int, end: int, row: int) -> Callable[[], object]:
         rows = min(_STRIP, height - row)
         return lambda: trsm(blas_of(factor.dtype), block(j, j), block(row, j), rows, end - j)
 
-    def subtract(j: int, end: int, row: int, last: int) -> Callable[[], object]:
-        shape = height - row, last - row, end - j
-        return lambda: _subtract_strip(blas_of(factor.dtype), block(row, j), shape, block(row, row), True)
+    def subtract(j: int, end: int, row: int) -> Callable[[], object]:
+        last = min(row + _STRIP, width)
+
+        def run() -> None:
+            blas, left, depth = blas_of(factor.dtype), block(row, j), end - j
+            syrk(blas, left, last - row, depth, block(row, row), True)
+            if last < height:
+                shape = height - last, last - row, depth
+                gemm(blas, block(last, j), left, shape, block(last, row), True)
+
+        return run
 
     def leave(row: int) -> Callable[[], object]:
-        shape = below - row, min(_STRIP, below - row), width
-        target = parts.stack, update + row * (below + 1), below
-        return lambda: _subtract_strip(blas_of(factor.dtype), block(width + row, 0), shape, target, False)
+        last = min(row + _STRIP, below)
+
+        def run() -> None:
+            blas, left = blas_of(factor.dtype), block(width + row, 0)
+            syrk(blas, left, last - row, width, waiting(row, row), False)
+            if last < below:
+                shape = below - last, last - row, width
+                gemm(blas, block(width + last, 0), left, shape, waiting(last, row), False)
+
+        return run
 
     for j in range(0, width, _STRIP):
         end = min(j + _STRIP, width)
@@ -326,20 +355,17 @@ def _factor_large(factor: CholeskyFactor, panels: _Panels, parts: _Parts, s: int
             pivot[:] = 0.0, plan.first[s] * b + j + info - 1
             return True
         workers.run([divide(j, end, row) for row in range(end, height, _STRIP)])
-        rows = range(end, width, _STRIP)
-        workers.run([subtract(j, end, row, min(row + _STRIP, width)) for row in rows])
-    _check_pivots(s, panels, parts, pivot)
+        workers.run([subtract(j, end, row) for row in range(end, width, _STRIP)])
     workers.run([leave(row) for row in range(0, below, _STRIP)])
-    _pass_on(s, panels, parts, 0, update)
     return False
 
 
 @kernel
-def _sum_at_nodes(panels: Any, parts: Any) -> None:
+def _sum_at_nodes(given: Any) -> None:
     """Write the diagonal blocks of the Laplacian, in elimination order: sums over incident edges."""
-    first, row_pointers, rows = panels.first, panels.row_pointers, panels.rows
-    begin, index, row, column = parts.edge_pointers, parts.edge_index, parts.edge_row, parts.edge_column
-    weights, diagonal = parts.weights, parts.diagonal
+    first, row_pointers, rows, begin = given.first, given.row_pointers, given.rows, given.edge_pointers
+    index, row, column = given.edge_index, given.edge_row, given.edge_column
+    weights, diagonal = given.weights, given.diagonal
     diagonal[:] = 0.0
     for s in range(len(first) - 1):
         start, width = first[s], first[s + 1] - first[s]
@@ -354,375 +380,223 @@ def _sum_at_nodes(panels: Any, parts: Any) -> None:
 
 
 @kernel
-def _factorize(begin: int, end: int, panels: Any, parts: Any, arena: int, pivot: Any, blas: Any) -> bool:
-    """Factor the supernodes begin..end-1; return True if a pivot was not positive.
+def _factorize(
+    begin: int, end: int, from_step: int, to_step: int, given: Any, panels: Any, stack: Any, arena: int,
+    pivot: Any, blas: Any,
+) -> bool:  # fmt: skip
+    """Take the supernodes begin..end-1 through some steps; return True if a pivot was not positive.
 
     A task has its updates in its arena, all but the root's; above the tasks, `arena` is 0. `pivot` is lowered
-    to the least relative pivot and the row it stands in.
+    to the least ratio of a squared pivot to its diagonal entry and the row it stands in.
     """
-    b = panels.b
+    b, first, row_pointers, diagonal = given.b, given.first, given.row_pointers, given.diagonal
+    index, row, column, weights = given.edge_index, given.edge_row, given.edge_column, given.weights
+    size = panels.itemsize
     for s in range(begin, end):
-        width = (panels.first[s + 1] - panels.first[s]) * b
-        below = (panels.row_pointers[s + 1] - panels.row_pointers[s]) * b
+        start, width = first[s] * b, (first[s + 1] - first[s]) * b
+        below = (row_pointers[s + 1] - row_pointers[s]) * b
         height = width + below
-        offset = panels.pointers[s] * b * b
-        _assemble_front(s, panels, parts, arena)
-        square = (panels.entries, offset, height)
-        info = potrf(blas, square, width)
-        if info != 0:
-            pivot[0] = 0.0
-            pivot[1] = panels.first[s] * b + info - 1
-            return True
-        _check_pivots(s, panels, parts, pivot)
-        if below == 0:
-            continue
-        rest = (panels.entries, offset + width, height)
-        trsm(blas, square, rest, below, width)
-        update = (parts.update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
-        syrk(blas, rest, below, width, (parts.stack, update, below), False)
-        _pass_on(s, panels, parts, arena, update)
+        offset = given.panel_pointers[s] * b * b
+        panel = panels[offset : offset + width * height]
+        update = (given.update_offsets[s] + (arena if s < end - 1 else 0)) * b * b
+        for step in range(from_step, to_step + 1):
+            if step == _FACTOR:
+                square = array_address(panels) + offset * size, height
+                info = potrf(blas, square, width)
+                if info != 0:
+                    pivot[0] = 0.0
+                    pivot[1] = start + info - 1
+                    return True
+                rest = square[0] + width * size, height
+                trsm(blas, square, rest, below, width)
+                mine = array_address(stack) + update * size, max(below, 1)
+                syrk(blas, rest, below, width, mine, False)
+                continue
+            if step == _ASSEMBLE:
+                panel[:] = 0.0
+                for k in range(given.edge_pointers[s], given.edge_pointers[s + 1]):
+                    e = index[k]
+                    for c in range(b):
+                        at = (column[k] * b + c) * height + row[k] * b
+                        for a in range(b):
+                            panel[at + a] -= weights[e, c * b + a]
+                for i in range(width * b):
+                    q = i // b
+                    node = q // b
+                    panel[q * height + node * b + i - q * b] += diagonal[first[s] + node, i - node * b * b]
+                target, leading, lowest, highest = panel, height, 0, width // b
+            else:
+                for q in range(width):
+                    root, node = panel[q * height + q], q // b
+                    ratio = root * root / diagonal[first[s] + node, (q - node * b) * (b + 1)]
+                    if not ratio >= pivot[0]:
+                        pivot[0] = ratio
+                        pivot[1] = start + q
+                target, leading = stack[update : update + below * below], below
+                lowest, highest = width // b, height // b
+            _add_children(s, given, stack, arena, lowest, highest, target, leading)
     return False
-
-
-@kernel
-def _assemble_front(s: int, panels: Any, parts: Any, arena: int) -> None:
-    """Write the panel of a supernode before it is factored: edges, diagonal, children's updates."""
-    b, row_pointers = panels.b, panels.row_pointers
-    width = (panels.first[s + 1] - panels.first[s]) * b
-    height = width + (row_pointers[s + 1] - row_pointers[s]) * b
-    offset = panels.pointers[s] * b * b
-    panel = panels.entries[offset : offset + width * height]
-    panel[:] = 0.0
-    _assemble_edges(panel, height, b, s, parts)
-    _assemble_diagonal(panel, height, b, panels.first[s], panels.first[s + 1], parts.diagonal)
-    _add_children(s, panels, parts, arena, 0, width // b, panel, height)
-
-
-@kernel
-def _pass_on(s: int, panels: Any, parts: Any, arena: int, update: int) -> None:
-    """Add what the children leave for later fronts to the update of s, which starts at `update`."""
-    width = panels.first[s + 1] - panels.first[s]
-    below = panels.row_pointers[s + 1] - panels.row_pointers[s]
-    leading = below * panels.b
-    mine = parts.stack[update : update + leading**2]
-    _add_children(s, panels, parts, arena, width, width + below, mine, leading)
 
 
 @inner_kernel
 def _add_children(
-    s: int, panels: Any, parts: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
+    s: int, given: Any, stack: Any, arena: int, lowest: int, highest: int, target: Any, leading: int
 ) -> None:
-    """Add the columns of the children's updates that go to the columns lowest..highest-1 of a front."""
-    b, row_pointers, stack = panels.b, panels.row_pointers, parts.stack
-    for c in range(parts.child_pointers[s], parts.child_pointers[s + 1]):
-        child = parts.children[c]
-        there = parts.relative[row_pointers[child] : row_pointers[child + 1]]
-        update = stack[(parts.update_offsets[child] + arena) * b * b :][: (len(there) * b) ** 2]
-        _add_update(update, there, b, lowest, highest, target, leading)
+    """Add the columns of the children's updates that go to the columns lowest..highest-1 of a front.
 
-
-@kernel
-def _subtract_strip(blas: Any, a: Any, shape: Any, c: Any, accumulate: bool) -> None:
-    """Subtract a a^T from the first columns of the lower triangle of the block c, or store -a a^T there.
-
-    `shape` holds the rows of `a`, how many of them, the first, belong to these columns of c, and its columns.
+    `target` starts at row and column `lowest`. Consecutive rows mostly stay consecutive and are added as
+    vectors.
     """
-    rows, strip, columns = shape
-    syrk(blas, a, strip, columns, c, accumulate)
-    if rows > strip:
-        lower = (a[0], a[1] + strip, a[2])
-        gemm(blas, lower, a, (rows - strip, strip, columns), (c[0], c[1] + strip, c[2]), accumulate)
-
-
-@inner_kernel
-def _assemble_edges(panel: Any, height: int, b: int, s: int, parts: Any) -> None:
-    """Subtract the edges' weights from the panel of a supernode at their slots."""
-    index, row, column, weights = parts.edge_index, parts.edge_row, parts.edge_column, parts.weights
-    for k in range(parts.edge_pointers[s], parts.edge_pointers[s + 1]):
-        e = index[k]
-        for c in range(b):
-            at = (column[k] * b + c) * height + row[k] * b
-            for a in range(b):
-                panel[at + a] -= weights[e, c * b + a]
-
-
-@inner_kernel
-def _assemble_diagonal(panel: Any, height: int, b: int, start: int, stop: int, diagonal: Any) -> None:
-    """Add the diagonal blocks of the nodes start..stop-1 to a panel."""
-    for q in range(stop - start):
-        for c in range(b):
-            at = (q * b + c) * height + q * b
-            for a in range(b):
-                panel[at + a] += diagonal[start + q, c * b + a]
-
-
-@kernel
-def _check_pivots(s: int, panels: Any, parts: Any, pivot: Any) -> None:
-    """Lower pivot[0] to the least ratio of a squared pivot to its diagonal entry, and note its row."""
-    b, start = panels.b, panels.first[s]
-    width = (panels.first[s + 1] - start) * b
-    height = width + (panels.row_pointers[s + 1] - panels.row_pointers[s]) * b
-    panel, diagonal = panels.entries[panels.pointers[s] * b * b :], parts.diagonal
-    for k in range(width):
-        root = panel[k * height + k]
-        ratio = root * root / diagonal[start + k // b, (k % b) * (b + 1)]
-        if not ratio >= pivot[0]:
-            pivot[0] = ratio
-            pivot[1] = start * b + k
-
-
-@inner_kernel
-def _add_update(
-    update: Any, there: Any, b: int, lowest: int, highest: int, target: Any, leading: int
-) -> None:
-    """Add the columns of a child's update that go to the columns lowest..highest-1 of its parent's front.
-
-    `there` maps the child's rows to the parent's; `target` starts at row and column `lowest` if that is
-    not 0. Consecutive rows mostly stay consecutive and are added as vectors.
-    """
-    size = len(there)
-    run_end = np.empty(size, np.int64)
-    for i in range(size - 1, -1, -1):
-        joined = i + 1 < size and there[i + 1] == there[i] + 1
-        run_end[i] = run_end[i + 1] if joined else i + 1
-    for j in range(size):
-        if there[j] < lowest or there[j] >= highest:
-            continue
-        for c in range(b):
-            source = (j * b + c) * size * b
-            into = ((there[j] - lowest) * b + c) * leading
-            i = j
-            skip = c  # the part of the diagonal block above the diagonal was never written
-            while i < size:
-                count = (run_end[i] - i) * b
-                at = into + (there[i] - lowest) * b
-                _add(target[at + skip : at + count], update[source + i * b + skip : source + i * b + count])
-                i = run_end[i]
-                skip = 0
-
-
-@inner_kernel
-def _add(target: Any, values: Any) -> None:
-    """Add one contiguous vector to another."""
-    for i in range(len(target)):
-        target[i] += values[i]
+    b = given.b
+    for k in range(given.child_pointers[s], given.child_pointers[s + 1]):
+        child = given.children[k]
+        # Where the child's rows are in this front.
+        there = given.relative[given.row_pointers[child] : given.row_pointers[child + 1]]
+        size = len(there)
+        run_end = np.empty(size, np.int64)
+        for i in range(size - 1, -1, -1):
+            joined = i + 1 < size and there[i + 1] == there[i] + 1
+            run_end[i] = run_end[i + 1] if joined else i + 1
+        for j in range(size):
+            if there[j] < lowest or there[j] >= highest:
+                continue
+            for c in range(b):
+                source = (given.update_offsets[child] + arena) * b * b + (j * b + c) * size * b
+                into = ((there[j] - lowest) * b + c) * leading
+                i = j
+                skip = c  # the part of the diagonal block above the diagonal was never written
+                while i < size:
+                    at = into + (there[i] - lowest) * b
+                    sums = target[at + skip : at + (run_end[i] - i) * b]
+                    values = stack[source + i * b + skip : source + run_end[i] * b]
+                    for p in range(len(sums)):
+                        sums[p] += values[p]
+                    i = run_end[i]
+                    skip = 0
 
 
 def _substitute(factor: CholeskyFactor, x: npt.NDArray[Any]) -> None:
     """Solve L L^T y = x in place for three right-hand sides: the tasks, what is above them, and back."""
     plan, b = factor.symbolic, factor.block
     outer = np.zeros((len(plan.tasks), *x.shape), dtype=x.dtype)  # what each task leaves for rows above it
-    addresses = [leaf_address(leaf, factor.dtype, 3) for leaf in (_subtract_four, _multiply_four)]
-    leaves = np.array(addresses, dtype=np.int64)
 
-    def job(kernel: Any, begin: int, end: int, *rest: Any) -> Callable[[], object]:
-        return lambda: kernel(
+    def descend(run: IntArray, outer: npt.NDArray[Any]) -> Callable[[], object]:
+        work = np.empty((3, plan.largest_front * b), x.dtype)
+        begin, end = run
+        return lambda: _descend(
             begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
-            np.empty((3, plan.largest_front * b), x.dtype), leaves, np.empty(3, np.int64),
-            np.empty(12, x.dtype), *rest,
+            work, outer,
         )  # fmt: skip
 
-    factor.workers.run([job(_descend, *task, outer[k]) for k, task in enumerate(plan.tasks)])
+    def ascend(run: IntArray) -> Callable[[], object]:
+        work, sums = np.empty((3, plan.largest_front * b), x.dtype), np.empty((3, 4), x.dtype)
+        begin, end = run
+        return lambda: _ascend(
+            begin, end, b, plan.first, plan.row_pointers, plan.rows, plan.panel_pointers, factor.panels, x,
+            work, sums,
+        )  # fmt: skip
+
+    factor.workers.run([descend(task, outer[k]) for k, task in enumerate(plan.tasks)])
     nodes = (plan.num_nodes, b, 3)
     for k, (_, end) in enumerate(plan.tasks):
         rows = plan.rows[plan.row_pointers[end - 1] : plan.row_pointers[end]]
         x.reshape(nodes)[rows] += outer[k].reshape(nodes)[rows]
     for run in plan.above:
-        job(_descend, *run, x)()
+        descend(run, x)()
     for run in plan.above[::-1]:
-        job(_ascend, *run)()
-    factor.workers.run([job(_ascend, *task) for task in plan.tasks])
+        ascend(run)()
+    factor.workers.run([ascend(task) for task in plan.tasks])
 
 
 @kernel
 def _descend(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
-    x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any, outer: Any,
+    x: Any, work: Any, outer: Any,
 ) -> None:  # fmt: skip
-    """Solve with the panels of the supernodes begin..end-1; later rows than theirs are kept in `outer`."""
+    """Solve with the panels of the supernodes begin..end-1; later rows than theirs are kept in `outer`.
+
+    The rows below a block of four columns take all four at once. The last block may overlap the one before,
+    whose columns then count 0.
+    """
+    zero, limit = work.dtype.type(0), first[end] * b
     for s in range(begin, end):
-        height = _load_front(b, s, first, row_pointers, rows, x, work, False)
-        width = (first[s + 1] - first[s]) * b
-        _forward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
-        _store_front(b, s, first, x, work)
-        _add_below(b, s, first, row_pointers, rows, first[end], x, outer, work)
+        start, width = first[s] * b, (first[s + 1] - first[s]) * b
+        height = width + (row_pointers[s + 1] - row_pointers[s]) * b
+        offset = panel_pointers[s] * b * b
+        for i in range(width):
+            work[0, i], work[1, i], work[2, i] = x[start + i, 0], x[start + i, 1], x[start + i, 2]
+        work[:, width:height] = zero
+        for j in range(0, width, 4):
+            stop = min(j + 4, width)
+            last = stop if width >= 4 else height
+            for q in range(j, stop):
+                column = offset + q * height
+                for k in range(3):
+                    value = work[k, q] / panels[column + q]
+                    work[k, q] = value
+                    for i in range(q + 1, last):
+                        work[k, i] -= panels[column + i] * value
+            if width < 4:
+                break
+            q, column, below = stop - 4, offset + (stop - 4) * height, height - stop
+            l0 = panels[column + stop : column + height]
+            l1 = panels[column + height + stop : column + 2 * height]
+            l2 = panels[column + 2 * height + stop : column + 3 * height]
+            l3 = panels[column + 3 * height + stop : column + 4 * height]
+            for k in range(3):
+                a0 = work[k, q] if q >= j else zero
+                a1 = work[k, q + 1] if q + 1 >= j else zero
+                a2 = work[k, q + 2] if q + 2 >= j else zero
+                a3 = work[k, q + 3]
+                u = work[k, stop:height]
+                for i in range(below):
+                    u[i] -= l0[i] * a0 + l1[i] * a1 + l2[i] * a2 + l3[i] * a3
+        for i in range(width):
+            x[start + i, 0], x[start + i, 1], x[start + i, 2] = work[0, i], work[1, i], work[2, i]
+        at = width
+        for p in range(row_pointers[s], row_pointers[s + 1]):
+            row = np.int64(rows[p]) * b
+            target = x if row < limit else outer
+            for i in range(row, row + b):
+                target[i, 0] += work[0, at]
+                target[i, 1] += work[1, at]
+                target[i, 2] += work[2, at]
+                at += 1
 
 
 @kernel
 def _ascend(
     begin: int, end: int, b: int, first: Any, row_pointers: Any, rows: Any, panel_pointers: Any, panels: Any,
-    x: Any, work: Any, leaves: Any, sizes: Any, numbers: Any,
+    x: Any, work: Any, sums: Any,
 ) -> None:  # fmt: skip
-    """Solve with the transposed panels of the supernodes end-1..begin."""
+    """Solve with the transposed panels of the supernodes end-1..begin, in the blocks of `_descend`."""
     for s in range(end - 1, begin - 1, -1):
-        height = _load_front(b, s, first, row_pointers, rows, x, work, True)
-        width = (first[s + 1] - first[s]) * b
-        _backward(panels, panel_pointers[s] * b * b, height, width, work, leaves, sizes, numbers)
-        _store_front(b, s, first, x, work)
-
-
-@inner_kernel
-def _load_front(
-    b: int, s: int, first: Any, row_pointers: Any, rows: Any, x: Any, work: Any, with_below: bool
-) -> Any:
-    """Copy the unknowns of a front to `work`, 0 for the rows below if not `with_below`; return its height."""
-    start, width = first[s] * b, (first[s + 1] - first[s]) * b
-    for i in range(width):
-        for k in range(3):
-            work[k, i] = x[start + i, k]
-    at = width
-    for p in range(row_pointers[s], row_pointers[s + 1]):
-        row = np.int64(rows[p]) * b
-        for a in range(b):
-            for k in range(3):
-                work[k, at + a] = x[row + a, k] if with_below else 0.0
-        at += b
-    return at
-
-
-@inner_kernel
-def _store_front(b: int, s: int, first: Any, x: Any, work: Any) -> None:
-    """Copy a front's own unknowns back to `x`."""
-    start, width = first[s] * b, (first[s + 1] - first[s]) * b
-    for i in range(width):
-        for k in range(3):
-            x[start + i, k] = work[k, i]
-
-
-@inner_kernel
-def _add_below(
-    b: int, s: int, first: Any, row_pointers: Any, rows: Any, limit: int, x: Any, outer: Any, work: Any
-) -> None:
-    """Add what a front leaves to the rows below: to `x` if they are before `limit`, else to `outer`."""
-    at = (first[s + 1] - first[s]) * b
-    for p in range(row_pointers[s], row_pointers[s + 1]):
-        row = np.int64(rows[p])
-        target = x if row < limit else outer
-        for a in range(b):
-            for k in range(3):
-                target[row * b + a, k] += work[k, at + a]
-        at += b
-
-
-@inner_kernel
-def _forward(
-    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
-) -> None:
-    """Divide by the square part of a panel and subtract its rows below, four columns at a time."""
-    j = 0
-    while j + 4 <= width:
-        for q in range(j, j + 4):
-            _eliminate(panels[offset + q * height :][:height], q, j + 4, work)
-            for k in range(3):
-                numbers[4 * k + q - j] = work[k, q]
-        _call_leaf(leaves[0], panels, offset, height, j, work, sizes, numbers)
-        j += 4
-    end = width if width >= 4 else height
-    for q in range(j, width):
-        _eliminate(panels[offset + q * height :][:height], q, end, work)
-    if j < width and width >= 4:  # the rows below take the last four columns, those done before times 0
-        for k in range(3):
-            for q in range(width - 4, width):
-                numbers[4 * k + q - width + 4] = work[k, q] if q >= j else 0
-        _call_leaf(leaves[0], panels, offset, height, width - 4, work, sizes, numbers)
-
-
-@inner_kernel
-def _backward(
-    panels: Any, offset: int, height: int, width: int, work: Any, leaves: Any, sizes: Any, numbers: Any
-) -> None:
-    """Solve with the transposed panel for its own unknowns, four columns at a time from the last."""
-    j = width - width % 4
-    end = width if width >= 4 else height
-    if j < width and width >= 4:
-        _call_leaf(leaves[1], panels, offset, height, width - 4, work, sizes, numbers)
-        for k in range(3):
-            for q in range(j, width):
-                work[k, q] -= numbers[4 * k + q - width + 4]
-    for q in range(width - 1, j - 1, -1):
-        _finish(panels[offset + q * height :][:height], q, end, work)
-    while j > 0:
-        j -= 4
-        _call_leaf(leaves[1], panels, offset, height, j, work, sizes, numbers)
-        for q in range(j + 3, j - 1, -1):
-            for k in range(3):
-                work[k, q] -= numbers[4 * k + q - j]
-            _finish(panels[offset + q * height :][:height], q, j + 4, work)
-
-
-@inner_kernel
-def _eliminate(column: Any, q: int, end: int, work: Any) -> None:
-    """Finish unknown q and subtract its column from the rows q+1..end-1."""
-    for k in range(3):
-        work[k, q] /= column[q]
-        for i in range(q + 1, end):
-            work[k, i] -= column[i] * work[k, q]
-
-
-@inner_kernel
-def _finish(column: Any, q: int, end: int, work: Any) -> None:
-    """Subtract the rows q+1..end-1 of column q from unknown q and finish it."""
-    for k in range(3):
-        total = work[k, q]
-        for i in range(q + 1, end):
-            total -= column[i] * work[k, i]
-        work[k, q] = total / column[q]
-
-
-@inner_kernel
-def _call_leaf(
-    leaf: int, panels: Any, offset: int, height: int, j: int, work: Any, sizes: Any, numbers: Any
-) -> None:
-    """Run a leaf on the columns j..j+3 of a panel and the rows from j+4 on."""
-    sizes[0], sizes[1], sizes[2] = height - j - 4, height, work.shape[1]
-    columns = array_address(panels) + (offset + j * height + j + 4) * panels.itemsize
-    vectors = array_address(work) + (j + 4) * work.itemsize
-    call_address(leaf, (array_address(sizes), columns, vectors, array_address(numbers)))
-
-
-def _subtract_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
-    """Leaf: subtract four columns times their coefficients from three vectors."""
-    size = carray(sizes, (3,))
-    count, height, stride = size[0], size[1], size[2]
-    panel = carray(columns, (3 * height + count,))
-    work = carray(vectors, (2 * stride + count,))
-    factor = carray(numbers, (12,))
-    l0, l1 = panel[:count], panel[height : height + count]
-    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
-    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
-    a0, a1, a2, a3 = factor[0], factor[1], factor[2], factor[3]
-    b0, b1, b2, b3 = factor[4], factor[5], factor[6], factor[7]
-    c0, c1, c2, c3 = factor[8], factor[9], factor[10], factor[11]
-    for i in range(count):
-        u[i] -= l0[i] * a0 + l1[i] * a1 + l2[i] * a2 + l3[i] * a3
-        v[i] -= l0[i] * b0 + l1[i] * b1 + l2[i] * b2 + l3[i] * b3
-        w[i] -= l0[i] * c0 + l1[i] * c1 + l2[i] * c2 + l3[i] * c3
-
-
-def _multiply_four(sizes: Any, columns: Any, vectors: Any, numbers: Any) -> None:
-    """Leaf: write the twelve products of four columns with three vectors."""
-    size = carray(sizes, (3,))
-    count, height, stride = size[0], size[1], size[2]
-    panel = carray(columns, (3 * height + count,))
-    work = carray(vectors, (2 * stride + count,))
-    sums = carray(numbers, (12,))
-    l0, l1 = panel[:count], panel[height : height + count]
-    l2, l3 = panel[2 * height : 2 * height + count], panel[3 * height :]
-    u, v, w = work[:count], work[stride : stride + count], work[2 * stride :]
-    u0 = u1 = u2 = u3 = v0 = v1 = v2 = v3 = w0 = w1 = w2 = w3 = sums.dtype.type(0)
-    for i in range(count):
-        u0 += l0[i] * u[i]
-        u1 += l1[i] * u[i]
-        u2 += l2[i] * u[i]
-        u3 += l3[i] * u[i]
-        v0 += l0[i] * v[i]
-        v1 += l1[i] * v[i]
-        v2 += l2[i] * v[i]
-        v3 += l3[i] * v[i]
-        w0 += l0[i] * w[i]
-        w1 += l1[i] * w[i]
-        w2 += l2[i] * w[i]
-        w3 += l3[i] * w[i]
-    sums[0], sums[1], sums[2], sums[3] = u0, u1, u2, u3
-    sums[4], sums[5], sums[6], sums[7] = v0, v1, v2, v3
-    sums[8], sums[9], sums[10], sums[11] = w0, w1, w2, w3
+        start, width = first[s] * b, (first[s + 1] - first[s]) * b
+        height = width + (row_pointers[s + 1] - row_pointers[s]) * b
+        offset = panel_pointers[s] * b * b
+        for i in range(width):
+            work[0, i], work[1, i], work[2, i] = x[start + i, 0], x[start + i, 1], x[start + i, 2]
+        at = width
+        for p in range(row_pointers[s], row_pointers[s + 1]):
+            row = np.int64(rows[p]) * b
+            for i in range(row, row + b):
+                work[0, at], work[1, at], work[2, at] = x[i, 0], x[i, 1], x[i, 2]
+                at += 1
+        for j in range((width - 1) // 4 * 4, -1, -4):
+            stop = min(j + 4, width)
+            last = stop if width >= 4 else height
+            if width >= 4:
+                four = offset + (stop - 4) * height + stop
+                multiply_in_lanes(panels, four, height, work, stop, height - stop, sums)
+                for k in range(3):
+                    for q in range(j, stop):
+                        work[k, q] -= sums[k, q - stop + 4]
+            for q in range(stop - 1, j - 1, -1):
+                column = offset + q * height
+                for k in range(3):
+                    total = work[k, q]
+                    for i in range(q + 1, last):
+                        total -= panels[column + i] * work[k, i]
+                    work[k, q] = total / panels[column + q]
+        for i in range(width):
+            x[start + i, 0], x[start + i, 1], x[start + i, 2] = work[0, i], work[1, i], work[2, i]

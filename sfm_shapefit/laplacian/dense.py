@@ -1,8 +1,9 @@
 """Dense Cholesky steps inside kernels: BLAS and LAPACK through scipy's exported C functions.
 
-All matrices are column-major blocks inside a flat array, tuples (array, offset, leading dimension), and only
-lower triangles are read or written. float32 and float64 share one code: a kernel is handed the `blas_of` its
-type. Addresses are arguments, so the compiled kernels stay cached on disk (`sfm_shapefit.jit`).
+All matrices are column-major blocks, given by address and leading dimension, and only lower triangles are
+read or written. A kernel is handed the `blas_of` the type, float32 or float64, and is compiled once for both.
+Addresses are arguments, so the compiled kernels stay cached on disk (`sfm_shapefit.jit`). The arrays behind
+them must outlive the call.
 
 BLAS with two threads splits, and hence rounds, differently from BLAS with one. `one_blas_thread` holds it to
 one, so that results do not depend on the number of cores.
@@ -18,12 +19,20 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import ThreadpoolController
 
-from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.arrays import IntArray, frozen
 from sfm_shapefit.jit import array_address, call_address, function_address, inner_kernel, kernel
 
-_POTRF, _TRSM, _SYRK, _GEMM, _TRSV = range(5)
+Block = tuple[int, int]
+"""The address of the first entry of a matrix, and its leading dimension."""
 
+_POTRF, _TRSM, _SYRK, _GEMM, _TRSV, _TEXT, _ONE, _MINUS_ONE, _ZERO = range(9)
+
+# Character arguments of the Fortran routines, and numbers, all passed by reference.
 _FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
+_SCALARS: dict[str, npt.NDArray[Any]] = {
+    "s": np.array([1.0, -1.0, 0.0], dtype=np.float32),
+    "d": np.array([1.0, -1.0, 0.0], dtype=np.float64),
+}
 
 # One entry per thread of Python inside `one_blas_thread`; the first holds the limit.
 _limits: list[Any] = []
@@ -52,116 +61,87 @@ def one_blas_thread() -> Iterator[None]:
 
 
 @lru_cache(maxsize=2)
-def _addresses(letter: str) -> tuple[int, ...]:
-    """Return the addresses of xpotrf, xtrsm, xsyrk, xgemm and xtrsv for x = "s" or "d"."""
+def _addresses(letter: str) -> IntArray:
+    """Return addresses: xpotrf, xtrsm, xsyrk, xgemm, xtrsv for x = "s" or "d", and constant arguments."""
     blas, lapack = "scipy.linalg.cython_blas", "scipy.linalg.cython_lapack"
     routines = ((lapack, "potrf"), (blas, "trsm"), (blas, "syrk"), (blas, "gemm"), (blas, "trsv"))
-    return tuple(function_address(module, letter + name) for module, name in routines)
+    called = [function_address(module, letter + name) for module, name in routines]
+    scalars = [_SCALARS[letter][k:].ctypes.data for k in range(3)]
+    return frozen(np.array([*called, _FLAGS.ctypes.data, *scalars], dtype=np.int64))
 
 
 class Blas(NamedTuple):
     """What the kernels below need to call BLAS and LAPACK; one per thread, for the integers are scratch."""
 
-    routines: IntArray
-    """Addresses of the routines for one type, float32 or float64."""
-    flags: npt.NDArray[np.uint8]
-    """Character arguments of the Fortran routines: "L", "R", "T", "N"."""
+    addresses: IntArray
+    """Of the routines for one type, float32 or float64, and of their constant arguments."""
     integers: npt.NDArray[np.int32]
     """(8,) scratch that passes integers by reference."""
-    scalars: npt.NDArray[Any]
-    """1, -1, 0, which are passed by reference as alpha and beta."""
 
 
 def blas_of(dtype: npt.DTypeLike) -> Blas:
     """Return the routines for float32 or float64, with scratch of their own."""
-    addresses = _addresses("s" if np.dtype(dtype) == np.float32 else "d")
-    return Blas(
-        routines=np.array(addresses, dtype=np.int64),
-        flags=_FLAGS,
-        integers=np.zeros(8, dtype=np.int32),
-        scalars=np.array([1.0, -1.0, 0.0], dtype=dtype),
-    )
+    letter = "s" if np.dtype(dtype) == np.float32 else "d"
+    return Blas(addresses=_addresses(letter), integers=np.zeros(8, dtype=np.int32))
 
 
 @kernel
 def potrf(blas: Any, a: Any, order: int) -> int:
     """Factor the block a = L L^T in place; return 0, or k if the leading minor of order k is not positive."""
-    entries, offset, leading = a
-    integers = blas.integers
-    integers[0] = order
-    integers[1] = leading
-    integers[2] = 0
-    text, ints = array_address(blas.flags), array_address(integers)
-    block = array_address(entries) + offset * entries.itemsize
-    call_address(blas.routines[_POTRF], (text, ints, block, ints + 4, ints + 8))
+    at, integers = blas.addresses, blas.integers
+    integers[0], integers[1], integers[2] = order, a[1], 0
+    text, ints = at[_TEXT], array_address(integers)
+    call_address(at[_POTRF], (text, ints, a[0], ints + 4, ints + 8))
     return int(integers[2])
 
 
 @kernel
 def trsm(blas: Any, triangle: Any, below: Any, rows: int, columns: int) -> None:
     """Replace the (rows, columns) block `below` by below @ inv(triangle)^T."""
-    integers = blas.integers
-    integers[0] = rows
-    integers[1] = columns
-    integers[2] = triangle[2]
-    integers[3] = below[2]
-    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
-    triangle_address = array_address(triangle[0]) + triangle[1] * triangle[0].itemsize
-    below_address = array_address(below[0]) + below[1] * below[0].itemsize
+    at, integers = blas.addresses, blas.integers
+    integers[0], integers[1], integers[2], integers[3] = rows, columns, triangle[1], below[1]
+    text, ints = at[_TEXT], array_address(integers)
     pointers = (
         text + 1, text, text + 2, text + 3,
-        ints, ints + 4, one, triangle_address, ints + 8, below_address, ints + 12,
+        ints, ints + 4, at[_ONE], triangle[0], ints + 8, below[0], ints + 12,
     )  # fmt: skip
-    call_address(blas.routines[_TRSM], pointers)
+    call_address(at[_TRSM], pointers)
 
 
-@inner_kernel
+@kernel
 def syrk(blas: Any, a: Any, rows: int, columns: int, c: Any, accumulate: bool) -> None:
     """Subtract a a^T, a of so many rows and columns, from the lower triangle of c, or store -a a^T there."""
-    integers = blas.integers
-    integers[0] = rows
-    integers[1] = columns
-    integers[2] = a[2]
-    integers[3] = c[2]
-    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
-    size = blas.scalars.itemsize
-    beta = one if accumulate else one + 2 * size
-    pointers = (
-        text, text + 3, ints, ints + 4, one + size, array_address(a[0]) + a[1] * size, ints + 8,
-        beta, array_address(c[0]) + c[1] * size, ints + 12,
-    )  # fmt: skip
-    call_address(blas.routines[_SYRK], pointers)
+    at, integers = blas.addresses, blas.integers
+    integers[0], integers[1], integers[2], integers[3] = rows, columns, a[1], c[1]
+    text, ints = at[_TEXT], array_address(integers)
+    beta = at[_ONE] if accumulate else at[_ZERO]
+    pointers = (text, text + 3, ints, ints + 4, at[_MINUS_ONE], a[0], ints + 8, beta, c[0], ints + 12)
+    call_address(at[_SYRK], pointers)
 
 
-@inner_kernel
+@kernel
 def gemm(blas: Any, left: Any, right: Any, shape: Any, c: Any, accumulate: bool) -> None:
     """Subtract left right^T from a block c, or store it negated; shape: (rows, columns, depth)."""
-    integers = blas.integers
-    for k in range(3):
-        integers[k] = shape[k]
-    integers[3], integers[4], integers[5] = left[2], right[2], c[2]
-    text, ints, one = array_address(blas.flags), array_address(integers), array_address(blas.scalars)
-    size = blas.scalars.itemsize
-    beta = one if accumulate else one + 2 * size
+    at, integers = blas.addresses, blas.integers
+    integers[0], integers[1], integers[2] = shape
+    integers[3], integers[4], integers[5] = left[1], right[1], c[1]
+    text, ints = at[_TEXT], array_address(integers)
+    beta = at[_ONE] if accumulate else at[_ZERO]
     pointers = (
-        text + 3, text + 2, ints, ints + 4, ints + 8, one + size,
-        array_address(left[0]) + left[1] * size, ints + 12,
-        array_address(right[0]) + right[1] * size, ints + 16,
-        beta, array_address(c[0]) + c[1] * size, ints + 20,
+        text + 3, text + 2, ints, ints + 4, ints + 8, at[_MINUS_ONE], left[0], ints + 12, right[0], ints + 16,
+        beta, c[0], ints + 20,
     )  # fmt: skip
-    call_address(blas.routines[_GEMM], pointers)
+    call_address(at[_GEMM], pointers)
 
 
 @inner_kernel
-def solve_factored(blas: Any, a: Any, order: int, b: Any) -> None:
-    """Solve L L^T x = b in place for one right-hand side; the array `a` holds L as one block.
+def solve_factored(blas: Any, a: Any, order: int, right: int) -> None:
+    """Solve L L^T x = b in place for one right-hand side, b at the address `right`; the block `a` holds L.
 
     By xtrsv: xpotrs packs L for blocks of right-hand sides, which for one costs more than the solve.
     """
-    integers = blas.integers
-    integers[0] = order
-    integers[1] = 1
-    text, ints = array_address(blas.flags), array_address(integers)
-    matrix, right = array_address(a), array_address(b)
-    call_address(blas.routines[_TRSV], (text, text + 3, text + 3, ints, matrix, ints, right, ints + 4))
-    call_address(blas.routines[_TRSV], (text, text + 2, text + 3, ints, matrix, ints, right, ints + 4))
+    at, integers = blas.addresses, blas.integers
+    integers[0], integers[1], integers[2] = order, a[1], 1
+    text, ints = at[_TEXT], array_address(integers)
+    for transposed in (text + 3, text + 2):
+        call_address(at[_TRSV], (text, transposed, text + 3, ints, a[0], ints + 4, right, ints + 8))

@@ -64,7 +64,7 @@ def adjacency(num_nodes: int, edges: IntArray) -> Adjacency:
         num_nodes: n.
         edges: (m, 2) int64, checked.
     """
-    ends = edges.ravel()
+    ends = frozen(edges.ravel())
     pointers, entries = group_by(ends, num_nodes)
     neighbors = ends[entries ^ 1].astype(np.int32)  # the other end of the same edge
     return Adjacency(frozen(pointers), frozen(neighbors), frozen((entries // 2).astype(np.int32)))

@@ -183,8 +183,9 @@ def plan_factorization(graph: Adjacency, edges: IntArray, tree: EliminationTree)
     offsets, stack_size, arena_size = _stack_plan(parent, below, tasks)
     children = np.argsort(parent, kind="stable")[int(np.sum(parent < 0)) :]
     child_pointers = np.searchsorted(parent[children], np.arange(len(parent) + 1))
+    i, j = inverse[edges.T]
     edge_pointers, index, edge_row, edge_column = _edge_slots(
-        edges, inverse, owner, first, row_pointers, rows
+        np.minimum(i, j), np.maximum(i, j), owner, first, row_pointers, rows
     )
     return SymbolicFactor(
         permutation=frozen(permutation),
@@ -271,14 +272,16 @@ def _column_counts(pointers: Any, neighbors: Any, permutation: Any, inverse: Any
     leaf j and -1 where two branches meet, so that sums over subtrees count every row that passes.
     """
     n = len(permutation)
-    delta = np.ones(n, np.int64)
-    lowest = np.arange(n)  # first descendant
+    delta = np.empty(n, np.int64)
+    lowest = np.empty(n, np.int64)  # first descendant
+    previous = np.empty(n, np.int64)  # latest leaf seen in each row subtree
+    ancestor = np.empty(n, np.int64)
+    for j in range(n):
+        delta[j], lowest[j], previous[j], ancestor[j] = 1, j, -1, j
     for j in range(n):
         if parent[j] >= 0:
             delta[parent[j]] = 0  # not a leaf of the tree, so no leaf of its own row subtree
             lowest[parent[j]] = min(lowest[parent[j]], lowest[j])
-    previous = np.full(n, -1, np.int64)  # latest leaf seen in each row subtree
-    ancestor = np.arange(n)
     for j in range(n):
         if parent[j] >= 0:
             delta[parent[j]] -= 1
@@ -313,7 +316,13 @@ def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray,
     above = np.where(above < 0, -1, label[above])
     limits = np.array([limit for limit, _ in _MERGE_LIMITS], dtype=np.int64)
     shares = np.array([share for _, share in _MERGE_LIMITS])
-    label, tree, width, height = _merge(label, above, width, height, limits, shares, _MERGE_ALWAYS)
+    filled = width * height - width * (width - 1) / 2
+    target = _merge(above, width, height, filled, limits, shares, _MERGE_ALWAYS)
+    chosen = np.flatnonzero(target == np.arange(len(head)))
+    number = np.full(len(head), -1)
+    number[chosen] = np.arange(len(chosen))
+    label, width, height, above = number[target[label]], width[chosen], height[chosen], above[chosen]
+    tree = np.where(above < 0, -1, number[target[above]])
     post = _postorder(tree)
     rank = _inverse(post)
     order = np.argsort(rank[label], kind="stable")
@@ -324,35 +333,30 @@ def _supernodes(parent: IntArray, counts: IntArray) -> tuple[IntArray, IntArray,
 
 
 @kernel
-def _merge(label: Any, above: Any, width: Any, height: Any, limits: Any, shares: Any, always: float) -> Any:
-    """Merge children into parents while few zeros arise.
+def _merge(above: Any, width: Any, height: Any, filled: Any, limits: Any, shares: Any, always: float) -> Any:
+    """Merge children into parents while few zeros arise; return the supernode that each one is part of then.
 
-    Takes and returns the supernode of each column, and parent, columns and rows of each supernode.
+    `width`, `height` and `filled`, the entries that are not zero, grow to those of the merged supernodes.
     """
-    num = len(above)
-    true_entries = width * height - width * (width - 1) / 2
-    target = np.arange(num)
-    for s in range(num):  # children before parents; a parent has already absorbed its earlier children
+    target = np.empty(len(above), np.int64)
+    for s in range(len(above)):  # children before parents; a parent has already absorbed its earlier children
+        target[s] = s
         p = above[s]
         if p < 0:
             continue
         columns, rows = width[s] + width[p], width[s] + height[p]
         entries = columns * rows - columns * (columns - 1) / 2
-        zeros = 1.0 - (true_entries[s] + true_entries[p]) / entries
-        if zeros <= always or np.any((columns <= limits) & (zeros <= shares)):
+        zeros = 1.0 - (filled[s] + filled[p]) / entries
+        merged = zeros <= always
+        for k in range(len(limits)):
+            merged |= columns <= limits[k] and zeros <= shares[k]
+        if merged:
             target[s] = p
             width[p], height[p] = columns, rows
-            true_entries[p] += true_entries[s]
-    for s in range(num - 1, -1, -1):  # follow merges from the roots down
+            filled[p] += filled[s]
+    for s in range(len(above) - 1, -1, -1):  # follow merges from the roots down
         target[s] = target[target[s]]
-    chosen = np.flatnonzero(target == np.arange(num))
-    rank = np.full(num, -1, np.int64)
-    rank[chosen] = np.arange(len(chosen))
-    tree = np.full(len(chosen), -1, np.int64)
-    for k in range(len(chosen)):
-        if above[chosen[k]] >= 0:
-            tree[k] = rank[target[above[chosen[k]]]]
-    return rank[target[label]], tree, width[chosen], height[chosen]
+    return target
 
 
 @kernel
@@ -477,25 +481,25 @@ def _stacked(parent: Any, below: Any, root: int) -> Any:
 
 
 @kernel
-def _edge_slots(edges: Any, inverse: Any, owner: Any, first: Any, row_pointers: Any, rows: Any) -> Any:
+def _edge_slots(earlier: Any, later: Any, owner: Any, first: Any, row_pointers: Any, rows: Any) -> Any:
     """Group the edges by the supernode of their earlier end and find their row and column in its panel."""
-    num, m = len(first) - 1, len(edges)
-    entered = np.empty(m, np.int32)
+    num, m = len(first) - 1, len(earlier)
+    entered, index = np.empty(m, np.int64), np.empty(m, np.int32)
     for e in range(m):
-        entered[e] = owner[min(inverse[edges[e, 0]], inverse[edges[e, 1]])]
+        entered[e] = owner[earlier[e]]
     pointers, items = group_by(entered, num)
-    index = items.astype(np.int32)
+    for k in range(m):
+        index[k] = items[k]
     edge_row = np.empty(m, np.int32)
     edge_column = np.empty(m, np.int32)
-    position = np.empty(len(inverse), np.int64)
+    position = np.empty(len(owner), np.int64)
     for s in range(num):
-        start, width = first[s], first[s + 1] - first[s]
+        start, begin, width = first[s], row_pointers[s], first[s + 1] - first[s]
         for k in range(width):
             position[start + k] = k
-        for k in range(row_pointers[s], row_pointers[s + 1]):
-            position[rows[k]] = width + k - row_pointers[s]
+        for k in range(begin, row_pointers[s + 1]):
+            position[rows[k]] = width + k - begin
         for k in range(pointers[s], pointers[s + 1]):
-            i, j = inverse[edges[index[k], 0]], inverse[edges[index[k], 1]]
-            edge_column[k] = min(i, j) - start
-            edge_row[k] = position[max(i, j)]
+            edge_column[k] = earlier[index[k]] - start
+            edge_row[k] = position[later[index[k]]]
     return pointers, index, edge_row, edge_column

@@ -44,7 +44,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import array_address, kernel
 from sfm_shapefit.laplacian.approximate import Preconditioner, approximate_cholesky, conjugate_gradients
 from sfm_shapefit.laplacian.cholesky import factorize
 from sfm_shapefit.laplacian.dense import blas_of, one_blas_thread, potrf
@@ -530,7 +530,7 @@ def _least_pivot(edges: Any, blocks: Any, diagonal: Any, matrix: Any, blas: Any)
         for k in range(d):
             for q in range(k, d):
                 matrix[(i * d + k) * order + i * d + q] = diagonal[i, k, q]
-    if potrf(blas, (matrix, 0, order), order) != 0:
+    if potrf(blas, (array_address(matrix), order), order) != 0:
         return 0.0
     least = np.inf
     for i in range(n):

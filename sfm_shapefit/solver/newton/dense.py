@@ -6,7 +6,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.jit import inner_kernel, kernel
+from sfm_shapefit.jit import array_address, inner_kernel, kernel
 from sfm_shapefit.laplacian.dense import Blas, blas_of, one_blas_thread, potrf, solve_factored
 from sfm_shapefit.solver.newton.irls_start import approach
 from sfm_shapefit.solver.newton.steps import (
@@ -180,7 +180,7 @@ def _factorize(problem: Any, linearization: Any, factor: Any) -> int:
     while info != 0 and ridge <= last:
         _lift(problem, factor, size, ridge * size)
         _add_edge_blocks(problem, linearization, factor)
-        info = potrf(factor.blas, (factor.matrix, 0, order), order)
+        info = potrf(factor.blas, (array_address(factor.matrix), order), order)
         ridge *= 100.0
     if info == 0:
         _solve(factor, problem.c, linearization.a)
@@ -274,7 +274,7 @@ def _solve(factor: Any, nodes: Any, solution: Any) -> None:
     for i in range(n):
         for k in range(d):
             right[i * d + k] = nodes[i, k]
-    solve_factored(factor.blas, factor.matrix, right.size, right)
+    solve_factored(factor.blas, (array_address(factor.matrix), right.size), right.size, array_address(right))
     for i in range(n):
         for k in range(d):
             solution[i, k] = right[i * d + k]
