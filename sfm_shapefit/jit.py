@@ -29,8 +29,13 @@ import numpy.typing as npt
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils, targetconfig
+from numba.core.ccallback import CFunc
 from numba.core.event import Listener, install_listener
 from numba.extending import get_cython_function_address, intrinsic
+
+from sfm_shapefit.kernel_cache import KernelCache, choose_target
+
+choose_target()
 
 
 def _names_without_zlib(config: Any) -> str:
@@ -62,10 +67,9 @@ def kernel(function: Kernel) -> Kernel:
     """
     if getattr(function, "__closure__", None):
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
-    try:
-        return cast(Kernel, numba.njit(cache=True, **_OPTIONS)(function))
-    except RuntimeError:  # neither the package's folder nor the user's can be written: compile every time
-        return cast(Kernel, numba.njit(**_OPTIONS)(function))
+    dispatcher = numba.njit(**_OPTIONS)(function)
+    dispatcher._cache = KernelCache(function)
+    return cast(Kernel, dispatcher)
 
 
 @contextmanager
@@ -148,8 +152,11 @@ def mix_bits(z: Any) -> Any:
 def _compiled_leaf(function: Callable[..., None], dtype: str, num_arrays: int) -> Any:
     """Compile a leaf for one type, or load it from the disk cache."""
     number = numba.from_dtype(np.dtype(dtype))
-    signature = types.void(types.CPointer(types.int64), *([types.CPointer(number)] * num_arrays))
-    return numba.cfunc(signature, cache=True, error_model="numpy")(function)
+    arguments = (types.CPointer(types.int64), *([types.CPointer(number)] * num_arrays))
+    leaf: Any = CFunc(function, (arguments, types.void), {}, {"error_model": "numpy"})
+    leaf._cache = KernelCache(function)
+    leaf.compile()
+    return leaf
 
 
 def leaf_address(function: Callable[..., None], dtype: npt.DTypeLike, num_arrays: int) -> int:
