@@ -1,5 +1,7 @@
 """Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
 
+import json
+
 import llvmlite.binding as llvm
 import pytest
 from numba.core import config
@@ -8,6 +10,7 @@ from sfm_shapefit import kernel_cache
 from sfm_shapefit.jit import kernel
 from sfm_shapefit.kernel_cache import hear_of_kernels, is_noted, note, on_miss, stamp_of
 from tests.program import run_python
+from tests.scenes import RING, fingerprint
 
 
 def double(x):
@@ -138,6 +141,8 @@ def test_a_note_holds_for_its_sources_only(folder, monkeypatch):
     assert not is_noted("an example", own)
 
 
+TIMED = {"timings_s"}
+"""Facts that are of a run."""
 IMPORT = "import sfm_shapefit.jit; from numba.core import config; print(config.CPU_NAME)"
 COMPILE_BEFORE = "import numba; numba.njit(lambda x: x)(1)\n"
 
@@ -172,3 +177,23 @@ def test_the_portable_target_is_the_least_of_its_kind(monkeypatch, machine, syst
     monkeypatch.setattr(kernel_cache.sys, "platform", system)
     monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: features)
     assert kernel_cache._portable_target() == expected
+
+
+@pytest.mark.slow
+def test_two_processors_give_the_same_bits(tmp_path):
+    """The one at hand and the portable one; what a library chooses by processor is the same on one machine."""
+    outs = {}
+    for name, environment in {
+        "portable": {},
+        "host": {"NUMBA_CPU_NAME": "host", "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+    }.items():
+        words = ("locate", RING / "sparse" / "0", tmp_path / name, "-q")
+        done = run_python("-m", "sfm_shapefit", *words, **environment)
+        assert done.returncode == 0, done.stderr[-500:]
+        outs[name] = {file: digest for file, digest in fingerprint(tmp_path / name).items() if "bin" in file}
+        tables = ("cameras.csv", "pairs.csv")
+        outs[name] |= {table: (tmp_path / name / table).read_bytes() for table in tables}
+        facts = json.loads((tmp_path / name / "locate.json").read_text(encoding="utf-8"))
+        outs[name]["facts"] = {key: value for key, value in facts.items() if key not in TIMED}
+    assert outs["host"] == outs["portable"]
+    assert len(outs["host"]) == 8

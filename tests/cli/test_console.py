@@ -92,7 +92,7 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed():
             break
     os.close(master)
     assert process.wait() == 0
-    assert re.findall(rb"(\d+)/(\d+)", shown)[-1] == (b"7", b"7")
+    assert re.findall(rb"(\d+) of (\d+)", shown)[-1] == (b"7", b"7")
 
 
 def test_nothing_is_shown_where_there_is_no_terminal(capfd):
