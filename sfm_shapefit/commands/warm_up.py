@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
+from typing import Any
 
 from sfm_shapefit.errors import ShapeFitError
 from sfm_shapefit.kernel_cache import PACKAGE, hear_of_kernels, here, is_noted, made_for, note, on_miss
@@ -109,7 +110,9 @@ def compile_together(tell: Tell, say: Callable[[str], None]) -> Iterator[None]:
             say(f"this installation brings kernels for {made_for()}; for {here()} they are compiled once")
         missing = not_done(NEEDED)
         if missing and num_cores() > 1:
-            warm_up(missing, tell)
+            # Where no process can be started, as where memory is short, all is compiled here.
+            with suppress(OSError, MemoryError):
+                warm_up(missing, tell)
 
     with on_miss(act):
         yield
@@ -139,7 +142,7 @@ def _kernels(only_needed: bool) -> set[str]:
 def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpError]:
     """Run examples in processes; yield the names of kernels, and errors."""
     context, waiting = get_context("spawn"), list(examples)
-    workers = {}
+    workers, at_work = {}, dict[Any, str]()
     try:
         for _ in range(num_processes):
             ours, theirs = context.Pipe()
@@ -152,12 +155,17 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
                 assert isinstance(connection, Connection)
                 try:
                     heard = connection.recv()
-                    if heard is None:  # it has nothing to do
-                        connection.send(waiting.pop(0) if waiting else None)
-                    else:
+                    if heard is not None:
                         yield heard
+                        continue
+                    at_work[connection] = waiting.pop(0) if waiting else ""
+                    connection.send(at_work[connection])
                 except (EOFError, OSError):  # it ended, or died
                     workers.pop(connection).join()
+                    if at_work.get(connection):
+                        yield WarmUpError(f"{at_work[connection]}: its process died")
+        if waiting:
+            yield WarmUpError(f"{', '.join(waiting)}: no process is left to run it")
     finally:
         for process in workers.values():
             process.kill()
@@ -170,7 +178,7 @@ def _work(connection: Connection) -> None:
     # A parent that died needs no answer.
     with hear_of_kernels(connection.send), suppress(BrokenPipeError, EOFError):
         connection.send(None)
-        while (name := connection.recv()) is not None:
+        while name := connection.recv():
             try:
                 _run_example(name)
             except Exception as error:  # whatever it is, the others are worth running

@@ -1,6 +1,7 @@
 """`warm-up`: everything is compiled beforehand, by several processes, and nothing afterwards."""
 
 import inspect as python_inspect
+import os
 
 import pytest
 
@@ -32,6 +33,25 @@ def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
     assert 3 <= ready[-1] < totals[0] == len(module._kernels(only_needed=False))
     assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "commands")
     assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "commands")
+
+
+def test_processes_that_die_are_told_of(monkeypatch):
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    monkeypatch.setattr(module, "_work", os.abort)  # which takes no argument, so that they end at once
+    done = warm_up(["find_pieces", "place_graph"])
+    assert done == WarmUp(0, ("find_pieces, place_graph: no process is left to run it",))
+
+
+def test_where_no_process_can_be_started_a_command_compiles_alone(monkeypatch):
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    monkeypatch.setattr(module, "not_done", list)
+    monkeypatch.setattr(module, "get_context", no_process)
+    with compile_together(print, print):
+        miss()
+
+
+def no_process(_how):
+    raise OSError("no more processes")
 
 
 @pytest.fixture
