@@ -28,12 +28,17 @@ Tell = Callable[[int, int], None]
 NEEDED = (
     "solve_dense",
     "start_by_lud",
+    "judge_placement",
+    "refine_in_angles",
     "measure_pairs",
     "find_pieces",
     "place_graph",
     "locate_model",
 )
-"""Examples of what `locate`, `map`, `place` and `inspect` do in most runs."""
+"""Examples of what `locate`, `map`, `place` and `inspect` do in most runs.
+
+Parts come first, so that no two processes compile the same kernels, then the whole.
+"""
 FURTHER = (
     "solve_sparse",
     "solve_by_splitting",

@@ -17,6 +17,8 @@ from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.placement.place import place
+from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rigidity.pieces import parallel_rigid_pieces
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
@@ -52,6 +54,21 @@ def solve_dense(_folder: Path) -> None:
 def start_by_lud(_folder: Path) -> None:
     """Solve LUD, as the second start of a placement."""
     solve_lud(_random_graph(), certified=False)
+
+
+def judge_placement(_folder: Path) -> None:
+    """Judge the answer of a baseline, which takes no solver of ours."""
+    place(_random_graph(), objective="least-squares")
+
+
+def refine_in_angles(_folder: Path) -> None:
+    """Refine exact locations in the angles of noisy directions."""
+    problem = synthetic.random_graph_problem(20, 0.6, sigma=0.02, q=0.1, seed=1)
+    graph = problem.view_graph
+    plan = plan_refinement(graph)
+    assert plan is not None
+    assert not isinstance(plan, IterativeNormal)
+    refine_angles(graph, problem.locations, Metric(None, np.zeros(graph.num_edges, dtype=np.int64)), plan)
 
 
 def measure_pairs(folder: Path) -> None:
