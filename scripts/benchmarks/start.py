@@ -25,7 +25,7 @@ COMMANDS = {
     "map": "map data_synthetic/ring8/database.db {out}/mapped --overwrite --quiet",
     "place": "place data_synthetic/graph40.txt {out}/placed --overwrite --quiet",
     "inspect": "inspect data_synthetic/courtyard/sparse/0 --json",
-    "evaluate": "evaluate data_synthetic/courtyard/sparse/0 data_synthetic/courtyard/truth --json",
+    "evaluate": "evaluate data_synthetic/courtyard/truth data_synthetic/courtyard/truth --json",
 }
 WARM_UP = "warm-up"
 COLD_LOCATE_S = 20.0

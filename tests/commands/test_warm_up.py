@@ -2,6 +2,7 @@
 
 import inspect as python_inspect
 import os
+import re
 
 import pytest
 
@@ -10,6 +11,7 @@ from sfm_shapefit.commands import warm_up as module
 from sfm_shapefit.commands.stages import examples
 from sfm_shapefit.commands.warm_up import FURTHER, NEEDED, WarmUp, compile_together, warm_up
 from tests.program import run, run_python
+from tests.scenes import COURTYARD
 from tests.test_jit import RUN_COMMANDS
 
 
@@ -114,9 +116,15 @@ def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):
 
 
 @pytest.mark.slow
-def test_after_a_warm_up_no_command_compiles_anything(tmp_path):
+def test_a_cold_command_shares_its_compiling_and_after_a_warm_up_none_compiles(tmp_path):
     """From an empty cache, so it takes as long as all the compiling does."""
     cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    words = ("locate", COURTYARD / "sparse" / "0", tmp_path / "cold", "--verbose")
+    cold = run_python("-m", "sfm_shapefit", *words, **cache)
+    assert cold.returncode == 0, cold.stderr[-500:]
+    if module.num_cores() > 1:
+        assert re.search(r"compiling (\d+) of \1$", cold.stderr, flags=re.MULTILINE)
+        assert "compiling kernels" not in cold.stderr  # by the command itself
     done = run_python("-m", "sfm_shapefit", "warm-up", **cache)
     assert done.returncode == 0, done.stderr[-500:]
     files = sorted(path for path in (tmp_path / "cache").rglob("*") if path.is_file())
