@@ -156,16 +156,12 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
     from sfm_shapefit.commands.warm_up import compile_together
     from sfm_shapefit.jit import on_compilation
 
-    if not enabled:
-        with compile_together(_say_nothing, _say_nothing):
-            yield None
-        return
     if verbose:
         with on_compilation(lambda: _say(_COMPILING)), compile_together(say_now_and_then(), _say):
             yield _say_stage
         return
-    if not sys.stderr.isatty():
-        with compile_together(_say_nothing, _say):
+    if not (enabled and sys.stderr.isatty()):
+        with compile_together(_say_nothing, _say if enabled else _say_nothing):
             yield None
         return
     from rich.console import Console
@@ -201,12 +197,12 @@ def _say_nothing(*_what: Any) -> None:
 
 def say_now_and_then() -> "Tell":
     """Return what says on stderr how many kernels are compiled, every few seconds."""
-    said_at = time.monotonic()
+    said, said_at = 0, time.monotonic()
 
     def tell(done: int, total: int) -> None:
-        nonlocal said_at
-        if time.monotonic() - said_at > _SAID_EVERY_S or done == total:
-            said_at = time.monotonic()
+        nonlocal said, said_at
+        if done > said and (time.monotonic() - said_at > _SAID_EVERY_S or done == total):
+            said, said_at = done, time.monotonic()
             _say(f"compiling {done} of {total}")
 
     return tell
