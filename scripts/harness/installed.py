@@ -30,7 +30,7 @@ class Installed:
         own = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA", "PYTHON"))}
         home = self.folder / "home"
         return subprocess.run(
-            [str(self.folder / "bin" / "python"), *map(str, arguments)],
+            [str(self.folder / "bin" / "python"), "-P", *map(str, arguments)],  # not the package that is here
             env=own | {"HOME": str(home), "XDG_CACHE_HOME": str(home / "cache")},
             cwd=ROOT,
             capture_output=True,

@@ -33,6 +33,8 @@ def test_with_the_wheel_no_command_compiles_and_nothing_is_written(tmp_path):
     assert (installed.site / "sfm_shapefit/_kernels/made_for.txt").read_text().strip() == here()
     for path in [installed.site, *installed.site.rglob("*")]:
         path.chmod(path.stat().st_mode & ~0o222)  # which does not stop root: what is there is compared, too
+    done = installed.run("-c", "import sfm_shapefit; print(sfm_shapefit.__file__)")
+    assert done.stdout.startswith(str(installed.site))
     before = fingerprint(installed.folder)
     try:
         for command in COMMANDS:
