@@ -30,6 +30,10 @@ from numba.core import cgutils, targetconfig
 from numba.core.event import Listener, install_listener
 from numba.extending import get_cython_function_address, intrinsic, register_jitable
 
+from sfm_shapefit.kernel_cache import KernelCache, choose_target
+
+choose_target()
+
 
 def _names_without_zlib(config: Any) -> str:
     """Return a string of a compiler configuration for the names of symbols, as its own method does."""
@@ -60,10 +64,9 @@ def kernel(function: Kernel) -> Kernel:
     """
     if getattr(function, "__closure__", None):
         raise TypeError(f"kernel {function.__name__} closes over a value; pass it as an argument")
-    try:
-        return cast(Kernel, numba.njit(cache=True, **_OPTIONS)(function))
-    except RuntimeError:  # neither the package's folder nor the user's can be written: compile every time
-        return cast(Kernel, numba.njit(**_OPTIONS)(function))
+    dispatcher = numba.njit(**_OPTIONS)(function)
+    dispatcher._cache = KernelCache(function)
+    return cast(Kernel, dispatcher)
 
 
 def inner_kernel(function: Kernel) -> Kernel:

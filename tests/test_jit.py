@@ -1,4 +1,4 @@
-"""The door to numba: kernels compile with or without a place to cache them."""
+"""The door to numba: what is compiled, and what is found on disk."""
 
 import ast
 
@@ -97,6 +97,13 @@ with events.install_listener("numba:compile", Names()):
         "inspect data_synthetic/courtyard/sparse/0",
         f"solve data_synthetic/graph40.txt {target}/solved -q",
         f"solve data_synthetic/graph40.txt {target}/split --method admm -q",
+        f"map data_synthetic/ring8/database.db {target}/mapped -q",
+        f"locate data_synthetic/ring8/sparse/0 {target}/fixed --fix solved -q",
+        f"report {target}/located --scene",
+        f"convert {target}/located {target}/transforms.json -q",
+        f"synth {target}/drive --shape drive --num-images 6 --num-points 300",
+        "inspect data_synthetic/ring8/sparse/0 --theory",
+        f"place data_synthetic/graph40.txt {target}/linf --objective least-squares --filter 1dsfm -q",
     ):
         app(command.split(), standalone_mode=False)
 print("compiled:", *compiled, file=sys.stderr)

@@ -18,5 +18,6 @@ INDEX = {
     "rigs": "Metric scale and errors of a drive of two rigs, beside pycolmap's global mapping.",
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
+    "start": "The first run of each command in a fresh environment, as a clone and from the wheel.",
     "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
 }

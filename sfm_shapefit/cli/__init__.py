@@ -4,7 +4,19 @@ A module per command, under its name. Flags are the fields of the settings class
 progress and messages to stderr.
 """
 
-from sfm_shapefit.cli import convert, evaluate, inspect, locate, map, place, report, synth  # noqa: A004
+from sfm_shapefit.cli import convert, evaluate, inspect, locate, map, place, report, synth, warm_up  # noqa: A004
 from sfm_shapefit.cli.app import app, main
 
-__all__ = ["app", "convert", "evaluate", "inspect", "locate", "main", "map", "place", "report", "synth"]
+__all__ = [
+    "app",
+    "convert",
+    "evaluate",
+    "inspect",
+    "locate",
+    "main",
+    "map",
+    "place",
+    "report",
+    "synth",
+    "warm_up",
+]

@@ -14,22 +14,35 @@ from sfm_shapefit.cli.console import (
     repeat_lost_interrupts,
 )
 
-_ORDER = ("locate", "map", "place", "inspect", "evaluate", "report", "view", "convert", "synth")
-"""Of the commands in the help, by importance."""
+_GROUPS = {
+    "Place cameras": ("locate", "map", "place"),
+    "Look at models and results": ("inspect", "evaluate", "report", "view"),
+    "Make and convert": ("convert", "synth"),
+    "Set up": ("warm-up",),
+}
+"""The commands in the help, the most used first."""
 
 
 class _ByImportance(TyperGroup):
-    """Commands in the order of their importance, not of the alphabet."""
+    """Commands in groups and in the order of their importance, not of the alphabet."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        known = [name for name in _ORDER if name in self.commands]
-        return known + [name for name in super().list_commands(ctx) if name not in _ORDER]
+        """Return all names, those of the groups first."""
+        known = [name for names in _GROUPS.values() for name in names if name in self.commands]
+        return known + [name for name in super().list_commands(ctx) if name not in known]
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write a section for each group."""
+        known = self.list_commands(ctx)
+        for title, names in _GROUPS.items():
+            shown = [(name, self.commands[name].get_short_help_str(100)) for name in names if name in known]
+            with formatter.section(title):
+                formatter.write_dl(shown)
 
 
 app = typer.Typer(
     cls=_ByImportance,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # its columns break long sentences into one word a line
     context_settings={"help_option_names": ["-h", "--help"]},

@@ -7,6 +7,7 @@ The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view gra
 import os
 import signal
 import sys
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,7 @@ from sfm_shapefit.errors import ShapeFitError, UnsolvableError
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.stages.clock import Progress
+    from sfm_shapefit.commands.warm_up import Tell
 
 Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
@@ -34,8 +36,10 @@ _THREAD_BYTES = 50_000_000
 _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "Cannot allocate memory")
 """How Python, C++ and the dynamic linker say that there is no memory."""
 
-_COMPILING = "compiling kernels, which takes about a minute once; they are kept on disk"
+_COMPILING = "compiling kernels, once; they are kept on disk"
 
+# Where there is no terminal, so often.
+_SAID_EVERY_S = 2.0
 # An interrupt that was lost comes again after this time; native code has returned by then.
 _AGAIN_S = 0.02
 
@@ -149,22 +153,23 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
     Bars are written to a copy of stderr, which nobody silences. They do not go with the messages that
     pycolmap writes between them, so there are none if those are wanted.
     """
-    if verbose:
-        from sfm_shapefit.jit import on_compilation
+    from sfm_shapefit.commands.warm_up import compile_together
+    from sfm_shapefit.jit import on_compilation
 
-        with on_compilation(lambda: _say(_COMPILING)):
+    if verbose:
+        with on_compilation(lambda: _say(_COMPILING)), compile_together(say_now_and_then(), _say):
             yield _say_stage
         return
     if not (enabled and sys.stderr.isatty()):
-        yield None
+        with compile_together(_say_nothing, _say if enabled else _say_nothing):
+            yield None
         return
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeElapsedColumn
     from rich.progress import Progress as Display
 
-    from sfm_shapefit.jit import on_compilation
-
-    columns = (TextColumn("{task.description:<20}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    done_of_all = MofNCompleteColumn(separator=" of ")
+    columns = (TextColumn("{task.description:<20}"), BarColumn(), done_of_all, TimeElapsedColumn())
     with (
         os.fdopen(os.dup(2), "w") as stream,
         Display(*columns, console=Console(file=stream, force_terminal=True)) as display,
@@ -182,7 +187,25 @@ def show_progress(enabled: bool, verbose: bool = False) -> "Iterator[Progress | 
                 # The stage is over, perhaps sooner than its limit.
                 display.update(tasks[stage], total=shown.completed)
 
-        yield advance
+        with compile_together(lambda done, total: advance("compiling", done, total), display.console.print):
+            yield advance
+
+
+def _say_nothing(*_what: Any) -> None:
+    """Tell nobody."""
+
+
+def say_now_and_then() -> "Tell":
+    """Return what says on stderr how many kernels are compiled, every few seconds."""
+    said, said_at = 0, time.monotonic()
+
+    def tell(done: int, total: int) -> None:
+        nonlocal said, said_at
+        if done > said and (time.monotonic() - said_at > _SAID_EVERY_S or done == total):
+            said, said_at = done, time.monotonic()
+            _say(f"compiling {done} of {total}")
+
+    return tell
 
 
 def _say_stage(stage: str, done: int, total: int) -> None:

@@ -7,12 +7,17 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import print_table, report_errors
-from sfm_shapefit.cli.flags import InputPath, ModelArgument, OutputPath, Quiet, one_path
+from sfm_shapefit.cli.flags import GroupedCommand, InputPath, ModelArgument, OutputPath, Quiet, one_path
 
 _FORMATS = ("colmap", "colmap-txt", "nerf", "tum", "csv")
 
 
-@app.command("convert", short_help="Write a model in another format.")
+@app.command(
+    "convert",
+    cls=GroupedCommand,
+    short_help="Write a model in another format.",
+    epilog="Example: sfm-shapefit convert out transforms.json",
+)
 def convert_command(
     model: ModelArgument = None,
     out: Annotated[Path | None, typer.Argument(metavar="OUT", help="File or folder to be made.")] = None,

@@ -7,14 +7,19 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, print_json, print_table, report_errors, shorten
-from sfm_shapefit.cli.flags import InputPath, Json, ModelArgument, one_path
+from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.errors import InputError
 
 if TYPE_CHECKING:
     from sfm_shapefit.evaluation import Evaluation
 
 
-@app.command("evaluate", short_help="Compare a model's poses with those of a reference.")
+@app.command(
+    "evaluate",
+    cls=GroupedCommand,
+    short_help="Compare a model's poses with those of a reference.",
+    epilog="Example: sfm-shapefit evaluate out truth --csv errors.csv",
+)
 def evaluate_command(
     model: ModelArgument = None,
     reference: Annotated[

@@ -61,6 +61,11 @@ class OutputFlags(Settings):
 class GroupedCommand(TyperCommand):
     """A command whose help lists its options by the group that they belong to."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the words of the usage line: arguments are needed, though COLMAP's flags may give them."""
+        pieces = super().collect_usage_pieces(ctx)
+        return [piece if piece == self.options_metavar else piece.strip("[]") for piece in pieces]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write arguments first, then the command's own options, then each group under its title."""
         groups: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
@@ -68,6 +73,7 @@ class GroupedCommand(TyperCommand):
             record = parameter.get_help_record(ctx)
             own = "Arguments" if parameter.param_type_name == "argument" else "Options"
             if record is not None:
+                record = (record[0].strip("[]"), record[1]) if own == "Arguments" else record
                 title = getattr(parameter, "rich_help_panel", None) or own
                 groups.setdefault(title, []).append(record)
         for title, records in groups.items():

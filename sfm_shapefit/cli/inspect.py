@@ -39,7 +39,10 @@ _INSPECTED = (
 
 
 @app.command(
-    "inspect", cls=GroupedCommand, short_help="Diagnose a model and say what locate would do; write nothing."
+    "inspect",
+    cls=GroupedCommand,
+    short_help="Diagnose a model and say what locate would do; write nothing.",
+    epilog="Example: sfm-shapefit inspect sparse/0",
 )
 @takes(LocateOptions, only=_INSPECTED)
 def inspect_command(

@@ -33,7 +33,10 @@ if TYPE_CHECKING:
 
 
 @app.command(
-    "locate", cls=GroupedCommand, short_help="Place the cameras of a model from its rotations and matches."
+    "locate",
+    cls=GroupedCommand,
+    short_help="Place the cameras of a model from its rotations and matches.",
+    epilog="Example: sfm-shapefit locate sparse/0 out",
 )
 @takes(LocateOptions, OutputFlags)
 def locate_command(

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
 
 
 @app.command(
-    "map", cls=GroupedCommand, short_help="From the matches of a database alone: rotations, then locate."
+    "map",
+    cls=GroupedCommand,
+    short_help="From the matches of a database alone: rotations, then locate.",
+    epilog="Example: sfm-shapefit map database.db out --bundle-adjust",
 )
 @takes(MapOptions, OutputFlags)
 def map_command(

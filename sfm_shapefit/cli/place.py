@@ -16,9 +16,12 @@ if TYPE_CHECKING:
     from sfm_shapefit.results.result import GraphResult
 
 
-@app.command("solve", cls=GroupedCommand, hidden=True)
+@app.command("solve", cls=GroupedCommand, hidden=True, epilog="Example: sfm-shapefit place graph.txt out")
 @app.command(
-    "place", cls=GroupedCommand, short_help="Place the nodes of a bare view graph, or of relative poses."
+    "place",
+    cls=GroupedCommand,
+    short_help="Place the nodes of a bare view graph, or of relative poses.",
+    epilog="Example: sfm-shapefit place graph.txt out",
 )
 @takes(PlacementOptions, OutputFlags)
 def place_command(

@@ -8,12 +8,17 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import report_errors
-from sfm_shapefit.cli.flags import Scene, one_path
+from sfm_shapefit.cli.flags import GroupedCommand, Scene, one_path
 
 Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
 
 
-@app.command("report", short_help="Make report.html again from the other files of OUT.")
+@app.command(
+    "report",
+    cls=GroupedCommand,
+    short_help="Make report.html again from the other files of OUT.",
+    epilog="Example: sfm-shapefit report out --scene",
+)
 def report_command(out: Output = None, *, scene: Scene = False) -> None:
     """Write OUT/report.html anew from the other files of OUT."""
     folder = one_path(out, None, "OUT")
@@ -33,7 +38,12 @@ def report_command(out: Output = None, *, scene: Scene = False) -> None:
             raise InputError(f"{what}; copy it elsewhere first") from error
 
 
-@app.command("view", short_help="Explore OUT in the browser.")
+@app.command(
+    "view",
+    cls=GroupedCommand,
+    short_help="Explore OUT in the browser.",
+    epilog="Example: sfm-shapefit view out --port 8090",
+)
 def view_command(
     out: Output = None,
     *,

@@ -16,7 +16,12 @@ Images = Annotated[
 ]
 
 
-@app.command("synth", cls=GroupedCommand, short_help="Make a synthetic workspace with known truth.")
+@app.command(
+    "synth",
+    cls=GroupedCommand,
+    short_help="Make a synthetic workspace with known truth.",
+    epilog="Example: sfm-shapefit synth ring --shape ring --num-images 50",
+)
 @takes(SceneOptions, WorkspaceOptions, RenderOptions)
 def synth_command(
     out: OutArgument = None, *, output_path: OutputPath = None, images: Images = False, **given: Any

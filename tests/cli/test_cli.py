@@ -9,9 +9,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
 
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
+from sfm_shapefit.cli import app
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
@@ -63,6 +66,35 @@ def test_version_and_help_are_there_and_earlier_names_are_taken_and_stand_in_no_
     assert "..." not in listed.partition("\n")[2]  # each command's line is whole
     assert "solve" not in listed
     assert run("view", "-h").stdout.startswith("Usage:")
+
+
+def test_help_lists_commands_in_groups_the_most_used_first():
+    text = run("-h").stdout
+    titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
+    assert titles[1:] == ["Place cameras:", "Look at models and results:", "Make and convert:", "Set up:"]
+    listed = re.findall(r"^  ([a-z][\w-]*)  ", text.partition("Place cameras:")[2], flags=re.MULTILINE)
+    assert listed[:3] == ["locate", "map", "place"]
+    assert set(listed) == {name for name, command in get_command(app).commands.items() if not command.hidden}
+    for name in listed:
+        last = run(name, "-h").stdout.splitlines()[-1]
+        assert last.startswith(("  Example: sfm-shapefit ", "  In a Dockerfile: "))
+
+
+def test_the_usage_line_shows_what_is_needed():
+    assert run("locate", "-h").stdout.splitlines()[0].endswith(" locate [OPTIONS] MODEL OUT")
+    assert re.search(r"^  MODEL ", run("evaluate", "-h").stdout, flags=re.MULTILINE)
+    assert run("warm-up", "-h").stdout.splitlines()[0].endswith(" warm-up [OPTIONS]")
+
+
+def test_the_shell_can_complete_commands_and_python_can_run_them():
+    asked = {"_SFM_SHAPEFIT_COMPLETE": "complete_bash", "COMP_WORDS": "sfm-shapefit lo", "COMP_CWORD": "1"}
+    done = CliRunner().invoke(app, [], prog_name="sfm-shapefit", env=asked)
+    assert done.stdout == "locate\n"
+    assert "--install-completion" in run("-h").stdout
+    assert run_python("-m", "sfm_shapefit", "--version").stdout == run("--version").stdout
+
+
+def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
     flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)
     options = json.loads(done.stdout)["options"]

@@ -83,7 +83,7 @@ def test_bars_on_a_terminal_end_full_even_if_fewer_steps_were_needed_and_elsewhe
             break
     os.close(master)
     assert process.wait() == 0
-    assert re.findall(rb"(\d+)/(\d+)", shown)[-1] == (b"7", b"7")
+    assert re.findall(rb"(\d+) of (\d+)", shown)[-1] == (b"7", b"7")
     with show_progress(enabled=True) as progress:
         assert progress is None
     assert capfd.readouterr().err == ""

@@ -1,0 +1,135 @@
+"""`warm-up`: everything is compiled beforehand, by several processes, and nothing afterwards."""
+
+import inspect as python_inspect
+import os
+import re
+
+import pytest
+
+from sfm_shapefit import kernel_cache
+from sfm_shapefit.commands import warm_up as module
+from sfm_shapefit.commands.stages import examples
+from sfm_shapefit.commands.warm_up import FURTHER, NEEDED, WarmUp, compile_together, warm_up
+from tests.program import run, run_python
+from tests.scenes import COURTYARD
+from tests.test_jit import RUN_COMMANDS
+
+
+def test_every_example_is_run():
+    defined = [
+        name
+        for name, value in vars(examples).items()
+        if python_inspect.isfunction(value) and value.__module__ == examples.__name__ and name[0] != "_"
+    ]
+    assert sorted(defined) == sorted(NEEDED + FURTHER)
+
+
+def test_an_example_tells_of_its_kernels_and_one_that_fails_says_why():
+    told = []
+    done = warm_up(["find_pieces", "no_such_example"], lambda ready, total: told.append((ready, total)))
+    assert done.num_kernels >= 3
+    (sentence,) = done.failures
+    assert sentence.startswith("no_such_example: AttributeError: ")
+    ready, totals = zip(*told, strict=True)
+    assert list(ready) == sorted(ready)
+    assert 3 <= ready[-1] < totals[0] == len(module._kernels(only_needed=False))
+    assert kernel_cache.is_noted("find_pieces", kernel_cache.PACKAGE / "commands")
+    assert not kernel_cache.is_noted("no_such_example", kernel_cache.PACKAGE / "commands")
+
+
+def test_processes_that_die_are_told_of(monkeypatch):
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    monkeypatch.setattr(module, "_work", os.abort)  # which takes no argument, so that they end at once
+    done = warm_up(["find_pieces", "place_graph"])
+    assert done == WarmUp(0, ("find_pieces, place_graph: no process is left to run it",))
+
+
+def test_where_no_process_can_be_started_a_command_compiles_alone(monkeypatch):
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    monkeypatch.setattr(module, "not_done", list)
+    monkeypatch.setattr(module, "get_context", no_process)
+    with compile_together(print, print):
+        miss()
+
+
+def no_process(_how):
+    raise OSError("no more processes")
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """Warm-ups that a command asks for; none is done."""
+    calls = []
+    monkeypatch.setattr(module, "warm_up", lambda names, _tell: calls.append(list(names)))
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    return calls
+
+
+def miss():
+    """Miss a kernel, as a cache does."""
+    for act in list(kernel_cache._missed):
+        act()
+
+
+def test_a_miss_asks_for_the_examples_that_never_ran(asked, monkeypatch):
+    monkeypatch.setattr(module, "is_noted", lambda name, _folder: name != "solve_dense")
+    with compile_together(print, print):
+        miss()
+    assert asked == [["solve_dense"]]
+    monkeypatch.setattr(module, "num_cores", lambda: 1)
+    with compile_together(print, print):
+        miss()
+    monkeypatch.setattr(module, "is_noted", lambda _name, _folder: True)
+    monkeypatch.setattr(module, "num_cores", lambda: 2)
+    with compile_together(print, print):
+        miss()
+    miss()  # outside of any block
+    assert len(asked) == 1
+
+
+def test_a_wheel_for_another_numba_is_told_of(asked, monkeypatch):
+    monkeypatch.setattr(module, "made_for", lambda: "py311-numba0.61 on x86-64-v3")
+    monkeypatch.setattr(module, "is_noted", lambda _name, _folder: True)
+    said = []
+    with compile_together(print, said.append):
+        miss()
+    (sentence,) = said
+    assert "py311-numba0.61 on x86-64-v3" in sentence
+    assert kernel_cache.here() in sentence
+    monkeypatch.setattr(module, "made_for", kernel_cache.here)
+    with compile_together(print, said.append):
+        miss()
+    assert len(said) == 1
+
+
+def test_the_command_says_what_is_ready_or_what_failed(monkeypatch):
+    outcome = [WarmUp(7, ())]
+    monkeypatch.setattr(module, "warm_up", lambda _names, tell: (tell and tell(7, 7)) or outcome[0])
+    done = run("warm-up", code=0)
+    assert "7 ready on disk" in done.stdout
+    assert done.stderr == "sfm-shapefit: compiling 7 of 7\n"
+    assert run("warm-up", "-q", code=0).output == ""
+    outcome[0] = WarmUp(0, ())
+    assert "since before" in run("warm-up", code=0).stdout
+    outcome[0] = WarmUp(6, ("an example: an error",))
+    assert run("warm-up", code=3).stderr.endswith("sfm-shapefit: an example: an error\n")
+
+
+@pytest.mark.slow
+def test_a_cold_command_shares_its_compiling_and_after_a_warm_up_none_compiles(tmp_path):
+    """From an empty cache, so it takes as long as all the compiling does."""
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    words = ("locate", COURTYARD / "sparse" / "0", tmp_path / "cold", "--verbose")
+    cold = run_python("-m", "sfm_shapefit", *words, **cache)
+    assert cold.returncode == 0, cold.stderr[-500:]
+    if module.num_cores() > 1:
+        assert re.search(r"compiling (\d+) of \1$", cold.stderr, flags=re.MULTILINE)
+        assert "compiling kernels" not in cold.stderr  # by the command itself
+    done = run_python("-m", "sfm_shapefit", "warm-up", **cache)
+    assert done.returncode == 0, done.stderr[-500:]
+    files = sorted(path for path in (tmp_path / "cache").rglob("*") if path.is_file())
+    assert files
+    done = run_python("-c", RUN_COMMANDS, tmp_path / "out", **cache)
+    assert done.returncode == 0, done.stderr[-500:]
+    assert done.stderr.splitlines()[-1] == "compiled:"
+    assert sorted(path for path in (tmp_path / "cache").rglob("*") if path.is_file()) == files

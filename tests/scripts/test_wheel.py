@@ -1,0 +1,48 @@
+"""scripts/kernel_wheel.py: with the wheel that it builds no command compiles, and nothing is written."""
+
+import os
+import zipfile
+
+import pytest
+
+import kernel_wheel
+from harness.installed import install
+from sfm_shapefit.kernel_cache import here
+from tests.scenes import fingerprint
+
+COMMANDS = (
+    "locate data_synthetic/courtyard/sparse/0 {out}/located -q",
+    "map data_synthetic/ring8/database.db {out}/mapped -q",
+    "place data_synthetic/graph40.txt {out}/placed -q",
+    "inspect data_synthetic/courtyard/sparse/0",
+    "evaluate {out}/located data_synthetic/courtyard/truth",
+)
+
+
+@pytest.mark.slow
+def test_with_the_wheel_no_command_compiles_and_nothing_is_written(tmp_path):
+    wheel = kernel_wheel.build(tmp_path / "dist")
+    assert "none-any" not in wheel.name
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+        assert not [name for name in names if "__pycache__" in name]
+        assert len([name for name in names if name.startswith("sfm_shapefit/_kernels/")]) > 150
+        (metadata,) = [name for name in names if name.endswith("/METADATA")]
+        assert "\nRequires-Dist: numba==0." in archive.read(metadata).decode()
+    installed = install(tmp_path / "environment", wheel)
+    assert (installed.site / "sfm_shapefit/_kernels/made_for.txt").read_text().strip() == here()
+    for path in [installed.site, *installed.site.rglob("*")]:
+        path.chmod(path.stat().st_mode & ~0o222)  # which does not stop root: what is there is compared, too
+    done = installed.run("-c", "import sfm_shapefit; print(sfm_shapefit.__file__)")
+    assert done.stdout.startswith(str(installed.site))
+    before = fingerprint(installed.folder)
+    try:
+        for command in COMMANDS:
+            words = command.format(out=tmp_path / "out").split()
+            done = installed.run("-m", "sfm_shapefit", *words)
+            assert done.returncode == 0, done.stderr[-500:]
+            assert "compil" not in done.stderr
+        assert fingerprint(installed.folder) == before
+    finally:
+        for folder, _, _ in os.walk(installed.site):
+            os.chmod(folder, 0o755)

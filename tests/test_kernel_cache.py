@@ -1,0 +1,198 @@
+"""Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
+
+import json
+
+import llvmlite.binding as llvm
+import pytest
+from numba.core import config
+
+from sfm_shapefit import kernel_cache
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.kernel_cache import hear_of_kernels, is_noted, note, on_miss, stamp_of
+from tests.program import run_python
+from tests.scenes import RING, fingerprint
+
+
+def double(x):
+    return 2 * x
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def kept(folder):
+    return sorted(path for path in folder.rglob("*") if path.is_file())
+
+
+def compile_double():
+    """Call a new kernel, as another process would have it; return whether it had to be compiled."""
+    missed = []
+    with on_miss(lambda: missed.append("missed")):
+        assert kernel(double)(21) == 42
+    return missed == ["missed"]
+
+
+def test_a_kernel_is_compiled_once_and_found_again(folder):
+    heard = []
+    with hear_of_kernels(heard.append):
+        assert compile_double()
+        (file,) = kept(folder)
+        assert not compile_double()
+    assert kept(folder) == [file]
+    assert heard == ["test_kernel_cache.double"] * 2
+    with on_miss(lambda: pytest.fail("missed")):
+        assert kernel(double)(21) == 42
+    assert kernel(double)(1.5) == 3.0
+    assert len(kept(folder)) == 2
+
+
+@pytest.mark.parametrize("content", [b"", b"no pickle", b"cut"])
+def test_a_damaged_file_is_compiled_anew(folder, content):
+    compile_double()
+    (file,) = kept(folder)
+    whole = file.read_bytes()
+    file.write_bytes(content if content != b"cut" else whole[: len(whole) // 2])
+    assert compile_double()
+    assert not compile_double()
+    assert kept(folder) == [file]
+
+
+def test_another_source_leaves_nothing_of_the_earlier_one(folder, monkeypatch):
+    compile_double()
+    (file,) = kept(folder)
+    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
+    assert compile_double()
+    (now,) = kept(folder)
+    assert now != file
+
+
+def test_a_kernel_works_where_nothing_can_be_kept(tmp_path, monkeypatch):
+    (tmp_path / "file").write_text("no folder")
+    monkeypatch.setattr(config, "CACHE_DIR", str(tmp_path / "file" / "below"))
+    assert compile_double()
+    assert compile_double()
+
+
+def test_a_kernel_without_a_source_works(folder):
+    scope = {}
+    exec("def triple(x): return 3 * x", scope)
+    assert kernel(scope["triple"])(14) == 42
+    assert kept(folder) == []
+
+
+def test_kernels_of_a_wheel_are_read_and_nothing_is_written(folder, tmp_path, monkeypatch):
+    compile_double()
+    (file,) = kept(folder)
+    shipped = tmp_path / "shipped" / "_kernels"
+    shipped.mkdir(parents=True)
+    file.rename(shipped / file.name)
+    own = kernel_cache.Path(__file__).resolve().parent
+    monkeypatch.setattr(kernel_cache, "PACKAGE", own)
+    monkeypatch.setattr(kernel_cache, "SHIPPED", shipped)
+    assert not compile_double()
+    assert kept(folder) == []
+
+
+def test_what_is_missed_once_is_looked_for_again(folder):
+    compile_double()
+    (file,) = kept(folder)
+    aside = file.with_suffix(".aside")
+    file.rename(aside)
+    with on_miss(lambda: aside.rename(file)):  # as another process, which compiles it meanwhile
+        assert kernel(double)(21) == 42
+    assert kept(folder) == [file]
+
+
+def test_a_stamp_covers_what_a_module_imports_also_through_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(kernel_cache, "PACKAGE", tmp_path)
+    (tmp_path / "room").mkdir()
+    files = {
+        "top.py": "from sfm_shapefit.room import pair\nfrom os import path\n",
+        "room/__init__.py": "from sfm_shapefit.room.pairs import Pair\n",
+        "room/pairs.py": "class Pair: ...\n",
+        "other.py": "",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+
+    def stamp():
+        stamp_of.cache_clear()
+        kernel_cache._read.cache_clear()
+        return stamp_of(tmp_path / "top.py")
+
+    first = stamp()
+    (tmp_path / "other.py").write_text("# it has no part in it")
+    assert stamp() == first
+    (tmp_path / "room" / "pairs.py").write_text("class Renamed: ...\n")
+    assert stamp() != first
+    stamp_of.cache_clear()
+    kernel_cache._read.cache_clear()
+
+
+def test_a_note_holds_for_its_sources_only(folder, monkeypatch):
+    own = kernel_cache.PACKAGE / "commands"
+    assert not is_noted("an example", own)
+    note("an example", own)
+    assert is_noted("an example", own)
+    monkeypatch.setattr(kernel_cache, "stamp_of", lambda _path: "another")
+    assert not is_noted("an example", own)
+
+
+IMPORT = "import sfm_shapefit.jit; from numba.core import config; print(config.CPU_NAME)"
+COMPILE_BEFORE = "import numba; numba.njit(lambda x: x)(1)\n"
+
+
+@pytest.mark.parametrize(
+    ("program", "environment", "expected"),
+    [
+        (IMPORT, {}, kernel_cache._portable_target()),
+        (IMPORT, {"NUMBA_CPU_NAME": "host"}, "None"),
+        (IMPORT, {"NUMBA_CPU_NAME": "generic"}, "generic"),
+        (COMPILE_BEFORE + IMPORT, {}, "None"),
+    ],
+    ids=["as a rule", "host", "named", "after other code"],
+)
+def test_the_processor_is_the_portable_one_unless_something_else_is_asked_for(program, environment, expected):
+    done = run_python("-c", program, **environment)
+    assert done.stdout == f"{expected}\n", done.stderr
+
+
+@pytest.mark.parametrize(
+    ("machine", "system", "missing", "expected"),
+    [
+        ("x86_64", "linux", "", "x86-64-v3"),
+        ("AMD64", "linux", "fma", "generic"),
+        ("arm64", "darwin", "", "apple-m1"),
+        ("aarch64", "linux", "", "generic"),
+    ],
+)
+def test_the_portable_target_is_the_least_of_its_kind(monkeypatch, machine, system, missing, expected):
+    features = {name: name != missing for name in kernel_cache._X86_64_V3}
+    monkeypatch.setattr(kernel_cache.platform, "machine", lambda: machine)
+    monkeypatch.setattr(kernel_cache.sys, "platform", system)
+    monkeypatch.setattr(llvm, "get_host_cpu_features", lambda: features)
+    assert kernel_cache._portable_target() == expected
+
+
+@pytest.mark.slow
+def test_two_processors_give_the_same_bits(tmp_path):
+    """The one at hand and the portable one; what libraries choose by processor is the same on one machine."""
+    outs = {}
+    for name, environment in {
+        "portable": {},
+        "host": {"NUMBA_CPU_NAME": "host", "NUMBA_CACHE_DIR": str(tmp_path / "cache")},
+    }.items():
+        words = ("locate", RING / "sparse" / "0", tmp_path / name, "-q")
+        done = run_python("-m", "sfm_shapefit", *words, **environment)
+        assert done.returncode == 0, done.stderr[-500:]
+        outs[name] = {file: digest for file, digest in fingerprint(tmp_path / name).items() if "bin" in file}
+        tables = ("cameras.csv", "pairs.csv")
+        outs[name] |= {table: (tmp_path / name / table).read_bytes() for table in tables}
+        facts = json.loads((tmp_path / name / "locate.json").read_text(encoding="utf-8"))
+        del facts["timings_s"], facts["solve"]["seconds"]
+        outs[name]["facts"] = facts
+    assert outs["host"] == outs["portable"]
+    assert len(outs["host"]) == 8
