@@ -29,7 +29,7 @@ _POTRF, _TRSM, _SYRK, _GEMM, _TRSV, _TEXT, _ONE, _MINUS_ONE, _ZERO = range(9)
 
 # Character arguments of the Fortran routines, and numbers, all passed by reference.
 _FLAGS = np.frombuffer(b"LRTN", dtype=np.uint8)
-_SCALARS = {
+_SCALARS: dict[str, npt.NDArray[Any]] = {
     "s": np.array([1.0, -1.0, 0.0], dtype=np.float32),
     "d": np.array([1.0, -1.0, 0.0], dtype=np.float64),
 }
