@@ -234,32 +234,36 @@ def _least_sines(
     n, d = t.shape
     least, most = np.ones(high - low), np.ones(high - low)
     collinear = np.zeros(high - low, dtype=np.int64)
-    sines = np.empty(n)
+    smallest = np.empty(exceptions + 1)
     for i in range(low, high):
         for j in range(i + 1, n):
             length = 0.0
             for a in range(d):
                 length += (t[j, a] - t[i, a]) ** 2
+            smallest[:] = 1.0
             for k in range(n):
-                sines[k] = 2.0  # cameras i and j themselves come last
-                if k not in (i, j):
-                    along = 0.0
-                    for a in range(d):
-                        along += (t[k, a] - t[i, a]) * (t[j, a] - t[i, a])
-                    along /= length
-                    height, from_i, from_j = 0.0, 0.0, 0.0
-                    for a in range(d):
-                        b = t[k, a] - t[i, a]
-                        height += (b - along * (t[j, a] - t[i, a])) ** 2
-                        from_i += b * b
-                        from_j += (t[k, a] - t[j, a]) ** 2
-                    sines[k] = np.sqrt(height / max(from_i, from_j))
-                    collinear[i - low] += sines[k] < _COLLINEAR
-            least[i - low] = min(least[i - low], sines.min())
-            if exceptions > 0:
-                most[i - low] = min(most[i - low], np.partition(sines, exceptions)[exceptions])
-            else:
-                most[i - low] = least[i - low]
+                if k in (i, j):
+                    continue
+                along = 0.0
+                for a in range(d):
+                    along += (t[k, a] - t[i, a]) * (t[j, a] - t[i, a])
+                along /= length
+                height, from_i, from_j = 0.0, 0.0, 0.0
+                for a in range(d):
+                    b = t[k, a] - t[i, a]
+                    height += (b - along * (t[j, a] - t[i, a])) ** 2
+                    from_i += b * b
+                    from_j += (t[k, a] - t[j, a]) ** 2
+                sine = np.sqrt(height / max(from_i, from_j))
+                collinear[i - low] += sine < _COLLINEAR
+                place = exceptions
+                if sine < smallest[place]:
+                    while place > 0 and sine < smallest[place - 1]:
+                        smallest[place] = smallest[place - 1]
+                        place -= 1
+                    smallest[place] = sine
+            least[i - low] = min(least[i - low], smallest[0])
+            most[i - low] = min(most[i - low], smallest[exceptions])
     return least, most, collinear
 
 
