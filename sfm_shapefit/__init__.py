@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.map import map_database
     from sfm_shapefit.commands.write import WriteOptions, write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
-    from sfm_shapefit.options import LocateOptions, MapOptions
+    from sfm_shapefit.locate_options import LocateOptions, MapOptions
     from sfm_shapefit.placement.place import Placement, place
     from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.results.map_result import MapResult

@@ -32,7 +32,7 @@ LAYERS = [
     {"formats"},
     {"colmap"},
     {"synthetic"},
-    {"options"},
+    {"locate_options"},
     {"results"},
     {"report"},
     {"commands"},

@@ -190,7 +190,7 @@ def test_centers_on_a_line_are_flagged_and_explained(side):
     assert not evaluate_poses(bent, bent).degenerate
 
 
-def test_a_line_is_recognised_although_one_lost_camera_stands_beside_it():
+def test_a_line_is_recognized_although_one_lost_camera_stands_beside_it():
     straight = scene(9)
     line = replace(straight, centers=np.linspace(0, 30, 20)[:, None] * np.array([1.0, 2.0, -1.0]))
     flown, beside = line.centers.copy(), line.centers.copy()

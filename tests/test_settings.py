@@ -9,7 +9,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
-from sfm_shapefit.options import LocateOptions, MapOptions
+from sfm_shapefit.locate_options import LocateOptions, MapOptions
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.settings import groups_of, merge_options
 from sfm_shapefit.solver.options import SolverOptions

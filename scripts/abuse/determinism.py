@@ -110,7 +110,7 @@ def measure_reordering(scene: Path, work: Path, seed: int) -> float:
     """Return by how much of the extent positions move when everything is listed in another order."""
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.write import write_result
-    from sfm_shapefit.options import LocateOptions
+    from sfm_shapefit.locate_options import LocateOptions
 
     copy = reorder(scene, work / f"order{seed}", np.random.default_rng(seed))
     tables = []

@@ -1,6 +1,6 @@
 """Bundle adjustment: poses, points and lenses that explain the pixels best.
 
-    minimise  1/2 sum_o rho(|r_o|^2) + 1/2 sigma^2 sum_f d_f^T Omega_f d_f,      rho(s) = c^2 log(1 + s / c^2)
+    minimize  1/2 sum_o rho(|r_o|^2) + 1/2 sigma^2 sum_f d_f^T Omega_f d_f,      rho(s) = c^2 log(1 + s / c^2)
 
 over the centers C_f of the frames, their rotations (free, held, or weighted by a prior), the points X_p and,
 if asked, focal lengths and distortion; r_o is the reprojection error in pixels (`problem` has the lenses), c

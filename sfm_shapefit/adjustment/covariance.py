@@ -24,7 +24,7 @@ from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.schur import ReducedSystem, eliminate_points
-from sfm_shapefit.adjustment.solve import linearise_all, values_of
+from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
@@ -51,7 +51,7 @@ def estimate_covariances(
 ) -> FrameCovariances:
     """Return the covariances of the frames at the minimum that a problem stands at.
 
-    They are those of the linearised problem with the weights of the loss, and know of the noise of
+    They are those of the linearized problem with the weights of the loss, and know of the noise of
     observations and of the priors only: not of wrong calibration, nor of noise that observations share.
 
     Args:
@@ -65,7 +65,7 @@ def estimate_covariances(
     options = merge_options(options, AdjustmentOptions, overrides)
     layout = lay_out(problem, options)
     workers = Workers(options.threads)
-    normal = linearise_all(problem, layout, values_of(problem), options, workers)
+    normal = linearize_all(problem, layout, values_of(problem), options, workers)
     unseen = np.zeros(problem.num_frames, np.bool_)
     own = layout.node_of_frame >= 0
     unseen[own] = ~np.einsum("naa->na", normal.nodes)[layout.node_of_frame[own], :3].any(axis=1)

@@ -62,7 +62,7 @@ class NormalEquations:
     """(E, 3, 6) W"""
 
 
-def linearise(
+def linearize(
     layout: Layout,
     values: Values,
     loss_scale_px: float | None,

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
     NormalEquations,
     Values,
-    linearise,
+    linearize,
     reprojection_residuals,
     sum_losses,
 )
@@ -98,7 +98,7 @@ def adjust(
     on_iteration: OnIteration | None = None,
     **overrides: Any,
 ) -> Adjusted:
-    """Minimise the reprojection errors over centers, points and what the options free.
+    """Minimize the reprojection errors over centers, points and what the options free.
 
     Args:
         problem: the start; it is not changed.
@@ -119,7 +119,7 @@ def adjust(
     run = _Run(problem, options)
     try:
         ending = run.iterate(on_iteration)
-        run.linearise()
+        run.linearize()
     finally:
         run.workers.close()
     values = restore_gauge(problem, run.values, free_similarities(problem, options))
@@ -149,7 +149,7 @@ def values_of(problem: AdjustmentProblem) -> Values:
     )
 
 
-def linearise_all(
+def linearize_all(
     problem: AdjustmentProblem,
     layout: Layout,
     values: Values,
@@ -157,8 +157,8 @@ def linearise_all(
     workers: Workers,
     least_curvature: float = 1.0,
 ) -> NormalEquations:
-    """Return the normal equations of observations and priors; see `linearise`."""
-    normal = linearise(layout, values, options.loss_scale_px, workers, least_curvature)
+    """Return the normal equations of observations and priors; see `linearize`."""
+    normal = linearize(layout, values, options.loss_scale_px, workers, least_curvature)
     moves = layout.node_of_frame >= 0
     nodes = layout.node_of_frame[moves]
     for add, slots in ((add_center_prior, slice(0, 3)), (add_rotation_prior, slice(3, 6))):
@@ -193,7 +193,7 @@ class _Run:
     def iterate(self, on_iteration: OnIteration | None) -> Ending:
         """Take steps until a reason to stop."""
         while True:
-            normal = self.linearise()
+            normal = self.linearize()
             exact = 0.5 * self.problem.num_observations * _EXACT_PX**2
             if self.gradient_norm <= self.options.gradient_tolerance or self.costs[-1] <= exact:
                 return Ending.GRADIENT
@@ -201,10 +201,10 @@ class _Run:
             if ending is not None:
                 return ending
 
-    def linearise(self) -> NormalEquations:
+    def linearize(self) -> NormalEquations:
         """Return the normal equations at the best values, and note their gradient."""
         least = _LEAST_CURVATURE if self.bends else 1.0
-        normal = linearise_all(self.problem, self.layout, self.values, self.options, self.workers, least)
+        normal = linearize_all(self.problem, self.layout, self.values, self.options, self.workers, least)
         self.gradient_norm = _gradient_norm(normal, self.costs[-1])
         return normal
 

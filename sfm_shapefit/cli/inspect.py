@@ -19,7 +19,7 @@ from sfm_shapefit.cli.console import (
 )
 from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import Inspection

@@ -6,7 +6,7 @@ from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import OutputFlags
 
 if TYPE_CHECKING:
-    from sfm_shapefit.colmap.adjustment import Adjusted
+    from sfm_shapefit.colmap.bundle_adjustment import Adjusted
     from sfm_shapefit.solver.options import SolverResult
 
 

@@ -26,7 +26,7 @@ from sfm_shapefit.cli.lines import (
     further_piece_rows,
     name_pictures,
 )
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.result import LocateResult

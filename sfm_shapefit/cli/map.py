@@ -10,7 +10,7 @@ from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, OutputPath, one_path, takes
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.lines import describe_adjustment, describe_time
-from sfm_shapefit.options import MapOptions
+from sfm_shapefit.locate_options import MapOptions
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.map_result import MapResult

@@ -21,7 +21,7 @@ from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.graph_text import read_graph
 from sfm_shapefit.formats.models import is_model_file
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.diagnosis import Diagnosis, Theory, diagnose, theory_of
 from sfm_shapefit.settings import merge_options
 

@@ -23,7 +23,7 @@ from sfm_shapefit.commands.stages.seed import (
     select_trusted,
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images, rotations_of
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
@@ -24,7 +24,7 @@ from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1
-from sfm_shapefit.options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from sfm_shapefit.display import Displayed
-from sfm_shapefit.options import MapOptions
+from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.results.json_types import LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.adjustment import Adjusted
+from sfm_shapefit.colmap.bundle_adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
-from sfm_shapefit.options import LocateOptions, Source
+from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions

@@ -16,7 +16,7 @@ from sfm_shapefit.adjustment import (
 )
 from sfm_shapefit.adjustment.gauge import small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
-from sfm_shapefit.adjustment.solve import linearise_all, values_of
+from sfm_shapefit.adjustment.solve import linearize_all, values_of
 from sfm_shapefit.laplacian.operators import Workers
 from tests.adjustment.made import ring_problem
 from tests.adjustment.test_derivatives import whole_matrix
@@ -27,7 +27,7 @@ PLAIN = AdjustmentOptions(loss_scale_px=None, noise_px=0.5)
 def expected_covariances(problem, options, num_free):
     """Covariances of the nodes from the whole matrix, the centers' similarity held by constraints."""
     layout = lay_out(problem, options)
-    normal = linearise_all(problem, layout, values_of(problem), options, Workers(1))
+    normal = linearize_all(problem, layout, values_of(problem), options, Workers(1))
     matrix = whole_matrix(layout, normal)
     size = len(matrix)
     motions = small_similarities(problem.rotations, problem.centers, problem.centers.mean(axis=0))

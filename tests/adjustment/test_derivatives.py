@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 from sfm_shapefit.adjustment import AdjustmentOptions, CenterPrior, RotationPrior, isotropic_information
 from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.priors import sum_priors
-from sfm_shapefit.adjustment.residuals import linearise, reprojection_residuals, sum_losses
-from sfm_shapefit.adjustment.solve import linearise_all, move, values_of
+from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals, sum_losses
+from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
 from sfm_shapefit.laplacian.operators import Workers
 from tests.adjustment.made import LENSES, disturb, ring_problem
 
@@ -83,7 +83,7 @@ def test_the_normal_matrix_is_that_of_differences_of_the_residuals(model):
     layout, values = lay_out(problem, ALL_FREE), values_of(problem)
     jacobian = differences(layout, values, lambda v: reprojection_residuals(layout, v).ravel())
     expected = jacobian @ jacobian.T
-    found = whole_matrix(layout, linearise(layout, values, None, ONE))
+    found = whole_matrix(layout, linearize(layout, values, None, ONE))
     scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found / scale, expected / scale, atol=1e-7)
 
@@ -99,7 +99,7 @@ def test_the_gradient_is_that_of_differences_of_the_cost(model, scale):
         return sum_losses(layout, at, scale, ONE) + sum_priors(problem, at, options.noise_px)
 
     expected = differences(layout, values, cost)
-    normal = linearise_all(problem, layout, values, options, ONE)
+    normal = linearize_all(problem, layout, values, options, ONE)
     found = np.concatenate([normal.node_gradients[layout.active], normal.point_gradients.ravel()])
     np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
 
@@ -118,7 +118,7 @@ def test_the_curvature_of_the_loss_is_exact_where_it_bends_up():
     unit = residuals / np.sqrt(squares)[:, None]
     weights = w[:, None, None] * np.eye(2) + (along - w)[:, None, None] * unit[:, :, None] * unit[:, None, :]
     expected = np.einsum("koa,oab,lob->kl", j, weights, j)
-    found = whole_matrix(layout, linearise(layout, values, scale, ONE, 0.1))
+    found = whole_matrix(layout, linearize(layout, values, scale, ONE, 0.1))
     size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     np.testing.assert_allclose(found / size, expected / size, atol=1e-7)
 
@@ -140,8 +140,8 @@ def test_a_point_behind_its_camera_adds_nothing_and_counts_as_a_focal_length():
         points_seen=behind.points_seen[~lost],
         pixels=behind.pixels[~lost],
     )
-    without = linearise(lay_out(kept, ALL_FREE), values, 2.0, ONE)
-    found = linearise(layout, values, 2.0, ONE)
+    without = linearize(lay_out(kept, ALL_FREE), values, 2.0, ONE)
+    found = linearize(layout, values, 2.0, ONE)
     np.testing.assert_array_equal(found.points, without.points)
     np.testing.assert_allclose(found.nodes, without.nodes, rtol=1e-14)
 

@@ -16,7 +16,7 @@ import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.cli import app
 from sfm_shapefit.formats.graph_text import graph_text
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused

@@ -14,7 +14,7 @@ import pytest
 
 from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.adjustment import bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
@@ -464,7 +464,7 @@ def test_adjusted_points_satisfy_the_same_filters():
 
 
 def test_too_few_iterations_and_no_points_are_told(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.colmap.adjustment._MAX_STEPS", 1)
+    monkeypatch.setattr("sfm_shapefit.colmap.bundle_adjustment._MAX_STEPS", 1)
     original, _ = ring_model(noise_px=0.5)
     seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
     adjusted = bundle_adjust(seed, graph)

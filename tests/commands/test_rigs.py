@@ -181,7 +181,7 @@ def test_rigs_whose_sensors_coincide_have_no_scale(rigs, tmp_path):
 
 @pytest.fixture
 def moved_ring(tmp_path):
-    """The ring with true centres of five cameras, in a unit of 0.37 m, and the others at the origin."""
+    """The ring with true centers of five cameras, in a unit of 0.37 m, and the others at the origin."""
     truth = read_model(RING / "sparse" / "0")
     model = pycolmap.Reconstruction(RING / "sparse" / "0")
     centers = truth.centers / 0.37 + [100.0, -50.0, 7.0]

@@ -205,7 +205,7 @@ def test_a_repeated_facade_that_half_the_matches_confuse_is_refused_and_a_few_do
     [{}, {"noise_px": 2.0}, {"wrong": 0.3}, {"depth": (4e4, 8e4)}, {"depth": (4e5, 8e5), "count": 100}],
     ids=str,
 )
-def test_no_parallax_is_recognised_whatever_the_noise(kind):
+def test_no_parallax_is_recognized_whatever_the_noise(kind):
     baseline = (1.0, 0.2, -0.1) if "depth" in kind else (0.0, 0.0, 0.0)
     usual = {"noise_px": 0.5, "count": 300, "baseline": baseline}
     pairs = [make_pair(seed, **(usual | kind)) for seed in range(40)]

@@ -26,7 +26,7 @@ from sfm_shapefit.colmap.relative_rotations import RelativeRotations
 from sfm_shapefit.colmap.rotation_averaging import average_rotations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import rotation_angles_deg
-from sfm_shapefit.options import LEAST_MATCHES
+from sfm_shapefit.locate_options import LEAST_MATCHES
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations, Loss
 
 _LIMITS = (LEAST_MATCHES, 20, 30, 50, 80)

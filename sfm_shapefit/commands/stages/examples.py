@@ -46,9 +46,8 @@ def _workspace(folder: Path, options: WorkspaceOptions | None = None) -> Path:
 
 
 def solve_dense(_folder: Path) -> None:
-    """Solve small graphs in two and three dimensions by Newton steps."""
-    for dimension in (2, 3):
-        solve(_random_graph(dimension), threads=2)
+    """Solve a small graph by Newton steps."""
+    solve(_random_graph(), threads=2)
 
 
 def start_by_lud(_folder: Path) -> None:

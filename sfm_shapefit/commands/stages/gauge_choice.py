@@ -9,7 +9,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.commands.stages.rigs import Rigid
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import (
     Gauge,
     PositionPriors,

@@ -12,7 +12,7 @@ from sfm_shapefit.colmap.model import PosedModel, track_matches
 from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.options import LocateOptions, Source
+from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.results.result import Inputs
 
 if TYPE_CHECKING:

@@ -22,8 +22,8 @@ from sfm_shapefit.directions.tracks import build_tracks, covering_set, join_poin
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import SIGMA_PER_MEDIAN
 from sfm_shapefit.judgement.correlated_errors import NUM_SAMPLES, sample_direction_errors
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.measured import Evidence, MeasuredGraph
-from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
 
 _CHECK_ROTATIONS = "check that the rotations and intrinsics belong to these matches"

@@ -19,8 +19,8 @@ from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.laplacian.ordering import best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, plan_factorization
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
-from sfm_shapefit.options import LocateOptions
 from sfm_shapefit.solver.options import NO_FACTOR
 from sfm_shapefit.solver.solve import choose_method
 from sfm_shapefit.solver.splitting.linear import predict_factor

@@ -17,8 +17,8 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.lines import text_of
+from sfm_shapefit.locate_options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
-from sfm_shapefit.options import FIX_SOLVED, LocateOptions
 from sfm_shapefit.placement.place import Placement, place
 from sfm_shapefit.placement.tied_groups import is_scaled, refuse_options_of_groups
 from sfm_shapefit.solver.rigs.groups import RigidGroups, separate

@@ -12,7 +12,7 @@ from sfm_shapefit.commands.stages.inputs import MatchSource, open_source
 from sfm_shapefit.commands.stages.measure import build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.directions.matches import RayMatches
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.results.result import Inputs
 from sfm_shapefit.rotations.acceptance import refine_rotations

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
-from sfm_shapefit.colmap.adjustment import Adjusted, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import Adjusted, bundle_adjust
 from sfm_shapefit.colmap.seed import build_seed, turn_model
 from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import MatchBatch
-from sfm_shapefit.options import LocateOptions
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
 from sfm_shapefit.results.result import FurtherPiece
