@@ -14,8 +14,25 @@ import pdoc
 
 NAMES = (
     *("baselines", "colmap.model", "synthetic.rendered_workspace", "colmap.quiet", "synthetic.workspace"),
-    *("placement.diagnosis", "directions", "errors", "evaluation", "formats", "placement.gauge", "options"),
-    *("commands", "placement.place", "results.tables", "results", "rigidity", "judgement", "solver"),
+    *(
+        "placement.diagnosis",
+        "directions",
+        "errors",
+        "evaluation",
+        "formats",
+        "placement.gauge",
+        "locate_options",
+    ),
+    *(
+        "commands",
+        "placement.place",
+        "results.result",
+        "results.map_result",
+        "results.tables",
+        "rigidity",
+        "judgement",
+        "solver",
+    ),
     *("synthetic", "synthetic.fixtures", "theory", "viewgraph"),
 )
 MODULES = ("sfm_shapefit", *(f"sfm_shapefit.{name}" for name in NAMES))

@@ -1,20 +1,24 @@
 """Build a wheel that carries compiled kernels: `python scripts/kernel_wheel.py dist`.
 
-The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources, and what it kept becomes the
-package's folder `_kernels`, see `sfm_shapefit.kernel_cache`. Machine code and its wrapping depend on the
-minor versions of Python and numba, so the wheel requires those, and runs where numba's own wheel does.
+The wheel that hatchling makes is unpacked, `warm-up` compiles from its sources what is not compiled in this
+checkout, and what it kept becomes the package's folder `_kernels`, see `sfm_shapefit.kernel_cache`. Machine
+code and its wrapping depend on the minor versions of Python and numba, so the wheel requires those, and runs
+where numba's own wheel does.
 """
 
 import argparse
 import base64
 import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
 import zipfile
 from importlib.metadata import distribution
 from pathlib import Path
+
+from sfm_shapefit.kernel_cache import RUNTIME, stamp_of
 
 ROOT = Path(__file__).parents[1]
 
@@ -35,6 +39,7 @@ def build(out: Path) -> Path:
         with zipfile.ZipFile(pure) as archive:
             archive.extractall(tree)
         unpacked = {"PYTHONPATH": str(tree), "PYTHONDONTWRITEBYTECODE": "1"}
+        _copy_kernels(ROOT / "sfm_shapefit", tree / "sfm_shapefit")
         _run("-m", "sfm_shapefit", "warm-up", **unpacked)
         made_for = _run("-c", "from sfm_shapefit.kernel_cache import here; print(here())", **unpacked)
         _carry_kernels(tree / "sfm_shapefit", made_for)
@@ -53,6 +58,18 @@ def _run(*arguments: object, **environment: str) -> str:
     return subprocess.run(
         words, check=True, env=own | environment, stdout=subprocess.PIPE, text=True, cwd=ROOT / "scripts"
     ).stdout
+
+
+def _copy_kernels(checkout: Path, package: Path) -> None:
+    """Copy what is compiled beside the sources of this checkout and not stale."""
+    for file in checkout.rglob("__pycache__/*.nbc"):
+        folder = file.parent.parent
+        is_note = folder.name == "commands"
+        source = folder / ("stages/examples.py" if is_note else f"{file.name.partition('.')[0]}.py")
+        if f"-{RUNTIME}-{stamp_of(source)}-" in file.name:
+            place = package / file.relative_to(checkout)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(file, place)
 
 
 def _carry_kernels(package: Path, made_for: str) -> None:

@@ -78,41 +78,9 @@ def test_a_kernel_that_closes_over_a_value_is_refused():
         kernel(lambda x: factor * x)
 
 
-RUN_COMMANDS = """
-import sys
-import numba.core.event as events
-from sfm_shapefit.cli import app
-target, compiled = sys.argv[1], []
-
-class Names(events.Listener):
-    def on_start(self, event):
-        compiled.append(event.data["dispatcher"].py_func.__qualname__)
-    def on_end(self, event):
-        pass
-
-with events.install_listener("numba:compile", Names()):
-    for command in (
-        f"locate data_synthetic/courtyard/sparse/0 {target}/located -q",
-        f"evaluate {target}/located data_synthetic/courtyard/truth",
-        "inspect data_synthetic/courtyard/sparse/0",
-        f"solve data_synthetic/graph40.txt {target}/solved -q",
-        f"solve data_synthetic/graph40.txt {target}/split --method admm -q",
-        f"map data_synthetic/ring8/database.db {target}/mapped -q",
-        f"locate data_synthetic/ring8/sparse/0 {target}/fixed --fix solved -q",
-        f"report {target}/located --scene",
-        f"convert {target}/located {target}/transforms.json -q",
-        f"synth {target}/drive --shape drive --num-images 6 --num-points 300",
-        "inspect data_synthetic/ring8/sparse/0 --theory",
-        f"place data_synthetic/graph40.txt {target}/linf --objective least-squares --filter 1dsfm -q",
-    ):
-        app(command.split(), standalone_mode=False)
-print("compiled:", *compiled, file=sys.stderr)
-"""
-
-
 def test_a_second_process_compiles_nothing(tmp_path):
     for process in ("first", "second"):
-        done = run_python("-c", RUN_COMMANDS, tmp_path / process)
+        done = run_python("-m", "tests.every_command", tmp_path / process)
         assert done.returncode == 0, done.stderr[-500:]
     assert done.stderr.splitlines()[-1] == "compiled:"
 

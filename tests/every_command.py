@@ -1,0 +1,49 @@
+"""Run every command once; end with 1 if a kernel was compiled, and name it.
+
+    python -m tests.every_command OUT
+
+The gate runs it after `warm-up`, which must have compiled everything.
+"""
+
+import sys
+
+from numba.core import event as events
+
+from sfm_shapefit.cli import app
+
+COMMANDS = """
+    locate data_synthetic/courtyard/sparse/0 {out}/located -q
+    evaluate {out}/located data_synthetic/courtyard/truth
+    inspect data_synthetic/courtyard/sparse/0
+    solve data_synthetic/graph40.txt {out}/solved -q
+    solve data_synthetic/graph40.txt {out}/split --method admm -q
+    map data_synthetic/ring8/database.db {out}/mapped -q
+    locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
+    report {out}/located --scene
+    convert {out}/located {out}/transforms.json -q
+    synth {out}/drive --shape drive --num-images 6 --num-points 300
+    inspect data_synthetic/ring8/sparse/0 --theory
+    place data_synthetic/graph40.txt {out}/linf --objective least-squares --filter 1dsfm -q
+"""
+
+
+class Names(events.Listener):
+    """Hears of kernels that are compiled."""
+
+    def __init__(self):
+        self.compiled = []
+
+    def on_start(self, event):
+        self.compiled.append(event.data["dispatcher"].py_func.__qualname__)
+
+    def on_end(self, event):
+        pass
+
+
+if __name__ == "__main__":
+    names = Names()
+    with events.install_listener("numba:compile", names):
+        for command in COMMANDS.format(out=sys.argv[1]).strip().splitlines():
+            app(command.split(), standalone_mode=False)
+    print("compiled:", *names.compiled, file=sys.stderr)  # noqa: T201
+    sys.exit(bool(names.compiled))
