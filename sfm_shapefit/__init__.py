@@ -48,7 +48,7 @@ _HOMES = {
     "commands.map": ("map_database",),
     "commands.write": ("WriteOptions", "write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
-    "options": ("LocateOptions", "MapOptions"),
+    "locate_options": ("LocateOptions", "MapOptions"),
     "placement.place": ("Placement", "place"),
     "refinement.options": ("PlacementOptions",),
     "results.map_result": ("MapResult",),
