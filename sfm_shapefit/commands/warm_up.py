@@ -28,11 +28,10 @@ Tell = Callable[[int, int], None]
 NEEDED = (
     "solve_dense",
     "start_by_lud",
-    "judge_placement",
-    "refine_in_angles",
     "measure_pairs",
     "find_pieces",
-    "place_graph",
+    "judge_placement",
+    "refine_in_angles",
     "locate_model",
 )
 """Examples of what `locate`, `map`, `place` and `inspect` do in most runs.
@@ -40,6 +39,7 @@ NEEDED = (
 Parts come first, so that no two processes compile the same kernels, then the whole.
 """
 FURTHER = (
+    "place_graph",
     "solve_sparse",
     "solve_by_splitting",
     "locate_rigs",

@@ -46,8 +46,9 @@ def _workspace(folder: Path, options: WorkspaceOptions | None = None) -> Path:
 
 
 def solve_dense(_folder: Path) -> None:
-    """Solve a small graph by Newton steps."""
-    solve(_random_graph(), threads=2)
+    """Solve small graphs by Newton steps, one from a rough start and one from least squares."""
+    for graph in (_random_graph(), _long_graph(40)):
+        solve(graph, threads=2)
 
 
 def start_by_lud(_folder: Path) -> None:
