@@ -32,7 +32,7 @@ import numpy.typing as npt
 from sfm_shapefit.arrays import FloatArray, IntArray, frozen
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.jit import array_address, inner_kernel, kernel, multiply_in_lanes
-from sfm_shapefit.laplacian.dense import Block, blas_of, gemm, one_blas_thread, potrf, syrk, trsm
+from sfm_shapefit.laplacian.dense import Blas, Block, blas_of, gemm, one_blas_thread, potrf, syrk, trsm
 from sfm_shapefit.laplacian.operators import Int32Array, Workers, adjacency, check_edges
 from sfm_shapefit.laplacian.ordering import Ordering, best_order
 from sfm_shapefit.laplacian.symbolic import SymbolicFactor, elimination_tree, plan_factorization
@@ -325,28 +325,16 @@ def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot
         return lambda: trsm(blas_of(factor.dtype), block(j, j), block(row, j), rows, end - j)
 
     def subtract(j: int, end: int, row: int) -> Callable[[], object]:
-        last = min(row + _STRIP, width)
-
-        def run() -> None:
-            blas, left, depth = blas_of(factor.dtype), block(row, j), end - j
-            syrk(blas, left, last - row, depth, block(row, row), True)
-            if last < height:
-                shape = height - last, last - row, depth
-                gemm(blas, block(last, j), left, shape, block(last, row), True)
-
-        return run
+        rows = row, min(row + _STRIP, width), height
+        return lambda: _subtract_strip(
+            blas_of(factor.dtype), lambda i: block(i, j), end - j, block, rows, True
+        )
 
     def leave(row: int) -> Callable[[], object]:
-        last = min(row + _STRIP, below)
-
-        def run() -> None:
-            blas, left = blas_of(factor.dtype), block(width + row, 0)
-            syrk(blas, left, last - row, width, waiting(row, row), False)
-            if last < below:
-                shape = below - last, last - row, width
-                gemm(blas, block(width + last, 0), left, shape, waiting(last, row), False)
-
-        return run
+        rows = row, min(row + _STRIP, below), below
+        return lambda: _subtract_strip(
+            blas_of(factor.dtype), lambda i: block(width + i, 0), width, waiting, rows, False
+        )
 
     for j in range(0, width, _STRIP):
         end = min(j + _STRIP, width)
@@ -358,6 +346,31 @@ def _factor_large(factor: CholeskyFactor, stack: npt.NDArray[Any], s: int, pivot
         workers.run([subtract(j, end, row) for row in range(end, width, _STRIP)])
     workers.run([leave(row) for row in range(0, below, _STRIP)])
     return False
+
+
+def _subtract_strip(
+    blas: Blas,
+    left: Callable[[int], Block],
+    depth: int,
+    target: Callable[[int, int], Block],
+    rows: tuple[int, int, int],
+    accumulate: bool,
+) -> None:
+    """Subtract a strip of columns of a a^T from the lower triangle of a matrix, or store it negated.
+
+    Args:
+        blas: what BLAS needs.
+        left: `a` from a row on; it has `depth` columns.
+        depth: see `left`.
+        target: the matrix from a row and a column on.
+        rows: where the strip's columns, and so its rows, begin; where the columns end; where the rows end.
+        accumulate: whether what the strip holds counts.
+    """
+    row, last, bottom = rows
+    syrk(blas, left(row), last - row, depth, target(row, row), accumulate)
+    if last < bottom:
+        shape = bottom - last, last - row, depth
+        gemm(blas, left(last), left(row), shape, target(last, row), accumulate)
 
 
 @kernel
