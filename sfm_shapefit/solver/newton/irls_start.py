@@ -27,6 +27,7 @@ from sfm_shapefit.solver.newton.steps import (
     combine,
     dot,
     measure,
+    scale_to,
     set_residuals,
 )
 
@@ -45,8 +46,7 @@ def approach(problem: Any, iterate: Any, step: Any) -> bool:
     """Start near the optimum, with the bound 0; return whether it is: if not, the iterate is of no use."""
     t, gradient, degrees = iterate.t, step.addend, np.empty(len(iterate.t))
     downhill = np.empty_like(iterate.t)
-    scale = problem.kappa / dot(problem.c, problem.c)
-    combine(scale, problem.c, 0.0, problem.c, t)
+    scale_to(problem, problem.c, t)
     weigh(problem, t, np.inf, step.ratios, gradient, degrees)
     left = descend(problem, step, t, gradient, degrees, downhill, _FIRST_STEPS)
     if left > _LEFT * dot(t, gradient):
@@ -112,19 +112,19 @@ def descend(problem: Any, step: Any, t: Any, gradient: Any, degrees: Any, downhi
         About what is left of its energy <T, gradient>, where the preconditioned matrix is about the identity.
     """
     direction, product = step.t, step.nodes
-    size = set_downhill(problem, degrees, gradient, downhill)
-    combine(1.0, downhill, 0.0, downhill, direction)
+    direction[:] = 0.0
+    size, keep = set_downhill(problem, degrees, gradient, downhill), 0.0
     for _ in range(steps):
+        combine(1.0, downhill, keep, direction, direction)
         multiply(problem, step.ratios, direction, product)
         curvature = dot(direction, product)
         if not curvature > 0.0:
             break
-        alpha = size / curvature
-        previous = size
+        alpha, previous = size / curvature, size
         combine(1.0, t, alpha, direction, t)
         combine(1.0, gradient, alpha, product, gradient)
         size = set_downhill(problem, degrees, gradient, downhill)
-        combine(1.0, downhill, size / previous, direction, direction)
+        keep = size / previous
     return size
 
 

@@ -191,12 +191,9 @@ def set_up(v: Any, w: Any, basis: Any, tilt: Any, s: Any) -> None:
 @kernel
 def start_from(problem: Any, a: Any, iterate: Any) -> bool:
     """Start from the least-squares locations along `a`, whose scaled residuals are a feasible dual."""
-    length = dot(problem.c, a)
-    if not length > 0.0:
+    if not dot(problem.c, a) > 0.0:
         return False
-    for i in range(len(a)):
-        for k in range(len(problem.axes)):
-            iterate.t[i, k] = (problem.kappa / length) * a[i, k]
+    scale_to(problem, a, iterate.t)
     set_residuals(problem, iterate.t, iterate.r)
     worst = 0.0
     for e in range(len(problem.w)):
@@ -512,6 +509,15 @@ def combine(a: float, x: Any, b: float, y: Any, out: Any) -> None:
     for i in range(x.shape[0]):
         for k in range(x.shape[1]):
             out[i, k] = a * x[i, k] + b * y[i, k]
+
+
+@inner_kernel
+def scale_to(problem: Any, a: Any, t: Any) -> None:
+    """t = a, scaled so that <c, T> = kappa."""
+    scale = problem.kappa / dot(problem.c, a)
+    for i in range(len(a)):
+        for k in range(len(problem.axes)):
+            t[i, k] = scale * a[i, k]
 
 
 @inner_kernel
