@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.program import run_python
+from tests.test_jit import is_kernel
 
 PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
@@ -63,7 +64,6 @@ DOORS = {
 }
 
 MOST_PARAMETERS = 6
-KERNELS = "kernel", "inner_kernel"
 
 MODULES = sorted(set(PACKAGE.rglob("*.py")) - {PACKAGE / "__init__.py"})  # which imports lazily, from all
 
@@ -108,9 +108,8 @@ def test_only_kernels_and_commands_have_many_parameters():
         for node in ast.walk(ast.parse(text)):
             if isinstance(node, ast.FunctionDef) and room_of(path) != "cli":
                 count = len(node.args.posonlyargs + node.args.args + node.args.kwonlyargs)
-                is_kernel = any(ast.unparse(mark) in KERNELS for mark in node.decorator_list)
-                is_kernel |= f"intrinsic({node.name})" in text
-                many |= {node.name: count} if count > MOST_PARAMETERS and not is_kernel else {}
+                compiled = is_kernel(node) or f"intrinsic({node.name})" in text
+                many |= {node.name: count} if count > MOST_PARAMETERS and not compiled else {}
     assert not many
 
 
