@@ -14,6 +14,7 @@ Source: https://colmap.github.io/database.html, `colmap/scene/database_sqlite.cc
 to 4.2 (columns that came later, identity or zero poses that mean "none") measured with those versions.
 """
 
+import copy
 import itertools
 import os
 import secrets
@@ -24,6 +25,7 @@ import tempfile
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -40,6 +42,9 @@ from sfm_shapefit.geometry import normalized
 
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
+
+KEPT_MATCHES = 1_000_000
+"""So many are kept, in 80 MB, for reading and sorting them takes half as long as measuring directions."""
 
 # COLMAP's TwoViewGeometryConfiguration; what these list is not verified: undefined, degenerate, watermark.
 _CONFIGS_WITHOUT_MATCHES = (0, 1, 7)
@@ -137,6 +142,7 @@ class MatchDatabase:
         self._cache_bytes = _CACHE_BYTES
         self._rays: OrderedDict[int, FloatArray] = OrderedDict()
         self._cached_bytes = 0
+        self._kept: dict[int, list[MatchBatch]] = {}
         index_of_id = _match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
         self._pairs = _read_pairs(path, connection, index_of_id)
@@ -155,10 +161,19 @@ class MatchDatabase:
         """Keep no more bytes than these of the rays of keypoints that may be needed again."""
         self._cache_bytes = num_bytes
 
-    def forget_rays(self) -> None:
-        """Give back the memory of the rays that are kept; they are computed again where they are needed."""
+    def forget(self) -> None:
+        """Give back the memory of kept rays and matches; they are read again where they are needed."""
         self._rays.clear()
         self._cached_bytes = 0
+        self._kept.clear()
+
+    def turned(self, model: PosedModel) -> "MatchDatabase":
+        """Return the same matches for a model of the same images, in the same order, with other rotations."""
+        other = copy.copy(self)
+        other._model, other._rays, other._cached_bytes = model, OrderedDict(), 0
+        turns = model.rotations.transpose(0, 2, 1) @ self._model.rotations
+        other._kept = {least: [_turn(batch, turns) for batch in kept] for least, kept in self._kept.items()}
+        return other
 
     @property
     def num_matches(self) -> int:
@@ -226,6 +241,21 @@ class MatchDatabase:
         Raises:
             InputError: naming the pair whose matches are damaged or refer to keypoints that do not exist.
         """
+        if among is None and part is None and self.num_matches <= min(max_matches_per_batch, KEPT_MATCHES):
+            if min_matches not in self._kept:
+                self._kept[min_matches] = list(self._batches(min_matches, max_matches_per_batch))
+            yield from self._kept[min_matches]
+        else:
+            yield from self._batches(min_matches, max_matches_per_batch, among, part)
+
+    def _batches(
+        self,
+        min_matches: int,
+        max_matches_per_batch: int,
+        among: IntArray | None = None,
+        part: tuple[int, int] | None = None,
+    ) -> Iterator[MatchBatch]:
+        """Read what `iter_matches` yields."""
         enough = self._pairs.has_matches & (self._pairs.num_inliers >= min_matches)
         if part is not None:
             rank = np.cumsum(self._pairs.has_matches) - 1
@@ -580,6 +610,14 @@ def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:
     if not (isinstance(data, bytes) and isinstance(rows, int) and isinstance(cols, int)):
         return False
     return len(data) == rows * cols * itemsize
+
+
+def _turn(batch: MatchBatch, turns: FloatArray) -> MatchBatch:
+    """Return matches whose rays turn as their images do, by turns (n, 3, 3) in world axes."""
+    images = np.repeat(batch.pairs, np.diff(batch.offsets), axis=0)
+    rays = ((batch.rays_i, images[:, 0]), (batch.rays_j, images[:, 1]))
+    rays_i, rays_j = (np.einsum("mab,mb->ma", turns[image], old) for old, image in rays)
+    return replace(batch, rays_i=rays_i, rays_j=rays_j)
 
 
 def _in_order(keypoints: IntArray, pair_of: IntArray) -> tuple[IntArray, IntArray]:

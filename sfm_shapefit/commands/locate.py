@@ -5,16 +5,18 @@ Each stage is one function from values to a new value; the input is never change
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
-from sfm_shapefit.commands.stages.rigs import find_rigid_parts, place_cameras
+from sfm_shapefit.commands.stages.rigs import Rigid, find_rigid_parts, place_cameras
 from sfm_shapefit.commands.stages.rotations import refine_model_rotations
 from sfm_shapefit.commands.stages.seed import (
     Located,
@@ -24,8 +26,10 @@ from sfm_shapefit.commands.stages.seed import (
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.placement.gauge import PositionPriors
+from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
-from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
 from sfm_shapefit.settings import merge_options
 
@@ -86,28 +90,49 @@ def locate(
         with clock("rotations"):
             model, turned_deg = refine_model_rotations(model, inputs, options, clock)
     with open_source(model, inputs, options) as opened:
-        with clock("directions"):
-            directions = measure_directions(opened, options, clock, executor)
-        with clock("solve"):
-            measured = rigid.apply(build_graph(opened, directions, options))
-            work = count_work(opened, directions)
-            economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
-            source = opened.with_economy(economy)
-            measured = add_evidence(measured, source, directions, options)
-            placement = place_cameras(measured, options, clock)
-            kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            gauge = choose_gauge(model, placement, kept, rigid, options, priors_known)
-            if priors_known is not None and options.refine_with_priors:
-                placement, gauge = pull_to_priors(placement, gauge, priors_known, options)
-                kept = select_trusted(placement, options.min_trust)
-        with clock("further pieces"):
-            further = place_further_pieces(source, placement, options)
-        located = Located(placement, kept, gauge, rigid.fixed)
-        seeded, adjusted = build_seeded_model(source, located, options, clock, executor)
-        warnings = tuple(_collect_warnings(source, directions, located, seeded.num_points3D()))
+        found = locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
+    return found if turned_deg is None else replace(found, turned_deg=turned_deg)
+
+
+class Locating(NamedTuple):
+    """What a run of `locate` knows beside its matches and options."""
+
+    inputs: Inputs
+    rigid: Rigid
+    priors: PositionPriors | None = None
+    executor: Executor | None = None
+    centers: FloatArray | None = None
+    """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for images that it does
+    not have, None if there was none."""
+
+
+def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
+    """Place the cameras of an open source, and make the seeded model; see `locate`."""
+    model, rigid = opened.model, known.rigid
+    with clock("directions"):
+        directions = measure_directions(opened, options, clock, known.executor)
+    with clock("solve"):
+        measured = rigid.apply(build_graph(opened, directions, options))
+        work = count_work(opened, directions)
+        economy, measured, options = keep_within_memory(work, measured, options, opened.economy)
+        source = opened.with_economy(economy)
+        measured = add_evidence(measured, source, directions, options)
+        placement = place_cameras(measured, options, clock)
+        if known.centers is not None:
+            placement = move_cameras(placement, known.centers[placement.cameras], options)
+        kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+        gauge = choose_gauge(model, placement, kept, rigid, options, known.priors)
+        if known.priors is not None and options.refine_with_priors:
+            placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
+            kept = select_trusted(placement, options.min_trust)
+    with clock("further pieces"):
+        further = place_further_pieces(source, placement, options)
+    located = Located(placement, kept, gauge, rigid.fixed)
+    seeded, adjusted = build_seeded_model(source, located, options, clock, known.executor)
+    warnings = tuple(_collect_warnings(source, directions, located, seeded.num_points3D()))
     return LocateResult(
         reconstruction=seeded,
-        inputs=inputs,
+        inputs=known.inputs,
         options=options,
         model=model,
         directions=directions,
@@ -117,7 +142,6 @@ def locate(
         adjusted=adjusted,
         timings_s=clock.seconds,
         warnings=warnings,
-        turned_deg=turned_deg,
         further=further,
         fixed=rigid.fixed,
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sfm_shapefit.colmap.database import KEPT_MATCHES
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.laplacian.cholesky import analyze
 from sfm_shapefit.laplacian.operators import adjacency
@@ -221,7 +222,9 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     has_factor = economy.factor or work.needs_factor
     factor = 2.2 * 8.0 * _BLOCK * work.factor_entries if has_factor else 0.0
     moved = 8.0 * 3 * _SAMPLES * 3.0 * work.num_nodes if samples else 0.0
-    peaks["placing"] = throughout + solving + 2.5 * samples + moved + factor
+    is_kept = work.num_matches <= min(economy.batch, KEPT_MATCHES)
+    kept = 80.0 * work.num_matches if is_kept else 0.0
+    peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor
     seeds = 66.0 * work.num_keypoints
     matches = 46.0 * work.num_matches
     peaks["triangulating"] = throughout + 300.0 * work.num_edges + seeds + matches + 0.5 * batch

@@ -114,7 +114,7 @@ def _seed_and_tracks(
     among = placement.cameras if placement.piece else None
     batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
     graph = correspondence_graph(seed, model.image_ids, batches)
-    source.database.forget_rays()  # triangulation is where most memory is needed
+    source.database.forget()  # triangulation is where most memory is needed
     return seed, graph
 
 
