@@ -138,11 +138,10 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
 class MapOptions(LocateOptions):
     """What `map` does before it locates."""
 
-    refine_rotations: bool = option(
+    adjust: bool = option(
         True,
-        "Refine the averaged rotations on the matches before cameras are placed, camera by camera "
-        "where there is evidence. With bundle_adjust a draft is adjusted instead, and its rotations "
-        "are taken.",
+        "Adjust a first placement together with its rotations on few tracks that cover the images, and "
+        "locate from there. Averaged rotations are far coarser.",
     )
     relative_rotations: Relative = option(
         "matches",

@@ -132,3 +132,11 @@ def _solve(
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps - 1  # the start counts as one
     return steps, converged
+
+
+def adjust_thinly(
+    seed: pycolmap.Reconstruction, tracks: TrackSource, structure_options: StructureOptions
+) -> pycolmap.Reconstruction:
+    """Stand-in."""
+    loose = replace(structure_options, max_reprojection_error_px=16.0)
+    return bundle_adjust(seed, tracks, loose, rounds=1).reconstruction

@@ -102,8 +102,8 @@ class Locating(NamedTuple):
     priors: PositionPriors | None = None
     executor: Executor | None = None
     centers: FloatArray | None = None
-    """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN where it has none. None
-    if there was no adjustment."""
+    """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for those it lacks.
+    None if there was no adjustment."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:

@@ -1,10 +1,9 @@
 """`map_database`: rotations averaged from the matches, then `locate`, component by component.
 
-    images and matches -> relative rotations -> components -> averaged rotations -> locate -> models
+    images and matches -> relative rotations -> components -> averaged rotations
+        -> first placement -> rotations and centers adjusted on few tracks -> locate -> models
 
-With bundle adjustment, a draft is placed and adjusted in one loose round first; the rotations of the draft
-are far finer than averaged ones, so directions, verdicts and trust are measured anew from them before the
-final adjustment. Images that the averaging drops form components of their own.
+Images that the averaging drops form components of their own.
 """
 
 from collections.abc import Iterator
@@ -15,15 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
-from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images, rotations_of
+from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
-from sfm_shapefit.commands.locate import locate
+from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
+from sfm_shapefit.commands.stages.gauge_choice import read_priors
+from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import UnsolvableError
-from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
@@ -31,8 +32,6 @@ from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
 
-# A draft is a few pixels off and would lose long tracks, so its reprojection limit is wider by this factor.
-_DRAFT_WIDENING = 4.0
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.
 _ALARMING_SHARE = 0.7
@@ -147,45 +146,31 @@ class _Run(NamedTuple):
                 yield members[kept], own
 
     def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
-        """Place one component; with bundle adjustment, from the rotations of an adjusted draft."""
+        """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
         known = self.options.known_distance
         if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
             # The known distance belongs to another component.
             settings |= {"known_distance": None, "scale": "unit"}
-        rotations = averaging.rotations
-        if self.options.bundle_adjust:
-            with self.clock("draft"):
-                rotations = self._refine_by_draft(image_ids, rotations, settings)
-            settings["refine_rotations"] = False
-        with self.clock("locate"):
-            model = pose_at_origin(self.images.reconstruction, image_ids, rotations)
-            return locate(
-                model, self.database, options=LocateOptions(**settings), progress=self.clock.progress
-            )
+        options = LocateOptions(**settings)
+        model = self._pose(image_ids, averaging.rotations)
+        inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+        with open_source(model, inputs, options) as averaged:
+            source, centers = averaged, None
+            if self.options.adjust:
+                with self.clock("first placement"):
+                    rotations, centers = adjust_first_placement(averaged, options, self.clock)
+                source = averaged.turned(self._pose(image_ids, rotations))
+            priors = read_priors(source.model, inputs, options, None)
+            rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+            locating = Locating(inputs, rigid, priors, centers=centers)
+            with self.clock("locate"):
+                return locate_source(source, locating, options, Clock(self.clock.progress))
 
-    def _refine_by_draft(
-        self, image_ids: list[int], rotations: FloatArray, settings: dict[str, object]
-    ) -> FloatArray:
-        """Return rotations (k, 3, 3) from a loose adjustment of a draft, as given for images it lacks."""
-        draft_settings = settings | {
-            "refine_rotations": False,
-            "bundle_adjust": False,
-            "min_trust": 0.0,
-            "max_reprojection_error_px": _DRAFT_WIDENING * self.options.max_reprojection_error_px,
-        }
-        model = pose_at_origin(self.images.reconstruction, image_ids, rotations)
-        draft = locate(model, self.database, options=LocateOptions(**draft_settings))  # type: ignore[arg-type]
-        try:
-            adjusted = bundle_adjust(draft.reconstruction, draft.reconstruction, self.options, rounds=1)
-        except UnsolvableError:
-            return rotations
-        turned, posed = rotations_of(adjusted.reconstruction, image_ids)
-        if not posed.any():
-            return rotations
-        common = mean_rotation_l1(rotations[posed].transpose(0, 2, 1) @ turned[posed])
-        return np.where(posed[:, None, None], turned, rotations @ common)
+    def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
+        """Return images with these rotations and all centers 0."""
+        return read_model(pose_at_origin(self.images.reconstruction, image_ids, rotations))
 
 
 def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:

@@ -61,7 +61,8 @@ def build_seeded_model(
     """
     adjusted, axes = None, located.gauge.axes
     with clock("structure"):
-        seed, tracks = _seed_and_tracks(source, located, clock.advance)
+        seed, tracks = seed_and_tracks(source, located, clock.advance)
+        source.forget()  # triangulation is where most memory is needed
     if not options.bundle_adjust:
         with clock("triangulation"):
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
@@ -98,7 +99,7 @@ def place_further_pieces(
     return tuple(pieces)
 
 
-def _seed_and_tracks(
+def seed_and_tracks(
     source: MatchSource, located: Located, advance: Callable[[int, int], None]
 ) -> "tuple[pycolmap.Reconstruction, TrackSource]":
     """Return the model with its cameras moved, and the tracks to triangulate at their new poses."""
@@ -113,9 +114,7 @@ def _seed_and_tracks(
     # A further piece is small: read no more than it needs.
     among = placement.cameras if placement.piece else None
     batches = source.counted(_without_pairs(source.batches(among), placement.rejected_pairs), advance)
-    graph = correspondence_graph(seed, model.image_ids, batches)
-    source.database.forget()  # triangulation is where most memory is needed
-    return seed, graph
+    return seed, correspondence_graph(seed, model.image_ids, batches)
 
 
 def _without_pairs(batches: Iterator[MatchBatch], rejected: IntArray) -> Iterator[MatchBatch]:
