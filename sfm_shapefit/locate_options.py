@@ -138,6 +138,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
 class MapOptions(LocateOptions):
     """What `map` does before it locates."""
 
+    min_points_per_image: int = option(
+        30,
+        "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
+        "keeps all. Even a wrong pose finds a few points.",
+    )
     adjust: bool = option(
         True,
         "Adjust a first placement together with its rotations on few tracks that cover the images, and "

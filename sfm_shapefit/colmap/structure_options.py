@@ -17,6 +17,11 @@ class StructureOptions(Settings):
         1.5, "Points that no two cameras see under at least this angle are removed; their depth means little."
     )
     min_track_length: int = option(2, "Points seen in fewer images than this are removed; 2 or more.")
+    min_points_per_image: int = option(
+        0,
+        "Images that see fewer points than this are left out of the output and listed with the reason; 0 "
+        "keeps all.",
+    )
     ignore_two_view_tracks: bool = option(
         True,
         "Leave out matches that only two images share: a wrong one is not noticed, since one epipolar "
@@ -35,3 +40,4 @@ class StructureOptions(Settings):
                 f"min_triangulation_angle_deg must lie in [0, 90), got {self.min_triangulation_angle_deg}"
             )
         self.check_range("min_track_length", 2)
+        self.check_range("min_points_per_image", 0)

@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
+
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
@@ -128,18 +130,19 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     located = Located(placement, kept, gauge, rigid.fixed)
-    seeded, adjusted = build_seeded_model(source, located, options, clock, known.executor)
-    warnings = tuple(_collect_warnings(source, directions, located, seeded.num_points3D()))
+    seeded = build_seeded_model(source, located, options, clock, known.executor)
+    warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
     return LocateResult(
-        reconstruction=seeded,
+        reconstruction=seeded.reconstruction,
         inputs=known.inputs,
         options=options,
         model=model,
         directions=directions,
         placement=placement,
-        kept=kept,
+        kept=kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
+        poor=seeded.poor,
         gauge=gauge,
-        adjusted=adjusted,
+        adjusted=seeded.adjusted,
         timings_s=clock.seconds,
         warnings=warnings,
         further=further,

@@ -150,6 +150,9 @@ class LocateSummary(PlacementSummary):
 
     inputs: Annotated[ModelInputs, "What was read."]
     not_trusted: Annotated[dict[str, str], "Images that are left out because they are not trusted, and why."]
+    few_points: Annotated[
+        dict[str, int], "Images that are left out because they see too few points, and how many."
+    ]
     pairs: Annotated[
         dict[str, int],
         "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",

@@ -1,6 +1,6 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -62,7 +62,8 @@ class LocateResult(Displayed):
     """The view graph of all cameras and usable directions (edge e is row `directions.usable()[e]`), its
     largest rigid piece solved, and the evidence for it, in the solver's units."""
     kept: BoolArray
-    """Which of the placement's cameras are in the output; the others are not trusted enough."""
+    """Which of the placement's cameras are in the output; the others are not trusted enough, or see too few
+    points."""
     gauge: Gauge
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
@@ -78,6 +79,8 @@ class LocateResult(Displayed):
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+    poor: dict[int, int] = field(default_factory=dict)
+    """By the id of each image that was left out because it sees too few points, their number."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""
@@ -121,8 +124,17 @@ class LocateResult(Displayed):
             is_fixed = self.fixed is not None and self.fixed[camera]
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
+        for camera, count in self.few_points.items():
+            reason = f"it sees {count} points, fewer than {self.options.min_points_per_image}"
+            rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    @property
+    def few_points(self) -> dict[int, int]:
+        """By the images that were left out because they see too few points, how many these are."""
+        images = enumerate(self.model.image_ids.tolist())
+        return {camera: self.poor[image_id] for camera, image_id in images if image_id in self.poor}
 
     def _carried(self) -> dict[int, tuple[float, ...]]:
         """Return the centers of images in the output that no pair placed: fixed ones, and rest of a frame."""

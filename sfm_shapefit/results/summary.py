@@ -52,7 +52,9 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "not_trusted": {
             placement.graph.name_of(int(placement.cameras[k])): placement.assessment.reasons[k]
             for k in np.flatnonzero(~found.kept).tolist()
+            if int(placement.cameras[k]) not in found.few_points
         },
+        "few_points": {found.model.names[camera]: count for camera, count in found.few_points.items()},
         "pairs": {status.name.lower(): count for status, count in found.directions.counts().items()}
         | {"outlier": len(placement.rejected_pairs)},
         "num_points": model.num_points3D(),

@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted, bundle_adjust
+from sfm_shapefit.colmap.point_support import deregister_of_few_points
 from sfm_shapefit.colmap.seed import build_seed, turn_model
 from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
@@ -42,6 +43,16 @@ class Located(NamedTuple):
         return self.placement.cameras[self.kept]
 
 
+class Seeded(NamedTuple):
+    """A seeded model."""
+
+    reconstruction: "pycolmap.Reconstruction"
+    adjusted: Adjusted | None
+    """How bundle adjustment went, if it was asked for."""
+    poor: dict[int, int]
+    """By the id of each image that was left out because it sees too few points, their number."""
+
+
 def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
     """Return which of the placed cameras are trusted enough; all, if hardly any is."""
     kept: BoolArray = placement.assessment.trust >= min_trust
@@ -54,12 +65,13 @@ def build_seeded_model(
     options: LocateOptions,
     clock: Clock,
     executor: Executor | None = None,
-) -> "tuple[pycolmap.Reconstruction, Adjusted | None]":
-    """Return the model with its cameras moved and points triangulated, and how bundle adjustment went.
+) -> Seeded:
+    """Move the cameras, triangulate points, and adjust both if asked for.
 
     An executor shares out the model's own tracks.
     """
     adjusted, axes = None, located.gauge.axes
+    frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
     with clock("structure"):
         seed, tracks = seed_and_tracks(source, located, clock.advance)
         source.forget()  # triangulation is where most memory is needed
@@ -68,14 +80,14 @@ def build_seeded_model(
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
             adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
+    poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
     if source.database is not None:  # points of the model's own tracks have their colors already
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
-    return seeded if axes is None else turn_model(seeded, axes), adjusted
+    return Seeded(seeded if axes is None else turn_model(seeded, axes), adjusted, poor)
 
 
 def place_further_pieces(
@@ -86,13 +98,13 @@ def place_further_pieces(
     for further in place_further(placement, options):
         kept = select_trusted(further, options.min_trust)
         gauge = unit_gauge(further.locations[kept])
-        seeded, _ = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
+        seeded = build_seeded_model(source, Located(further, kept, gauge), options, Clock())
         pieces.append(
             FurtherPiece(
                 placement=further,
-                kept=kept,
+                kept=kept & ~np.isin(source.model.image_ids[further.cameras], list(seeded.poor)),
                 gauge=gauge,
-                reconstruction=seeded,
+                reconstruction=seeded.reconstruction,
                 image_ids=source.model.image_ids[further.cameras],
             )
         )
