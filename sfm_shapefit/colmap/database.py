@@ -161,11 +161,10 @@ class MatchDatabase:
         """Keep no more bytes than these of the rays of keypoints that may be needed again."""
         self._cache_bytes = num_bytes
 
-    def forget(self) -> None:
-        """Give back the memory of kept rays and matches; they are read again where they are needed."""
+    def forget_rays(self) -> None:
+        """Give back the memory of the rays that are kept; they are computed again where they are needed."""
         self._rays.clear()
         self._cached_bytes = 0
-        self._kept.clear()
 
     def turned(self, model: PosedModel) -> "MatchDatabase":
         """Return the same matches for a model of the same images, in the same order, with other rotations."""

@@ -145,6 +145,20 @@ class PlacementSummary(TypedDict):
     versions: Versions
 
 
+class Agreement(TypedDict):
+    """What share of the evidence agrees with the cameras and points of the output."""
+
+    pairs: Annotated[
+        float | None,
+        "Of the pairs of its cameras that say anything of a direction; null where none does.",
+    ]
+    observations: Annotated[
+        float | None,
+        "Of the keypoints matched in two or more of its other images, the share that sees a 3D point; null "
+        "without a database.",
+    ]
+
+
 class LocateSummary(PlacementSummary):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
 
@@ -157,6 +171,7 @@ class LocateSummary(PlacementSummary):
         dict[str, int],
         "Pairs by what became of them: usable, outlier, too_few_matches, few_inliers, no_parallax ...",
     ]
+    agreement: Annotated[Agreement, "What share of the evidence agrees."]
     num_points: Annotated[int, "Triangulated 3D points."]
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]

@@ -1,5 +1,6 @@
 """What `locate` and `solve` return: the answer with the evidence for it."""
 
+import math
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +11,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.directions.pair_directions import DirectionStatus, PairDirections
+from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
 from sfm_shapefit.locate_options import LocateOptions, Source
@@ -81,6 +82,9 @@ class LocateResult(Displayed):
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
+    agreeing_observations: float = math.nan
+    """Of the keypoints of images in the output that are matched in two or more of the others, the share that
+    sees a 3D point; NaN where there is no database."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""
@@ -129,6 +133,22 @@ class LocateResult(Displayed):
             rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
+
+    @property
+    def agreeing_pairs(self) -> float:
+        """Of the pairs of cameras in the output that say anything of a direction, the share that agrees.
+
+        Pairs whose matches contradict the rotations count as disagreeing; NaN where there are none.
+        """
+        placement = self.placement
+        is_in = np.zeros(placement.num_cameras, dtype=np.bool_)
+        is_in[placement.cameras[self.kept]] = True
+        judged = is_in[placement.graph.edges[placement.edges[placement.pairs]]].all(axis=1)
+        against = [k for k, status in enumerate(self.directions.status) if status in CONTRADICTIONS]
+        num_against = int(np.sum(is_in[self.directions.pairs[against].reshape(-1, 2)].all(axis=1)))
+        agreeing = int(np.sum(placement.assessment.inliers[placement.pairs] & judged))
+        total = int(np.sum(judged)) + num_against
+        return agreeing / total if total else math.nan
 
     @property
     def few_points(self) -> dict[int, int]:

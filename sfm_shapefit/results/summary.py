@@ -1,5 +1,6 @@
 """locate.json: the answer in plain values, schema version first."""
 
+import math
 from collections.abc import Iterable
 from dataclasses import asdict
 from importlib.metadata import version
@@ -57,6 +58,10 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "few_points": {found.model.names[camera]: count for camera, count in found.few_points.items()},
         "pairs": {status.name.lower(): count for status, count in found.directions.counts().items()}
         | {"outlier": len(placement.rejected_pairs)},
+        "agreement": {
+            "pairs": _number(found.agreeing_pairs),
+            "observations": _number(found.agreeing_observations),
+        },
         "num_points": model.num_points3D(),
         "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
@@ -120,6 +125,11 @@ def _summarize(
         "warnings": list(warnings),
         "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
     }
+
+
+def _number(value: float) -> float | None:
+    """Return a number that JSON has."""
+    return value if math.isfinite(value) else None
 
 
 def _pick(kind: Any, source: object) -> Any:

@@ -65,11 +65,6 @@ class MatchSource:
             num_nodes=model.num_images,
         )
 
-    def forget(self) -> None:
-        """Give back the memory of what was kept of a database; it is read again where it is needed."""
-        if self.database is not None:
-            self.database.forget()
-
     def turned(self, model: PosedModel) -> "MatchSource":
         """Return the same matches for a model of the same images with other rotations."""
         assert self.database is not None

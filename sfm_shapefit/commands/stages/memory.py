@@ -227,5 +227,5 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor
     seeds = 66.0 * work.num_keypoints
     matches = 46.0 * work.num_matches
-    peaks["triangulating"] = throughout + 300.0 * work.num_edges + seeds + matches + 0.5 * batch
+    peaks["triangulating"] = throughout + kept + 300.0 * work.num_edges + seeds + matches + 0.5 * batch
     return peaks

@@ -1,5 +1,6 @@
 """From placed cameras to seeded models: poses, points, colors, and bundle adjustment if asked for."""
 
+import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
 from typing import TYPE_CHECKING, NamedTuple
@@ -8,7 +9,10 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted, bundle_adjust
-from sfm_shapefit.colmap.point_support import deregister_of_few_points
+from sfm_shapefit.colmap.point_support import (
+    deregister_of_few_points,
+    share_of_agreeing_observations,
+)
 from sfm_shapefit.colmap.seed import build_seed, turn_model
 from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
@@ -51,6 +55,8 @@ class Seeded(NamedTuple):
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
     """By the id of each image that was left out because it sees too few points, their number."""
+    agreeing_observations: float
+    """Share of the keypoints matched in two other images that see a point; NaN without a database."""
 
 
 def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
@@ -74,7 +80,8 @@ def build_seeded_model(
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
     with clock("structure"):
         seed, tracks = seed_and_tracks(source, located, clock.advance)
-        source.forget()  # triangulation is where most memory is needed
+        if source.database is not None:
+            source.database.forget_rays()  # triangulation is where most memory is needed
     if not options.bundle_adjust:
         with clock("triangulation"):
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
@@ -84,10 +91,12 @@ def build_seeded_model(
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
+    agreeing = math.nan
     if source.database is not None:  # points of the model's own tracks have their colors already
+        agreeing = share_of_agreeing_observations(seeded, source.model.image_ids, source.batches())
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
-    return Seeded(seeded if axes is None else turn_model(seeded, axes), adjusted, poor)
+    return Seeded(seeded if axes is None else turn_model(seeded, axes), adjusted, poor, agreeing)
 
 
 def place_further_pieces(
