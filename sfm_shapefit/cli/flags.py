@@ -54,6 +54,7 @@ class OutputFlags(Settings):
     report: bool = option(True, "Write report.html: one page that works offline.")
     scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
+    strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")
     verbose: bool = option(False, "Let pycolmap's messages through, and list seconds per stage.")
 

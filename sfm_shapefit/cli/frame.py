@@ -6,7 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic
 
+import typer
+
 from sfm_shapefit.cli.console import (
+    EXIT_UNSOLVABLE,
     Rows,
     catch_termination,
     print_json,
@@ -18,6 +21,7 @@ from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.stages.clock import Progress
+    from sfm_shapefit.results.model_verdict import ModelVerdict
 
 
 @dataclass(slots=True, kw_only=True)
@@ -30,6 +34,7 @@ class Run(Generic[Options]):
     """Inputs, which OUT must not be, nor contain."""
     progress: "Progress | None" = None
     shown: Callable[[], None] = field(default=lambda: None)
+    is_unusable: bool = False
 
     @property
     def writing(self) -> dict[str, Any]:
@@ -44,6 +49,10 @@ class Run(Generic[Options]):
             self.shown = lambda: print_json(facts)
         elif not self.flags.quiet:
             self.shown = lambda: print_table(title, table())
+
+    def heed(self, verdict: "ModelVerdict") -> None:
+        """End with exit code 4, if that was asked for and the model is not to be used."""
+        self.is_unusable = self.flags.strict and verdict.is_bad
 
 
 @contextmanager
@@ -70,3 +79,5 @@ def command_run(
             with show_progress(not flags.quiet, flags.verbose) as run.progress, hear_pycolmap(flags.verbose):
                 yield run
         run.shown()
+        if run.is_unusable:
+            raise typer.Exit(EXIT_UNSOLVABLE)

@@ -81,6 +81,7 @@ def locate_command(
             )
         write_result(found, target, **run.writing)
         title = f"{len(found.model.names)} images of {source}"
+        run.heed(found.verdict)
         run.show(title, found.summary(), lambda: _locate_table(found, target, run.flags))
 
 
@@ -92,6 +93,7 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
     if facts["num_points"]:
         points = f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
     return [
+        ("verdict", found.verdict.statement),
         ("directions", found.inputs.statement),
         ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
         *([("not placed", shorten(left_out))] if left_out else []),

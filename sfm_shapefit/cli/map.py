@@ -43,6 +43,7 @@ def map_command(
         found = map_database(source, run.options, progress=run.progress)
         write_result(found, target, **run.writing)
         title = f"{found.num_images} images of {source}"
+        run.heed(found.models[0].located.verdict)
         run.show(title, found.summary(), lambda: _map_table(found, target, run.flags))
 
 
@@ -52,7 +53,8 @@ def _map_table(found: "MapResult", out: Path, flags: OutputFlags) -> Rows:
     for number, model in enumerate(found.models):
         located = model.located
         rows += [
-            (f"model {number}", f"{int(located.kept.sum())} of {len(model.names)} images placed"),
+            (f"model {number}", located.verdict.statement),
+            ("  placed", f"{int(located.kept.sum())} of {len(model.names)} images placed"),
             ("  rotations", model.averaging.statement),
             ("  points", str(located.reconstruction.num_points3D())),
             ("  scale", located.gauge.statement),

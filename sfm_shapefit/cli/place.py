@@ -82,6 +82,7 @@ def place_command(
         files = export_files(found, g2o=g2o, onedsfm=onedsfm)
         write_result(found, target, further_files=files, **run.writing)
         title = f"{found.placement.graph.num_nodes} nodes of {source}"
+        run.heed(found.verdict)
         run.show(title, found.summary(), lambda: _place_table(found, target, run.flags))
 
 
@@ -90,6 +91,7 @@ def _place_table(found: "GraphResult", out: Path, flags: OutputFlags) -> Rows:
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     return [
+        ("verdict", found.verdict.statement),
         ("directions", found.statement),
         ("dimension", str(placement.graph.dimension)),
         ("placed", f"{len(placement.cameras)} of {placement.graph.num_nodes} nodes"),

@@ -45,6 +45,7 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
 def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
     """Return what was placed and how certain it is, a sentence each; the facts are those of locate.json."""
     return [
+        *_verdict(facts),
         _placed(drawing),
         _pairs(drawing, facts),
         *_certainty(drawing),
@@ -63,6 +64,12 @@ def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
         *_loose(facts),
         *_unchecked(drawing),
     ]
+
+
+def _verdict(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield the verdict, which earlier outputs lack."""
+    if "verdict" in facts:
+        yield f"Verdict: {shorten(facts['verdict']['statement'], 2 * MAX_TEXT)}."
 
 
 def _placed(drawing: Drawing) -> str:

@@ -20,6 +20,15 @@ Warnings = Annotated[list[str], "What the user should know, a sentence each."]
 Version = Annotated[Literal[1], "Keys are added, never renamed, within a version."]
 
 
+class JudgedModel(TypedDict):
+    """Whether the model can be used; the rules are in `results.model_verdict`."""
+
+    grade: Annotated[Literal["good", "look", "do not use"], "What to do with it."]
+    statement: Annotated[str, "The same in a sentence."]
+    cameras: Annotated[list[str], "To be looked at, the least trusted first."]
+    reasons: Annotated[list[str], "Why the grade is not better."]
+
+
 class LooseGroup(TypedDict):
     """Cameras that are rigid by the graph but loose by the geometry."""
 
@@ -126,6 +135,7 @@ class PlacementSummary(TypedDict):
     """What stands in the locate.json of a model and of a bare graph."""
 
     schema_version: Version
+    verdict: Annotated[JudgedModel, "One verdict for the whole model."]
     options: Options
     num_images: Annotated[int, "Images of the input, posed or not; nodes of a bare graph."]
     num_placed: Annotated[int, "Of these, how many are in the output."]

@@ -19,6 +19,7 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
+from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
@@ -96,12 +97,17 @@ class LocateResult(Displayed):
 
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
-        return f"{images}, {self.reconstruction.num_points3D()} points, {len(self.warnings)} warnings"
+        return f"{self.verdict.grade.value}: {images}, {self.reconstruction.num_points3D()} points"
 
     @cached_property
     def image_names(self) -> tuple[str, ...]:
         """Names of all images of the input, posed or not."""
         return tuple(image.name for image in self.model.reconstruction.images.values())
+
+    @cached_property
+    def verdict(self) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return judge_model(self)
 
     @property
     def certified(self) -> SolverResult:
@@ -243,6 +249,11 @@ class GraphResult(Displayed):
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
         return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
+    @cached_property
+    def verdict(self) -> ModelVerdict:
+        """Whether the model can be used, and why."""
+        return judge_graph(self)
 
     @property
     def certified(self) -> SolverResult:

@@ -91,6 +91,12 @@ def _summarize(
     others = ("pycolmap", "numpy", "scipy", "clarabel")
     return {
         "schema_version": SCHEMA_VERSION,
+        "verdict": {
+            "grade": found.verdict.grade.value,
+            "statement": found.verdict.statement,
+            "cameras": list(found.verdict.cameras),
+            "reasons": list(found.verdict.reasons),
+        },
         "options": asdict(found.options),
         "num_images": placement.graph.num_nodes,
         "num_placed": len(placement.cameras),

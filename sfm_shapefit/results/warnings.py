@@ -14,6 +14,8 @@ from sfm_shapefit.solver.options import Status
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
 _ALARMING_SHARE = 0.5
 _ALARMING_LEVEL_DEG = 5.0
+# If no more pairs contradict refined locations, it does not matter that one of the convex starts collapsed.
+_FEW_REJECTED = 0.1
 # Cameras within so many median distances of the median say how large the scene is.
 _INSIDE = 30.0
 # A camera is uncertain if its standard deviation is more than this share of the extent of all.
@@ -37,33 +39,42 @@ def quality_warnings(placement: Placement) -> Iterator[str]:
     level = placement.assessment.level_deg
     if level > _ALARMING_LEVEL_DEG:
         yield f"the directions are {level:.0f} deg off the solution; do not trust it without a look"
-    refined = placement.refined
-    if refined.collapsed:
+    refined, rejected = placement.refined, len(placement.rejected_pairs) / max(len(placement.pairs), 1)
+    if refined.collapsed and not (refined.is_refined and rejected <= _FEW_REJECTED):
         assert refined.disagreement is not None
         yield (
             f"ShapeFit and LUD disagree about lengths (by {refined.disagreement:.0%}), as they do on long "
             f"chains and under heavy corruption; kept: {refined.start}"
             + ("" if refined.is_refined else ", unrefined; --objective auto refines both and compares")
         )
-    yield from _uncertain_cameras(placement)
-    share = len(placement.rejected_pairs) / max(len(placement.pairs), 1)
-    if share > _ALARMING_SHARE:
-        yield f"{share:.0%} of the pairs contradict the solution; do not trust it without a look"
+    yield from _uncertainty_warnings(placement)
+    if rejected > _ALARMING_SHARE:
+        yield f"{rejected:.0%} of the pairs contradict the solution; do not trust it without a look"
     if placement.second_configuration is not None:
         yield placement.second_configuration.statement()
 
 
-def _uncertain_cameras(placement: Placement) -> Iterator[str]:
+def uncertain_cameras(placement: Placement) -> IntArray:
+    """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
+    if len(placement.cameras) < SMALLEST_PIECE:
+        return np.zeros(0, dtype=np.int64)
+    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
+
+
+def _largest_sigmas(placement: Placement) -> FloatArray:
+    """Return the largest of each camera's standard deviations along the axes."""
+    return np.asarray(placement.assessment.sigmas[: len(placement.cameras)].max(axis=1))
+
+
+def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
     """Yield a warning that names the least certain camera, if any is uncertain."""
-    extent = _extent(placement.locations)
-    largest = placement.assessment.sigmas[: len(placement.cameras)].max(axis=1)
-    uncertain = int(np.sum(largest > _UNCERTAIN_SHARE * extent))
+    largest, uncertain = _largest_sigmas(placement), uncertain_cameras(placement)
     if np.isnan(largest).any():
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
-    if uncertain and len(placement.cameras) >= SMALLEST_PIECE:
+    if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
         yield (
-            f"{uncertain} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
+            f"{len(uncertain)} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
             f"above all {worst}; see sigma and trust in cameras.csv"
         )
 
