@@ -3,6 +3,7 @@
     found  = locate("sparse/0")                             # a COLMAP model with its cameras placed
     write_result(found, "out")
     mapped = map_database("database.db")                    # the same from the matches alone
+    pairs  = relative_rotations("database.db")              # of every two images, and how well each is known
     report = inspect("sparse/0")                            # its view graph diagnosed, nothing solved
     errors = evaluate(found.reconstruction, "truth")
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import inspect
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.map import map_database
+    from sfm_shapefit.commands.relative_rotations import relative_rotations
     from sfm_shapefit.commands.write import WriteOptions, write_map_result, write_result
     from sfm_shapefit.errors import InputError, ShapeFitError, UnsolvableError
     from sfm_shapefit.locate_options import LocateOptions, MapOptions
@@ -46,6 +48,7 @@ _HOMES = {
     "commands.inspect": ("inspect",),
     "commands.locate": ("locate",),
     "commands.map": ("map_database",),
+    "commands.relative_rotations": ("relative_rotations",),
     "commands.write": ("WriteOptions", "write_map_result", "write_result"),
     "errors": ("InputError", "ShapeFitError", "UnsolvableError"),
     "locate_options": ("LocateOptions", "MapOptions"),
@@ -85,6 +88,7 @@ __all__ = [
     "locate",
     "map_database",
     "place",
+    "relative_rotations",
     "solve",
     "write_map_result",
     "write_result",

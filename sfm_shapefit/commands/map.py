@@ -16,8 +16,8 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.model import PosedModel, read_model
-from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
 from sfm_shapefit.commands.locate import Locating, locate_source
+from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
@@ -29,6 +29,7 @@ from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
 
@@ -68,9 +69,8 @@ def map_database(
         images = read_images(path)
         unposed = read_model(images.reconstruction)
     with clock("relative rotations"):
-        relative = relative_rotations(
-            path, unposed, LEAST_MATCHES, options.relative_rotations, options.num_threads(), clock.advance
-        )
+        sharing = Sharing(options.num_threads(), advance=clock.advance)
+        relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
     run = _Run(options, clock, path, images, unposed)
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.average_components(relative, reasons):
@@ -127,7 +127,7 @@ class _Run(NamedTuple):
                 continue
             with self.clock("rotation averaging"):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
-                local = inside._replace(pairs=np.searchsorted(members, inside.pairs))
+                local = replace(inside, pairs=np.searchsorted(members, inside.pairs))
                 try:
                     answer = average_consistently(len(members), local, self.options.min_matches)
                 except UnsolvableError as error:

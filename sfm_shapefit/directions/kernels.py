@@ -148,7 +148,7 @@ def _refine(
         if step < _RESCALINGS:
             noise_px, cap_px = _measure_noise(matches, residuals, _width(noise_px), work)
         width = _width(noise_px)
-        _fill_basis(d, basis)
+        fill_basis(d, basis)
         h00, h01, h11, g0, g1 = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(len(matches)):
             r = residuals[k]
@@ -199,7 +199,7 @@ def _measure_noise(
             count += 1
     if count < 3:
         return cutoff_px / _WIDTH, np.inf
-    noise_px = max(SIGMA_PER_MEDIAN * _median(work, int(count)) * count / (count - 2.0), _MIN_NOISE_PX)
+    noise_px = max(SIGMA_PER_MEDIAN * median(work, int(count)) * count / (count - 2.0), _MIN_NOISE_PX)
     for k in range(len(matches)):
         if abs(residuals[k]) < cutoff_px and matches[k, 9] > _VOTE_SIGMAS * noise_px:
             work[seen] = matches[k, 9]
@@ -210,7 +210,7 @@ def _measure_noise(
 
 
 @inner_kernel
-def _median(values: FloatArray, count: int) -> float:
+def median(values: FloatArray, count: int) -> float:
     """Return the median of the first `count` values, at least one; reorders them."""
     half = count >> 1
     upper = _select(values, count, half)
@@ -248,7 +248,7 @@ def _select(values: FloatArray, count: int, rank: int) -> float:
 
 
 @inner_kernel
-def _fill_basis(d: FloatArray, basis: FloatArray) -> None:
+def fill_basis(d: FloatArray, basis: FloatArray) -> None:
     """Fill the rows of `basis` (2, 3) with an orthonormal basis of the plane orthogonal to d."""
     smallest = 0
     for c in range(1, 3):
@@ -308,7 +308,7 @@ def _fill_moments(
     width = _width(noise_px)
     total, curved, squared, count = 0.0, 0.0, 0.0, 0
     feigned, basis, jacobian = np.empty((3, 3)), np.empty((2, 3)), np.empty(3)
-    _fill_basis(d, basis)
+    fill_basis(d, basis)
     flat, steep = moments[0], moments[1]
     feigned[:] = 0.0
     for k in range(len(matches)):
@@ -381,7 +381,7 @@ def _measure(
             count += 1
     measures[0], measures[1], measures[2], measures[3] = count, max(front, behind), min(front, behind), voters
     if count > 0:
-        measures[6], measures[7] = _median(sizes, int(count)), _median(angles, int(count))
+        measures[6], measures[7] = median(sizes, int(count)), median(angles, int(count))
     return -1.0 if behind > front else 1.0
 
 

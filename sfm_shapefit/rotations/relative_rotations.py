@@ -1,6 +1,7 @@
 """Relative rotations of image pairs, how well each is known, and which of them to believe."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -28,15 +29,12 @@ class RelativeRotations:
     weight_shares: FloatArray
     """(k,) W, the mean robust weight of a pair's matches, in (0, 1]: how well one pose explains them."""
 
-    def subset(self, rows: IntArray | BoolArray) -> "RelativeRotations":
+    def subset(self, rows: IntArray | BoolArray) -> Self:
         """Return the given pairs, in that order."""
-        return RelativeRotations(
-            pairs=self.pairs[rows],
-            rotations=self.rotations[rows],
-            information=self.information[rows],
-            num_matches=self.num_matches[rows],
-            weight_shares=self.weight_shares[rows],
-        )
+        columns: dict[str, Any] = {
+            field.name: getattr(self, field.name) for field in fields(RelativeRotations)
+        }
+        return replace(self, **{name: column[rows] for name, column in columns.items()})
 
     def are_sound(self, least: float = SOUND) -> BoolArray:
         """Return which pairs to believe, (k,): W ln n >= least, and W >= 0.4."""

@@ -13,12 +13,14 @@ import pytest
 from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras, read_model
 from sfm_shapefit.commands.stages.execution import (
-    DirectionTask,
+    PairTask,
+    PairWork,
     WorkerError,
     measure_task,
     measure_with_workers,
     open_executor,
 )
+from sfm_shapefit.directions.estimate import estimate_directions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.directions.pair_directions import concatenate
 from sfm_shapefit.errors import InputError
@@ -39,23 +41,22 @@ def model(workspace):
     return read_model(workspace / "sparse" / "0")
 
 
+WORK = PairWork(estimate=partial(estimate_directions, options=DirectionOptions()), matches_per_task=700)
+
+
 def serial(workspace, model):
     cameras = posed_cameras(model)
     with open_database(workspace / "database.db", model) as database:
         whole = (0, database.num_pairs)
-    task = DirectionTask(
-        database=workspace / "database.db", part=whole, cameras=cameras, options=DirectionOptions()
-    )
+    task = PairTask(database=workspace / "database.db", part=whole, cameras=cameras, work=WORK)
     (found,) = measure_task(task)
     return found
 
 
-def shared(workspace, model, executor, matches_per_task=700):
+def shared(workspace, model, executor):
     seen = []
     with open_database(workspace / "database.db", model) as database:
-        parts = measure_with_workers(
-            database, model, DirectionOptions(), executor, lambda *done: seen.append(done), matches_per_task
-        )
+        parts = measure_with_workers(database, model, WORK, executor, lambda *done: seen.append(done))
     return concatenate(parts), seen
 
 

@@ -1,5 +1,6 @@
 """`map`: from a database alone to models, one for each component, with rotations the matches agree with."""
 
+import dataclasses
 import json
 
 import numpy as np
@@ -9,10 +10,10 @@ from scipy.spatial.transform import Rotation
 import sfm_shapefit
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.relative_rotations import RelativeRotations, relative_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
@@ -95,15 +96,14 @@ def test_inlier_matches_are_enough(tmp_path):
     )
     images = read_images(path)
     unposed, truth = read_model(images.reconstruction), read_model(RING / "sparse" / "0")
-    found = relative_rotations(path, unposed, 15)
+    found = sfm_shapefit.relative_rotations(path)
     i, j = found.pairs.T
     true = truth.rotations[j] @ truth.rotations[i].transpose(0, 2, 1)
     assert len(found.pairs) > 10
-    assert found.sound.all()
+    assert found.are_sound().all()
+    assert found.names == unposed.names
     # Half a pixel of noise at f = 1000 px, over hundreds of matches.
     assert np.median(rotation_angles_deg(found.rotations.transpose(0, 2, 1) @ true)) < 0.2
-    parallel = relative_rotations(path, unposed, 15, threads=3)
-    np.testing.assert_array_equal(parallel.rotations, found.rotations)
     with pytest.raises(UnsolvableError, match="has 15 inlier matches and a relative rotation"):
         sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(relative_rotations="stored"))
 
@@ -158,8 +158,15 @@ def problem(num_false=0, seed=5, n=14):
     turn = Rotation.from_rotvec([0.0, 0.0, np.pi / 2.0]).as_matrix()
     i, j = pairs[false].T
     rotations[false], counts[false] = truth[j] @ turn @ truth[i].transpose(0, 2, 1), 16
-    sound = np.ones(len(pairs), dtype=np.bool_)
-    return truth, RelativeRotations(pairs=pairs, rotations=rotations, num_matches=counts, sound=sound)
+    information = np.tile(np.eye(3), (len(pairs), 1, 1))
+    shares = np.ones(len(pairs))
+    return truth, RelativeRotations(
+        pairs=pairs,
+        rotations=rotations,
+        information=information,
+        num_matches=counts,
+        weight_shares=shares,
+    )
 
 
 def worst_error_deg(answer, truth):
@@ -183,13 +190,13 @@ def test_the_most_consistent_of_several_averagings_is_kept():
 def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
     truth, relative = problem()
     bad = (relative.pairs == 3).any(axis=1)
-    unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # contradict known focal lengths
+    unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
     answers = []
-    for wrong, sound in ((bad, relative.sound), (unsound, ~unsound)):
+    for wrong, shares in ((bad, np.ones(len(bad))), (unsound, np.where(unsound, 0.3, 1.0))):
         rotations = relative.rotations.copy()
         rng = np.random.default_rng(1)
         rotations[wrong] = Rotation.random(int(wrong.sum()), random_state=rng).as_matrix()
-        part = relative._replace(rotations=rotations, sound=sound)
+        part = dataclasses.replace(relative, rotations=rotations, weight_shares=shares)
         answers.append(average_consistently(14, part))
     assert answers[0].agreements[3] < 0.25
     assert np.delete(answers[0].agreements, 3).min() > 0.8

@@ -22,12 +22,12 @@ from dataclasses import replace
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.relative_rotations import RelativeRotations
 from sfm_shapefit.colmap.rotation_averaging import average_rotations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.locate_options import LEAST_MATCHES
 from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations, Loss
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 _LIMITS = (LEAST_MATCHES, 20, 30, 50, 80)
 _LOSSES: tuple[Loss, ...] = ("geman-mcclure", "half-norm")
@@ -58,19 +58,22 @@ def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> 
     """Return an answer per setting that is different from the others and succeeds."""
     seen: set[tuple[int, bool]] = set()
     answers = []
+    sound = relative.are_sound()
     for sound_only in (True, False):
         for limit in (min_matches,) if min_matches else _LIMITS:
             used = relative.num_matches >= limit
             if sound_only:
-                used &= relative.sound
-            setting = int(used.sum()), sound_only and not bool(relative.sound.all())
+                used &= sound
+            setting = int(used.sum()), sound_only and not bool(sound.all())
             if setting in seen or not used.any():
                 continue
             seen.add(setting)
-            pairs, rotations, counts, _ = relative.subset(used)
+            given = relative.subset(used)
             for loss in _LOSSES:
                 with suppress(UnsolvableError):
-                    found = average_rotations(num_images, pairs, rotations, counts, loss=loss)
+                    found = average_rotations(
+                        num_images, given.pairs, given.rotations, given.num_matches, loss=loss
+                    )
                     answers.append(_judge(relative, found, limit, loss, sound_only))
     return answers
 
@@ -84,7 +87,8 @@ def _judge(
 ) -> AveragedRotations:
     """Compare averaged rotations with the sound pairs, or with all if none is sound."""
     rotations, registered = found
-    pairs = relative.subset(relative.sound) if relative.sound.any() else relative
+    sound = relative.are_sound()
+    pairs = relative.subset(sound) if sound.any() else relative
     i, j = pairs.pairs.T
     predicted = rotations[j] @ rotations[i].transpose(0, 2, 1)
     residuals = rotation_angles_deg(pairs.rotations.transpose(0, 2, 1) @ predicted)

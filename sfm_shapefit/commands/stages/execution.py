@@ -1,8 +1,9 @@
-"""Directions measured by other processes or machines, through any `concurrent.futures` executor.
+"""Pairs measured by other processes or machines, through any `concurrent.futures` executor.
 
-The pairs of a database are cut into parts of a few hundred thousand matches. A task names the database file
-and carries the posed cameras, without which rays have no world axes: names, rotations, intrinsics. Its
-worker opens the file read-only for itself, reads its part, and sends the directions back. Every pair is
+What is measured of pairs, directions or relative rotations, is a function of a batch of their matches. The
+pairs of a database are cut into parts of some hundred thousand matches. A task names the database file and
+the function, and carries the cameras, without which matches are no rays: names, rotations, intrinsics. Its
+worker opens the file read-only for itself, reads its part, and sends back what it measured. Every pair is
 estimated by itself with draws of its own, and the parts are put together in their order: the answer is that
 of one process, to the bit, whichever worker did what, and however often.
 
@@ -17,29 +18,39 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Generic, Literal, TypeVar
 
 from sfm_shapefit.colmap.database import MatchDatabase, open_database
 from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_cameras
-from sfm_shapefit.directions.estimate import estimate_directions
-from sfm_shapefit.directions.options import DirectionOptions
-from sfm_shapefit.directions.pair_directions import PairDirections, concatenate
+from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
+Measured = TypeVar("Measured")
 ExecutorKind = Literal["serial", "processes", "dask"]
 
 MATCHES_PER_TASK = 1_000_000
-"""About 1.5 seconds of work, and 230 MB."""
+"""About 1.5 seconds of work for directions, and 230 MB."""
 # Dask gives a task whose worker died to another so many times.
 _RETRIES = 3
 _NO_DASK = "the executor dask needs dask.distributed: pip install '.[dask]' in the folder of sfm_shapefit"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairWork(Generic[Measured]):
+    """What to measure of the pairs of a database."""
+
+    estimate: Callable[[MatchBatch], Measured]
+    """A function of a module, or a `partial` of one, so that other processes find it."""
+    min_matches: int = 1
+    """Pairs with fewer are left out."""
+    matches_per_task: int = MATCHES_PER_TASK
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DirectionTask:
-    """Some pairs of a database, and all that is needed to measure their directions elsewhere."""
+class PairTask(Generic[Measured]):
+    """Some pairs of a database, and all that is needed to measure them elsewhere."""
 
     database: Path
     """Its absolute path, the same for all workers."""
@@ -47,18 +58,17 @@ class DirectionTask:
     """The range of its pairs."""
     cameras: PosedModelFile
     """Of the whole model: the indices of pairs refer to them."""
-    options: DirectionOptions
+    work: PairWork[Measured]
 
 
 def measure_with_workers(
     database: MatchDatabase,
     model: PosedModel,
-    options: DirectionOptions,
+    work: PairWork[Measured],
     executor: Executor,
     advance: Callable[[int, int], None],
-    matches_per_task: int = MATCHES_PER_TASK,
-) -> list[PairDirections]:
-    """Return the directions of all pairs of a database, in parts, as an executor's workers measure them.
+) -> list[Measured]:
+    """Return what an executor's workers measure of all pairs of a database, in parts, in their order.
 
     The executor is not shut down; `advance` is told of the pairs that are done and of their number.
 
@@ -67,22 +77,21 @@ def measure_with_workers(
         InputError: as a worker found the database.
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
-    parts = database.parts(matches_per_task)
-    tasks = [DirectionTask(database=path, part=part, cameras=cameras, options=options) for part in parts]
-    found: list[PairDirections] = []
+    parts = database.parts(work.matches_per_task)
+    tasks = [PairTask(database=path, part=part, cameras=cameras, work=work) for part in parts]
+    found: list[Measured] = []
     for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
         found += measured
         advance(stop, database.num_pairs)
     return found
 
 
-def measure_task(task: DirectionTask) -> list[PairDirections]:
-    """Return the directions of a task's pairs, one value or none; what a worker runs."""
+def measure_task(task: PairTask[Measured]) -> list[Measured]:
+    """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
     model = from_posed_cameras(task.cameras)
     with open_database(task.database, model) as database:
-        batches = database.iter_matches(1, part=task.part)
-        found = [estimate_directions(batch, task.options) for batch in batches]
-    return [concatenate(found)] if found else []
+        batches = database.iter_matches(task.work.min_matches, part=task.part)
+        return [task.work.estimate(batch) for batch in batches]
 
 
 @contextmanager

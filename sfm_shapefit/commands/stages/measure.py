@@ -2,13 +2,14 @@
 
 from concurrent.futures import Executor
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.commands.stages.clock import Clock
-from sfm_shapefit.commands.stages.execution import measure_with_workers
+from sfm_shapefit.commands.stages.execution import PairWork, measure_with_workers
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.memory import Workload
 from sfm_shapefit.directions.estimate import estimate_directions, from_relative_poses
@@ -48,7 +49,8 @@ def measure_directions(
             raise UnsolvableError("the database has no stored relative pose; use directions from matches")
         return from_relative_poses(poses, model.rotations, options)
     if executor is not None and source.database is not None:
-        parts = measure_with_workers(source.database, model, options, executor, clock.advance)
+        work = PairWork(estimate=partial(estimate_directions, options=options))
+        parts = measure_with_workers(source.database, model, work, executor, clock.advance)
     else:
         threads = options.num_threads()
         batches = source.counted(source.batches(), clock.advance)
