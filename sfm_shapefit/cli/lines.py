@@ -7,7 +7,6 @@ from sfm_shapefit.cli.flags import OutputFlags
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.bundle_adjustment import Adjusted
-    from sfm_shapefit.solver.options import SolverResult
 
 
 def further_piece_rows(facts: dict[str, Any]) -> Rows:
@@ -19,14 +18,6 @@ def further_piece_rows(facts: dict[str, Any]) -> Rows:
         if piece["folder"]
     ]
     return [("further pieces", shorten(lines))] if lines else []
-
-
-def describe_objective(solve: "SolverResult") -> str:
-    """Say what the solver reached, how sure that is, and which solver it was."""
-    chosen = f"{solve.method}: {solve.method_reason}"
-    if not solve.status.has_certificate:
-        return f"{solve.objective:.6g}, not certified ({chosen})"
-    return f"{solve.objective:.6g}, certified to {max(solve.gap, 0.0):.1e} ({chosen})"
 
 
 def describe_time(timings_s: dict[str, float], detailed: bool) -> str:

@@ -21,7 +21,6 @@ from sfm_shapefit.cli.flags import (
 from sfm_shapefit.cli.frame import command_run
 from sfm_shapefit.cli.lines import (
     describe_adjustment,
-    describe_objective,
     describe_time,
     further_piece_rows,
     name_pictures,
@@ -100,13 +99,13 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
         *_group_rows(facts),
         *further_piece_rows(facts),
         ("pairs", _describe_pairs(facts)),
-        ("objective", describe_objective(found.certified)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
         ("centers", found.placement.refined.statement()),
         ("scale", found.gauge.statement),
         ("points", points),
         *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),
         *[("warning", warning) for warning in found.warnings],
+        ("certificate", found.departure.statement),
         ("time", describe_time(found.timings_s, flags.verbose)),
         ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),
     ]

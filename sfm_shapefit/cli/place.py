@@ -9,7 +9,7 @@ from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import command_run
-from sfm_shapefit.cli.lines import describe_objective, describe_time, further_piece_rows, name_pictures
+from sfm_shapefit.cli.lines import describe_time, further_piece_rows, name_pictures
 from sfm_shapefit.refinement.options import PlacementOptions
 
 if TYPE_CHECKING:
@@ -105,9 +105,9 @@ def _place_table(found: "GraphResult", out: Path, flags: OutputFlags) -> Rows:
             ),
         ),
         ("residuals", _describe_residuals(facts["residuals_deg"])),
-        ("objective", describe_objective(found.certified)),
         ("locations", placement.refined.statement()),
         *[("warning", warning) for warning in facts["warnings"]],
+        ("certificate", found.departure.statement),
         ("time", describe_time(found.timings_s, flags.verbose)),
         ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),
     ]

@@ -237,8 +237,10 @@ def _tiles(drawing: Drawing, facts: dict[str, Any]) -> list[list[str]]:
         [f"{int(cameras.placed.sum()):,} / {len(cameras.names):,}", "cameras placed"],
         [f"{int(np.sum(classes == PairClass.AGREES)):,} / {len(classes):,}", "pairs agree"],
         [f"{facts['residual_level_deg']:.2g}°", "level of the residuals"],
-        [f"{max(facts['solve']['gap'], 0.0):.0e}", "certified gap of the optimum"],
     ]
+    observations = facts.get("agreement", {}).get("observations")
+    if observations is not None:
+        tiles.append([f"{observations:.0%}", "of the observations see a point"])
     if np.isfinite(trust).any():
         tiles.append([f"{np.nanmin(trust):.2f}", f"least trust, median {np.nanmedian(trust):.2f}"])
     if drawing.points.num_all:

@@ -49,8 +49,8 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         _placed(drawing),
         _pairs(drawing, facts),
         *_certainty(drawing),
-        _optimum(facts["solve"]),
         f"Scale and origin: {shorten(facts.get('scale') or _SOLVER_SCALE, 2 * MAX_TEXT)}.",
+        *_delivered(facts),
     ]
 
 
@@ -112,16 +112,10 @@ def _certainty(drawing: Drawing) -> Iterator[str]:
     )
 
 
-def _optimum(solve: dict[str, Any]) -> str:
-    """Say what the certificate proves."""
-    if solve["status"] == "not_solved":
-        return f"Nothing certifies these positions as a whole ({solve['method']}: {solve['method_reason']})."
-    others = {True: ", and no other placement is as good", False: ", but others may be as good", None: ""}
-    certified = "is certified" if solve["status"] == "converged" else "is not certified to the tolerance"
-    return (
-        f"The convex optimum {certified}: its objective {solve['objective']:.4g} is within "
-        f"{max(solve['gap'], 0.0):.1e} of the least possible{others[solve['unique']]}."
-    )
+def _delivered(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what is certified and what is delivered, which earlier outputs lack."""
+    if "delivered" in facts:
+        yield f"The certificate: {facts['delivered']['statement']}."
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

@@ -131,6 +131,18 @@ class ModelInputs(TypedDict):
     directions: Annotated[str, "Where the directions came from."]
 
 
+class Delivered(TypedDict):
+    """What is certified, and how far the cameras that are delivered stand from it."""
+
+    statement: Annotated[str, "Both in words."]
+    from_certified_median: Annotated[
+        float | None,
+        "Of the distances from the certified optimum after the similarity that fits best, as a share of the "
+        "scene's radius; null if nothing is certified.",
+    ]
+    from_certified_max: Annotated[float | None, "The largest of these distances."]
+
+
 class PlacementSummary(TypedDict):
     """What stands in the locate.json of a model and of a bare graph."""
 
@@ -148,6 +160,7 @@ class PlacementSummary(TypedDict):
     residuals_deg: Residuals
     loose_groups: Annotated[list[LooseGroup], "Groups of cameras that hang loose."]
     pieces: Annotated[list[Piece], "Parallel-rigid pieces, most cameras first."]
+    delivered: Annotated[Delivered, "What became of the certified optimum."]
     solve: Annotated[Solve, "The certified solve."]
     finish: Annotated[Finish, "What became of its optimum."]
     timings_s: Timings

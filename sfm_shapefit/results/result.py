@@ -18,6 +18,7 @@ from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
@@ -103,6 +104,13 @@ class LocateResult(Displayed):
     def image_names(self) -> tuple[str, ...]:
         """Names of all images of the input, posed or not."""
         return tuple(image.name for image in self.model.reconstruction.images.values())
+
+    @cached_property
+    def departure(self) -> Departure:
+        """What is certified, what is delivered, and how far apart they are."""
+        image_ids = self.model.image_ids[self.placement.cameras]
+        centers = _centers_of(self.reconstruction, image_ids, self.kept)
+        return compare_with_certified(self.placement, centers, adjusted=self.adjusted is not None)
 
     @cached_property
     def verdict(self) -> ModelVerdict:
@@ -249,6 +257,11 @@ class GraphResult(Displayed):
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
         return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
+    @cached_property
+    def departure(self) -> Departure:
+        """What is certified, what is delivered, and how far apart they are."""
+        return compare_with_certified(self.placement, self.placement.locations, adjusted=False)
 
     @cached_property
     def verdict(self) -> ModelVerdict:

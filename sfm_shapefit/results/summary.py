@@ -113,6 +113,11 @@ def _summarize(
             for group in placement.assessment.loose_groups
         ],
         "pieces": piece_rows(placement, solved),
+        "delivered": {
+            "statement": found.departure.statement,
+            "from_certified_median": found.departure.median,
+            "from_certified_max": found.departure.largest,
+        },
         "solve": cast("Solve", placement.certified.summary()),
         "finish": {
             "start": refined.start,
