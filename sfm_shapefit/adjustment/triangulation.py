@@ -31,6 +31,8 @@ _PAIRS = 15
 _STEPS = 5
 # Of the distance of a point that a step may go before the steps end.
 _STILL = 1e-9
+# Of so many rays one makes the widest angle with another, nearly always.
+_WIDE_AMONG = 64
 # So many points a track may be of.
 _MOST_POINTS = 3
 
@@ -88,27 +90,16 @@ def triangulate_tracks(tracks: ObservedTracks, poses: CameraPoses, limits: Point
     figures = np.array(
         [limits.max_error_px**2, math.cos(math.radians(limits.min_angle_deg)), limits.min_length]
     )
+    most = _MOST_POINTS if tracks.may_split else 1
     given = (
         tracks.offsets, tracks.cameras, tracks.on_plane, poses.rotations, poses.centers,
-        poses.focal_lengths_px, poses.images, figures, _MOST_POINTS if tracks.may_split else 1, int(lengths.max(initial=0)),
+        poses.focal_lengths_px, poses.images, figures, most, int(lengths.max(initial=0)),
     )  # fmt: skip
     cuts = np.searchsorted(tracks.offsets, np.arange(0, len(seen), _SLICE)[1:]).tolist()
     count = 0
     for begin, end in zip([0, *cuts], [*cuts, tracks.num_tracks], strict=True):
         count = _triangulate(begin, end, count, given, points, track_of, seen)
     return TriangulatedPoints(points=points[:count], tracks=track_of[:count], points_seen=seen)
-
-
-@inner_kernel
-def _error(rotation: Any, center: Any, u: float, v: float, x: float, y: float, z: float) -> float:
-    """Return the squared error on the plane z = 1, infinite behind the camera."""
-    x, y, z = x - center[0], y - center[1], z - center[2]
-    depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z
-    if not depth > 0.0:
-        return float(np.inf)
-    du = (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z) / depth - u
-    dv = (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z) / depth - v
-    return du * du + dv * dv
 
 
 @inner_kernel
@@ -156,133 +147,175 @@ def _step(
     return float(np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)) / far
 
 
+@inner_kernel
+def _gather(
+    first: int, last: int, cameras: Any, plane: Any, rotations: Any, seen: Any, rows: Any, rays: Any
+) -> int:
+    """Write the observations of no point yet and their rays in axes of the world; return how many."""
+    k = 0
+    for row in range(first, last):
+        u, v = plane[row, 0], plane[row, 1]
+        if seen[row] != -1 or np.isnan(u + v):
+            continue
+        rotation, size = rotations[cameras[row]], np.sqrt(1.0 + u * u + v * v)
+        for a in range(3):
+            rays[k, a] = (u * rotation[0, a] + v * rotation[1, a] + rotation[2, a]) / size
+        rows[k] = row
+        k += 1
+    return k
+
+
+@inner_kernel
+def _pair(s: int, k: int) -> Any:
+    """Return the s-th pair of k observations that is tried."""
+    if k * (k - 1) > 2 * _PAIRS:
+        i = s * k // _PAIRS
+        return i, (i + 1 + (7 * s + 3) % 16 * (k - 1) // 16) % k
+    i = 0
+    while s >= k - 1 - i:
+        s -= k - 1 - i
+        i += 1
+    return i, i + 1 + s
+
+
+@inner_kernel
+def _middle(p: Any, along_p: Any, q: Any, along_q: Any, cosine: float, point: Any) -> bool:
+    """Write the middle of the shortest line between two rays; return whether their angle is enough."""
+    d = along_p[0] * along_q[0] + along_p[1] * along_q[1] + along_p[2] * along_q[2]
+    if d > cosine:
+        return False
+    by_p = by_q = 0.0
+    for a in range(3):
+        by_p += along_p[a] * (q[a] - p[a])
+        by_q += along_q[a] * (q[a] - p[a])
+    sine = max(1.0 - d * d, 1e-12)
+    far_p, far_q = (by_p - d * by_q) / sine, (d * by_p - by_q) / sine
+    for a in range(3):
+        point[a] = 0.5 * (p[a] + far_p * along_p[a] + q[a] + far_q * along_q[a])
+    return True
+
+
+@inner_kernel
+def _weigh(
+    rows: Any, k: int, cameras: Any, plane: Any, rotations: Any, centers: Any, focals: Any, limit: float,
+    point: Any, errors: Any, weights: Any,
+) -> int:  # fmt: skip
+    """Write squared errors in pixels, and weights: focal^2 within the limit, else 0; return how many are."""
+    inside = 0
+    for o in range(k):
+        row = rows[o]
+        at = cameras[row]
+        scale = focals[at] ** 2
+        x, y, z = point[0] - centers[at, 0], point[1] - centers[at, 1], point[2] - centers[at, 2]
+        depth = rotations[at, 2, 0] * x + rotations[at, 2, 1] * y + rotations[at, 2, 2] * z
+        errors[o] = np.inf
+        if depth > 0.0:
+            du = rotations[at, 0, 0] * x + rotations[at, 0, 1] * y + rotations[at, 0, 2] * z
+            dv = rotations[at, 1, 0] * x + rotations[at, 1, 1] * y + rotations[at, 1, 2] * z
+            du, dv = du / depth - plane[row, 0], dv / depth - plane[row, 1]
+            errors[o] = scale * (du * du + dv * dv)
+        weights[o] = 0.0
+        if errors[o] <= limit:
+            weights[o] = scale
+            inside += 1
+    return inside
+
+
+@inner_kernel
+def _look_back(
+    rows: Any, k: int, cameras: Any, centers: Any, images: Any, errors: Any, weights: Any, point: Any,
+    rays: Any,
+) -> int:  # fmt: skip
+    """Keep the best observation of each image, others get weight -1; write the rays back, return how many."""
+    length = 0
+    for o in range(k):
+        if weights[o] == 0.0:
+            continue
+        image = images[cameras[rows[o]]]
+        other = o + 1
+        while other < k and images[cameras[rows[other]]] == image and weights[o] > 0.0:
+            if weights[other] > 0.0:
+                weights[o if errors[other] < errors[o] else other] = -1.0
+            other += 1
+        if weights[o] > 0.0:
+            center = centers[cameras[rows[o]]]
+            x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
+            size = np.sqrt(x * x + y * y + z * z)
+            rays[length, 0], rays[length, 1], rays[length, 2] = x / size, y / size, z / size
+            length += 1
+    return length
+
+
+@inner_kernel
+def _is_wide(rays: Any, length: int, cosine: float) -> bool:
+    """Return whether two of the rays make the least angle; of very many, one is among the first."""
+    for o in range(length):
+        for other in range(min(o, _WIDE_AMONG)):
+            d = rays[o, 0] * rays[other, 0] + rays[o, 1] * rays[other, 1] + rays[o, 2] * rays[other, 2]
+            if d <= cosine:
+                return True
+    return False
+
+
+@inner_kernel
+def _search(
+    rows: Any, rays: Any, k: int, cameras: Any, plane: Any, rotations: Any, centers: Any, focals: Any,
+    limit: float, cosine: float, point: Any, best: Any, errors: Any, weights: Any,
+) -> bool:  # fmt: skip
+    """Write the point of two observations with the least truncated squares; return whether there is one."""
+    least = np.inf
+    for s in range(min(k * (k - 1) // 2, _PAIRS)):
+        i, j = _pair(s, k)
+        p, q = centers[cameras[rows[i]]], centers[cameras[rows[j]]]
+        if not _middle(p, rays[i], q, rays[j], cosine, point):
+            continue
+        _weigh(rows, k, cameras, plane, rotations, centers, focals, limit, point, errors, weights)
+        cost = 0.0
+        for o in range(k):
+            cost += min(errors[o], limit)
+        if cost < least:
+            least = cost
+            best[0], best[1], best[2] = point[0], point[1], point[2]
+    return bool(least < np.inf)
+
+
 @kernel
 def _triangulate(begin: int, end: int, count: int, given: Any, points: Any, track_of: Any, seen: Any) -> int:
     """Write the points of the tracks begin..end-1 from number `count` on; return their number then."""
     offsets, cameras, plane, rotations, centers, focals, images, figures, most, longest = given
     limit, cosine, fewest = figures[0], figures[1], figures[2]
-    rows = np.empty(longest, np.int64)
-    rays = np.empty((longest, 3))
-    weights, errors, scales = np.empty(longest), np.empty(longest), np.empty(longest)
+    rows, rays = np.empty(longest, np.int64), np.empty((longest, 3))
+    weights, errors = np.empty(longest), np.empty(longest)
     best, point = np.empty(3), np.empty(3)
     for t in range(begin, end):
         for _ in range(most):
-            # What is not yet of a point, and its rays in axes of the world.
-            k = 0
-            for row in range(offsets[t], offsets[t + 1]):
-                u, v = plane[row, 0], plane[row, 1]
-                if seen[row] != -1 or not (u == u and v == v):
-                    continue
-                rotation, size = rotations[cameras[row]], np.sqrt(1.0 + u * u + v * v)
-                for a in range(3):
-                    rays[k, a] = (u * rotation[0, a] + v * rotation[1, a] + rotation[2, a]) / size
-                rows[k], scales[k] = row, focals[cameras[row]] ** 2
-                k += 1
+            k = _gather(offsets[t], offsets[t + 1], cameras, plane, rotations, seen, rows, rays)
             if k < fewest:
                 break
-            # The best point of two observations.
-            num_pairs = min(k * (k - 1) // 2, _PAIRS)
-            is_few = num_pairs < _PAIRS or k * (k - 1) // 2 == _PAIRS
-            least = np.inf
-            i, j = 0, 0
-            for s in range(num_pairs):
-                if is_few:
-                    j += 1
-                    if j == k:
-                        i += 1
-                        j = i + 1
-                else:
-                    i = s * k // num_pairs
-                    j = (i + 1 + (s * 7 + 3) * (k - 1) // 16 % (k - 1)) % k
-                d = rays[i, 0] * rays[j, 0] + rays[i, 1] * rays[j, 1] + rays[i, 2] * rays[j, 2]
-                if d > cosine:
-                    continue
-                p, q = centers[cameras[rows[i]]], centers[cameras[rows[j]]]
-                along_i = along_j = 0.0
-                for a in range(3):
-                    along_i += rays[i, a] * (q[a] - p[a])
-                    along_j += rays[j, a] * (q[a] - p[a])
-                sine = max(1.0 - d * d, 1e-12)
-                far_i, far_j = (along_i - d * along_j) / sine, (d * along_i - along_j) / sine
-                for a in range(3):
-                    point[a] = 0.5 * (p[a] + far_i * rays[i, a] + q[a] + far_j * rays[j, a])
-                cost = 0.0
-                for o in range(k):
-                    at = cameras[rows[o]]
-                    error = _error(
-                        rotations[at], centers[at], plane[rows[o], 0], plane[rows[o], 1], point[0], point[1],
-                        point[2],
-                    )  # fmt: skip
-                    cost += min(error * scales[o], limit)
-                    if cost >= least:
-                        break
-                if cost < least:
-                    least = cost
-                    for a in range(3):
-                        best[a] = point[a]
-            if least == np.inf:
-                break
-            # Its best place by what is within the limit.
-            moved = 1.0
-            for step in range(_STEPS + 1):
-                inside = 0
-                for o in range(k):
-                    at = cameras[rows[o]]
-                    error = _error(
-                        rotations[at], centers[at], plane[rows[o], 0], plane[rows[o], 1], best[0], best[1],
-                        best[2],
-                    )  # fmt: skip
-                    errors[o] = error * scales[o]
-                    weights[o] = scales[o] if errors[o] <= limit else 0.0
-                    inside += errors[o] <= limit
-                if inside < 2 or step == _STEPS or moved < _STILL:
+            found = _search(
+                rows, rays, k, cameras, plane, rotations, centers, focals, limit, cosine, point, best, errors,
+                weights,
+            )  # fmt: skip
+            moved, inside = 1.0, 0
+            for step in range(_STEPS + 1 if found else 0):
+                inside = _weigh(
+                    rows, k, cameras, plane, rotations, centers, focals, limit, best, errors, weights
+                )  # fmt: skip
+                if inside < fewest or step == _STEPS or moved < _STILL:
                     break
                 moved = _step(rows, k, cameras, plane, rotations, centers, weights, best)
                 if moved < 0.0:
                     inside = 0
                     break
-            # One observation of each image; they ascend.
-            length = 0
-            for o in range(k):
-                if weights[o] == 0.0:
-                    continue
-                other = o + 1
-                while other < k and images[cameras[rows[other]]] == images[cameras[rows[o]]]:
-                    if weights[other] > 0.0:
-                        if errors[other] < errors[o]:
-                            weights[o] = -1.0
-                            break
-                        weights[other] = -1.0
-                    other += 1
-                if weights[o] < 0.0:
-                    continue
-                center = centers[cameras[rows[o]]]
-                x, y, z = best[0] - center[0], best[1] - center[1], best[2] - center[2]
-                size = np.sqrt(x * x + y * y + z * z)
-                rays[length, 0], rays[length, 1], rays[length, 2] = x / size, y / size, z / size
-                length += 1
-            if inside < fewest or length < fewest:
+            if inside < fewest:
                 break
-            is_wide = False
-            for o in range(length):
-                for other in range(o):
-                    d = (
-                        rays[o, 0] * rays[other, 0]
-                        + rays[o, 1] * rays[other, 1]
-                        + rays[o, 2] * rays[other, 2]
-                    )
-                    if d <= cosine:
-                        is_wide = True
-                        break
-                if is_wide:
-                    break
-            if not is_wide:
+            length = _look_back(rows, k, cameras, centers, images, errors, weights, best, rays)
+            if length < fewest or not _is_wide(rays, length, cosine):
                 break
             for o in range(k):
                 if weights[o] != 0.0:
                     seen[rows[o]] = count if weights[o] > 0.0 else -2
-            for a in range(3):
-                points[count, a] = best[a]
+            points[count, 0], points[count, 1], points[count, 2] = best[0], best[1], best[2]
             track_of[count] = t
             count += 1
     # An observation that another of its image surpasses is of no point either.

@@ -7,6 +7,7 @@ those that see something take part. No ray is more than 28 degrees off the axis 
 is at most 1.3 times that of the image, even for rays at right angles to the camera or behind it.
 """
 
+import itertools
 from collections.abc import Collection
 from dataclasses import dataclass
 
@@ -108,7 +109,7 @@ def read_frames(reconstruction: pycolmap.Reconstruction, fixed_frames: Collectio
     images = [reconstruction.image(i) for i in image_ids]
     frame_ids = sorted({image.frame_id for image in images})
     place = {frame: k for k, frame in enumerate(frame_ids)}
-    frame_poses = [reconstruction.frame(i).rig_from_world for i in frame_ids]
+    frame_poses = [_pose(reconstruction.frame(i)) for i in frame_ids]
     rotations = np.array([pose.rotation.matrix() for pose in frame_poses]).reshape(-1, 3, 3)
     translations = np.array([pose.translation for pose in frame_poses]).reshape(-1, 3)
     camera_ids = sorted({image.camera_id for image in images})
@@ -150,8 +151,11 @@ def collect_tracks(
         tracks: as in `colmap.structure.triangulate`.
         min_length: tracks of fewer observations are left out.
     """
-    is_graph = isinstance(tracks, pycolmap.CorrespondenceGraph)
-    seen = _join_graph(frames, reconstruction, tracks) if is_graph else _points_of(frames, tracks)
+    may_split = isinstance(tracks, pycolmap.CorrespondenceGraph)
+    if isinstance(tracks, pycolmap.CorrespondenceGraph):
+        seen = _join_graph(frames, reconstruction, tracks)
+    else:
+        seen = _points_of(frames, tracks)
     images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
     keypoints = np.concatenate([keypoints for keypoints, _ in seen])
     ids = np.concatenate([names for _, names in seen])
@@ -168,7 +172,7 @@ def collect_tracks(
         pixels=pixels[order],
         on_plane=on_plane[order],
         ids=names,
-        may_split=is_graph,
+        may_split=may_split,
     )
 
 
@@ -189,7 +193,7 @@ def with_poses(
         if not turns and (center == old.centers[k]).all():
             continue
         frame = copy.frame(frame_id)
-        turn = pycolmap.Rotation3d(rotation) if turns else frame.rig_from_world.rotation
+        turn = pycolmap.Rotation3d(rotation) if turns else _pose(frame).rotation
         frame.rig_from_world = pycolmap.Rigid3d(turn, -(rotation @ center))
     for before, after, camera_id in zip(old.lenses, new.lenses, new.colmap_camera_of_lens, strict=True):
         if after.parameters != before.parameters:
@@ -229,6 +233,13 @@ def add_points(
         begin = end
 
 
+def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
+    """Return rig_from_world of a frame of a posed image."""
+    pose = frame.rig_from_world
+    assert pose is not None
+    return pose
+
+
 def _lens(camera: pycolmap.Camera) -> Lens:
     """Return the lens of a camera, or that of the views of one that is undistorted."""
     if camera.model_name in _ADJUSTED_MODELS:
@@ -244,7 +255,7 @@ def _focal_length_px(camera: pycolmap.Camera) -> float:
 
 
 def _views(camera: pycolmap.Camera) -> FloatArray:
-    """Return the views of a camera, (v, 3, 3) view_from_camera; the camera itself if it is adjusted as it is."""
+    """Return the views of a camera, (v, 3, 3) view_from_camera: itself if it is adjusted as it is."""
     if camera.model_name in _ADJUSTED_MODELS:
         return np.eye(3)[None]
     return _CUBE
@@ -253,12 +264,13 @@ def _views(camera: pycolmap.Camera) -> FloatArray:
 def _sensor_from_rig(
     reconstruction: pycolmap.Reconstruction, image: pycolmap.Image
 ) -> tuple[FloatArray, FloatArray]:
-    """Return rotation and translation of the sensor that took an image, exactly the identity for a reference."""
+    """Return rotation and translation of the sensor of an image, exactly the identity for a reference."""
     sensor = reconstruction.camera(image.camera_id).sensor_id
     rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
     if rig.is_ref_sensor(sensor):
         return np.eye(3), np.zeros(3)
     pose = rig.sensor_from_rig(sensor)
+    assert pose is not None  # `read_model` refuses others
     return pose.rotation.matrix(), pose.translation
 
 
@@ -287,7 +299,7 @@ def _look_up(
     cameras = np.searchsorted(frames.images, images)
     pixels, on_plane = np.empty((len(images), 2)), np.empty((len(images), 2))
     ends = np.searchsorted(images, np.arange(len(frames.image_ids) + 1)).tolist()
-    for k, (begin, end) in enumerate(zip(ends[:-1], ends[1:], strict=True)):
+    for k, (begin, end) in enumerate(itertools.pairwise(ends)):
         image = reconstruction.image(frames.image_ids[k])
         camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
         xy = points2d_xy(image)[keypoints[own]]

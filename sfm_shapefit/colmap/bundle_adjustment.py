@@ -17,7 +17,6 @@ One thread does all, as the answer must not depend on their number.
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 import pycolmap
@@ -30,10 +29,7 @@ from sfm_shapefit.colmap.adjustment import PosedFrames, add_points, collect_trac
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
-from sfm_shapefit.colmap.structure_options import StructureOptions
-from sfm_shapefit.errors import UnsolvableError
-
-Adjuster = Literal["own", "ceres"]
+from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 
 # Of each solve of all tracks: scale of the Cauchy loss in pixel thresholds, and the relative fall to end at.
 _SOLVES = ((0.25, 1e-3), (0.0625, 1e-4))
@@ -78,13 +74,13 @@ def bundle_adjust(
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
 
     Returns:
-        The adjusted model, with ids and colors of points as from `triangulate`. What of the gauge fixed frames
-        and rigs do not hold stays near the seed's: by our own, the centers' best similarity to the seed's is
-        the identity; Ceres holds two cameras. The poses of sensors in their rigs stay what they are, and
-        intrinsics to the bit.
+        The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
+        frames and rigs do not hold stays near the seed's: by our own, the centers' best similarity to the
+        seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs stay what they
+        are, and intrinsics to the bit.
 
     Raises:
-        UnsolvableError: if no point can be triangulated, or the adjustment diverges.
+        UnsolvableError: if no point can be triangulated, or Ceres diverges.
     """
     structure_options = structure_options or StructureOptions()
     if adjuster == "ceres":
@@ -195,20 +191,11 @@ class _Run:
             found = self.triangulate(1.0)
             refuse_without_points(len(found.points))
             adjusted = self.solve(self.frames.problem(self.tracks, found), scale, fall)
-        self._refuse_infinite(seed)
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks
         add_points(answer, self.frames, self.tracks, found, colors)
         return answer, initial_error_px, self.iterations, self.converged
-
-    def _refuse_infinite(self, seed: pycolmap.Reconstruction) -> None:
-        lost = ~np.isfinite(self.frames.centers).all(axis=1)
-        if lost.any():
-            raise UnsolvableError(
-                f"the bundle adjustment drove frame {self.frames.frame_ids[int(np.argmax(lost))]} to "
-                "infinity; run without bundle adjustment"
-            )
 
 
 def _mean_error_px(problem: AdjustmentProblem) -> float:

@@ -79,7 +79,11 @@ def _solve(
         config.add_image(image_id)
     for frame_id in sorted(set(fixed_frames) & set(reconstruction.reg_frame_ids())):
         config.set_constant_rig_from_world_pose(frame_id)
-    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    has_scale = any(_has_offsets(rig) for rig in reconstruction.rigs.values())
+    if not has_scale:
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    elif not fixed_frames:  # rigs know the scale, and one frame holds the rest
+        config.set_constant_rig_from_world_pose(min(reconstruction.reg_frame_ids()))
     settings = pycolmap.BundleAdjustmentOptions()
     settings.print_summary = is_heard()
     settings.refine_focal_length = settings.refine_principal_point = settings.refine_extra_params = False
@@ -98,3 +102,9 @@ def _solve(
     converged = summary.termination_type == pycolmap.BundleAdjustmentTerminationType.CONVERGENCE
     steps = ceres.num_successful_steps + ceres.num_unsuccessful_steps - 1  # the start counts as one
     return steps, converged
+
+
+def _has_offsets(rig: pycolmap.Rig) -> bool:
+    """Return whether a sensor stands off its rig's origin."""
+    poses = [pose for pose in rig.non_ref_sensors.values() if pose is not None]
+    return any(bool(np.any(pose.translation)) for pose in poses)
