@@ -7,7 +7,7 @@ the options of all its stages, and some that concern the whole.
 from dataclasses import dataclass
 from typing import Literal
 
-from sfm_shapefit.colmap.structure_options import StructureOptions
+from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.settings import explained, option
@@ -75,6 +75,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     bundle_adjust: bool = option(
         False, "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."
     )
+    adjuster: Adjuster = option(
+        "own",
+        "What adjusts if bundle_adjust is asked for: our own, whose answer is the same bit by bit and "
+        "several times faster, or pycolmap's Ceres.",
+    )
     min_trust: float = option(
         0.6,
         "Cameras of less trust are left out of the output and listed with the reason; 0 keeps all. "
@@ -92,6 +97,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self._check_distance()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
+        if self.adjuster != "own" and not self.bundle_adjust:
+            raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_rotations and self.directions == "relative-poses":
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):

@@ -5,7 +5,7 @@ the very same quaternion, so that rotations and intrinsics come out bit-identica
 their rigs are not touched: all images of a frame move with it.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.model import PYCOLMAP_ERRORS, PosedModel
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.geometry import Similarity
 
 Keypoints = Callable[[int], FloatArray | None]
 """Returns the pixels (k, 2) of the keypoints of an image, by its index into `PosedModel.image_ids`."""
@@ -87,6 +88,24 @@ def turn_model(reconstruction: pycolmap.Reconstruction, axes: FloatArray) -> pyc
     """Return the model turned about the origin: cameras and points, x -> axes x."""
     copy = pycolmap.Reconstruction(reconstruction)
     copy.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(axes), np.zeros(3)))
+    return copy
+
+
+def transform_model(
+    reconstruction: pycolmap.Reconstruction, similarity: Similarity, fixed_frames: Collection[int] = ()
+) -> pycolmap.Reconstruction:
+    """Return the model under a similarity: cameras and points, and sensors in rigs if it scales.
+
+    Args:
+        reconstruction: not changed.
+        similarity: of the world.
+        fixed_frames: ids of frames that it does not move; they keep their poses to the last bit.
+    """
+    copy = pycolmap.Reconstruction(reconstruction)
+    rotation = pycolmap.Rotation3d(similarity.rotation)
+    copy.transform(pycolmap.Sim3d(similarity.scale, rotation, similarity.translation))
+    for frame_id in fixed_frames:
+        copy.frame(frame_id).rig_from_world = reconstruction.frame(frame_id).rig_from_world
     return copy
 
 

@@ -1,8 +1,12 @@
 """What a 3D point must satisfy. Pure data, and cheap to import."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 from sfm_shapefit.settings import Settings, explained, option
+
+Adjuster = Literal["own", "ceres"]
+"""What adjusts bundles: our own, or pycolmap's Ceres."""
 
 
 @explained

@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
@@ -123,14 +123,16 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         if known.centers is not None:
             placement = move_cameras(placement, known.centers[placement.cameras], options)
         kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-        gauge = choose_gauge(model, placement, kept, rigid, options, known.priors)
+        rule = GaugeRule(model, rigid, options, known.priors)
+        gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
         if known.priors is not None and options.refine_with_priors:
             placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
             kept = select_trusted(placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
-    located = Located(placement, kept, gauge, rigid.fixed)
+    located = Located(placement, kept, gauge, rigid.fixed, rule)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
+    located = located._replace(gauge=seeded.gauge)
     warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -142,7 +144,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         kept=kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
         agreeing_observations=seeded.agreeing_observations,
-        gauge=gauge,
+        gauge=seeded.gauge,
         adjusted=seeded.adjusted,
         timings_s=clock.seconds,
         warnings=warnings,

@@ -12,6 +12,9 @@ from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH, Metric
 from sfm_shapefit.refinement.options import PlacementOptions
 
+PULLED = "; the priors moved cameras by "
+"""What the statement of the gauge goes on with, before how far."""
+
 
 def pull_to_priors(
     placement: Placement, gauge: Gauge, priors: PositionPriors, options: PlacementOptions
@@ -48,7 +51,7 @@ def pull_to_priors(
     )
     return (
         replace_locations(placement, kept, options),
-        replace(gauge, statement=f"{gauge.statement}; the priors moved cameras by {by:.3g} (median)"),
+        replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),
     )
 
 

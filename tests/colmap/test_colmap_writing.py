@@ -430,11 +430,12 @@ def test_a_point_stays_if_what_is_asked_for_is_less_than_it_has(xyz, image_ids, 
         assert kept.num_points3D() == 120 + (value == loose)
 
 
+@pytest.mark.parametrize("adjuster", ["own", "ceres"])
 @SOURCES
-def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source):
+def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source, adjuster):
     original, points = ring_model()
     disturbed = ring_centers() + np.random.default_rng(3).normal(scale=0.03 * RADIUS, size=(NUM_IMAGES, 3))
-    adjusted = bundle_adjust(*seeded_with(source, original, disturbed))
+    adjusted = bundle_adjust(*seeded_with(source, original, disturbed), adjuster=adjuster)
     centers = centers_of(adjusted.reconstruction)
     aligned = fit_similarity_l1(centers, ring_centers()).apply(centers)
     # the solver stops when the cost falls by less than 1e-6 of itself; 0.18 units of disturbance before
@@ -464,15 +465,16 @@ def test_adjusted_points_satisfy_the_same_filters():
 
 
 def test_too_few_iterations_and_no_points_are_told(monkeypatch):
-    monkeypatch.setattr("sfm_shapefit.colmap.bundle_adjustment._MAX_STEPS", 1)
+    monkeypatch.setattr("sfm_shapefit.colmap.ceres_adjustment._MAX_STEPS", 1)
     original, _ = ring_model(noise_px=0.5)
     seed, graph = seeded(original, ring_centers() * [1.0, 1.02, 1.0])
-    adjusted = bundle_adjust(seed, graph)
+    adjusted = bundle_adjust(seed, graph, adjuster="ceres")
     assert not adjusted.converged
     assert adjusted.iterations == 3
     seed, graph = seeded(original, np.zeros((NUM_IMAGES, 3)))
-    with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
-        bundle_adjust(seed, graph)
+    for adjuster in ("own", "ceres"):
+        with pytest.raises(UnsolvableError, match="run without bundle adjustment"):
+            bundle_adjust(seed, graph, adjuster=adjuster)
 
 
 @pytest.mark.parametrize("quiet", [True, False])
@@ -486,7 +488,7 @@ def test_what_pycolmap_says_during_adjustment_reaches_the_terminal_only_if_wante
     monkeypatch.setattr(pycolmap, "create_default_ceres_bundle_adjuster", talkative)
     seed, graph = seeded(ring_model(noise_px=0.5)[0])
     with hear_pycolmap(not quiet):
-        bundle_adjust(seed, graph)
+        bundle_adjust(seed, graph, adjuster="ceres")
     said = capfd.readouterr()
     assert said.out == ""
     assert ("not positive definite" in said.err) != quiet

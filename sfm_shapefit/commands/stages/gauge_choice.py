@@ -1,14 +1,16 @@
 """Which scale, origin and axes the output gets: as asked, or by what is known."""
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.commands.stages.rigs import Rigid
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import (
     Gauge,
@@ -20,7 +22,6 @@ from sfm_shapefit.placement.gauge import (
     prior_gauge,
     unit_gauge,
 )
-from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.results.result import Inputs
 
 
@@ -45,40 +46,58 @@ def read_priors(
     return database_priors(inputs.database, model)
 
 
-def choose_gauge(
-    model: PosedModel,
-    placement: Placement,
-    kept: BoolArray,
-    rigid: Rigid,
-    options: LocateOptions,
-    priors: PositionPriors | None,
-) -> Gauge:
-    """Return scale, origin and axes of the output.
+class GaugeRule(NamedTuple):
+    """What sets scale, origin and axes of the output: as asked, or by what is known."""
 
-    Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
-    given, else the input. A single fixed camera moves only the origin. Only cameras that are `kept` count.
+    model: PosedModel
+    rigid: Rigid
+    options: LocateOptions
+    priors: PositionPriors | None
 
-    Raises:
-        InputError: if what is asked for is not determined.
-        UnsolvableError: if the only fixed image is not placed.
+    def choose(self, cameras: IntArray, locations: FloatArray, unit: float | None) -> Gauge:
+        """Return the gauge of cameras that were found.
+
+        Rigid groups know the scale. Else it is as asked: "auto" takes a known distance, else priors that are
+        given, else the input. A single fixed camera moves only the origin.
+
+        Args:
+            cameras: (k,) those in the output, ascending.
+            locations: (k, 3) where they are, in axes of the input.
+            unit: length of the unit of rigid groups in the locations' units; None without such groups.
+
+        Raises:
+            InputError: if what is asked for is not determined.
+            UnsolvableError: if the only fixed image is not among the cameras.
+        """
+        model, rigid, options = self.model, self.rigid, self.options
+        centers, fixed = model.centers[cameras], rigid.fixed[cameras]
+        if unit is not None:
+            return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
+        if options.known_distance:
+            gauge = _gauge_of_distance(model, cameras.tolist(), locations, options.known_distance)
+        elif self.priors is not None:
+            gauge = prior_gauge(locations, self.priors.of(cameras))
+        else:
+            gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
+        if not rigid.fixed.any():
+            return gauge
+        name = model.names[int(np.argmax(rigid.fixed))]
+        if not fixed.any():
+            raise UnsolvableError(
+                f"{name} is to stay where it is, but the matches do not tie it to the others"
+            )
+        return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
+
+
+def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) -> FloatArray:
+    """Return the turn of the world (3, 3) that brings adjusted rotations closest to the input's on average.
+
+    Args:
+        model: the input.
+        cameras: (k,) of its images.
+        rotations: (k, 3, 3) of them, cam_from_world.
     """
-    cameras = placement.cameras[kept]
-    locations, centers = placement.locations[kept], model.centers[cameras]
-    fixed = rigid.fixed[cameras]
-    if placement.unit is not None:
-        return metric_gauge(locations, placement.unit, centers, fixed, has_rigs=model.has_rigs)
-    if options.known_distance:
-        gauge = _gauge_of_distance(model, cameras.tolist(), locations, options.known_distance)
-    elif priors is not None:
-        gauge = prior_gauge(locations, priors.of(cameras))
-    else:
-        gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
-    if not rigid.fixed.any():
-        return gauge
-    name = model.names[int(np.argmax(rigid.fixed))]
-    if not fixed.any():
-        raise UnsolvableError(f"{name} is to stay where it is, but the matches do not tie it to the others")
-    return moved_gauge(gauge, locations[fixed][0], centers[fixed][0], name)
+    return mean_rotation_l1(model.rotations[cameras].transpose(0, 2, 1) @ rotations)
 
 
 def _gauge_of_distance(

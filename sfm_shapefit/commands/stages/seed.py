@@ -3,24 +3,29 @@
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted, bundle_adjust
+from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     deregister_of_few_points,
     share_of_agreeing_observations,
 )
-from sfm_shapefit.colmap.seed import build_seed, turn_model
+from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
 from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
 from sfm_shapefit.commands.stages.clock import Clock
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, restore_axes
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.geometry import Similarity
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import Gauge, unit_gauge
 from sfm_shapefit.placement.place import Placement, place_further
+from sfm_shapefit.placement.prior_refinement import PULLED
 from sfm_shapefit.results.result import FurtherPiece
 
 if TYPE_CHECKING:
@@ -40,6 +45,8 @@ class Located(NamedTuple):
     """The map from the placement's locations to the output's units and axes."""
     fixed: BoolArray | None = None
     """(n,) the images that keep their poses to the last bit; none if None."""
+    rule: GaugeRule | None = None
+    """What sets the gauge, and again after bundle adjustment; "unit" if None."""
 
     @property
     def cameras(self) -> IntArray:
@@ -51,6 +58,8 @@ class Seeded(NamedTuple):
     """A seeded model."""
 
     reconstruction: "pycolmap.Reconstruction"
+    gauge: Gauge
+    """From the solver's units to its own."""
     adjusted: Adjusted | None
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
@@ -74,9 +83,10 @@ def build_seeded_model(
 ) -> Seeded:
     """Move the cameras, triangulate points, and adjust both if asked for.
 
-    An executor shares out the model's own tracks.
+    Bundle adjustment is free to scale, shift and turn everything; the gauge is set again after it. An
+    executor shares out the model's own tracks.
     """
-    adjusted, axes = None, located.gauge.axes
+    adjusted, gauge = None, located.gauge
     frames = () if located.fixed is None else source.model.frame_ids[located.fixed].tolist()
     with clock("structure"):
         seed, tracks = seed_and_tracks(source, located, clock.advance)
@@ -87,7 +97,7 @@ def build_seeded_model(
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options, fixed_frames=frames)
+            adjusted = bundle_adjust(seed, tracks, options, adjuster=options.adjuster, fixed_frames=frames)
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
@@ -96,7 +106,56 @@ def build_seeded_model(
         agreeing = share_of_agreeing_observations(seeded, source.model.image_ids, source.batches())
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
-    return Seeded(seeded if axes is None else turn_model(seeded, axes), adjusted, poor, agreeing)
+    if poor:
+        lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
+        located = located._replace(kept=located.kept & ~lost)
+    if adjusted is not None or poor:
+        seeded, gauge = _set_gauge(seeded, source.model, located)
+    elif gauge.axes is not None:
+        seeded = turn_model(seeded, gauge.axes)
+    if adjusted is not None:
+        adjusted = replace(adjusted, reconstruction=seeded)
+    return Seeded(seeded, gauge, adjusted, poor, agreeing)
+
+
+def _set_gauge(
+    adjusted: "pycolmap.Reconstruction", model: PosedModel, located: Located
+) -> "tuple[pycolmap.Reconstruction, Gauge]":
+    """Return an adjusted model in the gauge that was chosen, found anew for its cameras, and that gauge.
+
+    The axes of the input are those in which the rotations agree best with the input's. What fixed cameras
+    hold of the gauge is held already.
+    """
+    fixed = np.zeros(model.num_images, np.bool_) if located.fixed is None else located.fixed
+    unit = None if located.placement.unit is None else 1.0
+    if fixed.any() and unit is not None:
+        return adjusted, located.gauge
+    images = [adjusted.image(i) for i in model.image_ids[located.cameras].tolist()]
+    centers = np.array([image.projection_center() for image in images])
+    turn = np.eye(3)
+    if not fixed.any():
+        rotations = np.array([image.cam_from_world().rotation.matrix() for image in images])
+        turn = restore_axes(model, located.cameras, rotations)
+    locations = centers @ turn.T
+    if located.rule is None:
+        found = unit_gauge(locations)
+    else:
+        found = located.rule.choose(located.cameras, locations, unit)
+    axes = np.eye(3) if found.axes is None else found.axes
+    scale, shift = found.similarity.scale, found.similarity.translation
+    motion = Similarity(scale=scale, rotation=axes @ turn, translation=axes @ shift)
+    answer = transform_model(adjusted, motion, model.frame_ids[fixed].tolist())
+    before = located.gauge.similarity
+    similarity = replace(
+        before, scale=scale * before.scale, translation=scale * turn @ before.translation + shift
+    )
+    return answer, replace(found, similarity=similarity, statement=_state(located.gauge, found))
+
+
+def _state(before: Gauge, after: Gauge) -> str:
+    """Return the statement of a gauge that was found again, with what pulled the cameras before."""
+    _, mark, pulled = before.statement.partition(PULLED)
+    return f"{after.statement}{mark}{pulled}"
 
 
 def place_further_pieces(
@@ -112,7 +171,7 @@ def place_further_pieces(
             FurtherPiece(
                 placement=further,
                 kept=kept & ~np.isin(source.model.image_ids[further.cameras], list(seeded.poor)),
-                gauge=gauge,
+                gauge=seeded.gauge,
                 reconstruction=seeded.reconstruction,
                 image_ids=source.model.image_ids[further.cameras],
             )

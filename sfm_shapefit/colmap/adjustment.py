@@ -1,0 +1,333 @@
+"""The door to our own bundle adjustment: a reconstruction as an `AdjustmentProblem`, and back into a new one.
+
+Frames of the reconstruction are frames of the problem. An image whose camera is a case of OPENCV is one
+camera of the problem. An image through any other lens becomes several ideal cameras of one center: its rays
+are undistorted once and shared out to 14 views, the faces and corners of a cube round the camera, of which
+those that see something take part. No ray is more than 28 degrees off the axis of its view, so that an error
+is at most 1.3 times that of the image, even for rays at right angles to the camera or behind it.
+"""
+
+import itertools
+from collections.abc import Collection
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+
+from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
+from sfm_shapefit.adjustment.tracks import ObservedTracks, join_matches
+from sfm_shapefit.adjustment.triangulation import CameraPoses, TriangulatedPoints
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.model import observed_points, points2d_xy
+from sfm_shapefit.colmap.structure import TrackSource
+
+_ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PosedFrames:
+    """The posed frames of a reconstruction and the cameras in them, as arrays; points apart."""
+
+    frame_ids: tuple[int, ...]
+    """Of the n frames, ascending."""
+    rotations: FloatArray
+    """(n, 3, 3) rig_from_world."""
+    centers: FloatArray
+    """(n, 3)"""
+    fixed: BoolArray
+    """(n,) frames that stay."""
+    image_ids: tuple[int, ...]
+    """Of the images, ascending; all of them are posed."""
+    images: IntArray
+    """(c,) the place in `image_ids` of the image that each camera is a view of, ascending."""
+    frame_of_camera: IntArray
+    """(c,)"""
+    sensor_rotations: FloatArray
+    """(c, 3, 3) camera_from_rig."""
+    sensor_translations: FloatArray
+    """(c, 3)"""
+    lenses: tuple[Lens, ...]
+    lens_of_camera: IntArray
+    """(c,)"""
+    colmap_camera_of_lens: tuple[int, ...]
+    """The id of the camera in the reconstruction."""
+
+    def poses(self) -> CameraPoses:
+        """Return where the cameras stand."""
+        turned = self.sensor_rotations @ self.rotations[self.frame_of_camera]
+        shifts = np.einsum("cba,cb->ca", turned, self.sensor_translations)
+        focals = np.array([np.mean(lens.values()[:2]) for lens in self.lenses])
+        return CameraPoses(
+            rotations=np.ascontiguousarray(turned),
+            centers=self.centers[self.frame_of_camera] - shifts,
+            focal_lengths_px=focals[self.lens_of_camera],
+            images=self.images,
+        )
+
+    def problem(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
+        """Return the problem of points that were triangulated from tracks, at the frames' own poses."""
+        used = np.flatnonzero(found.points_seen >= 0)
+        return self.problem_of(
+            found.points, tracks.cameras[used], found.points_seen[used], tracks.pixels[used]
+        )
+
+    def problem_of(
+        self, points: FloatArray, cameras_seeing: IntArray, points_seen: IntArray, pixels: FloatArray
+    ) -> AdjustmentProblem:
+        """Return the problem of points and their observations, at the frames' own poses."""
+        is_plain = len(self.images) == len(self.frame_ids) and not self.sensor_translations.any()
+        is_plain = is_plain and bool((self.sensor_rotations == np.eye(3)).all())
+        is_plain = is_plain and bool((self.frame_of_camera == np.arange(len(self.images))).all())
+        return AdjustmentProblem(
+            rotations=self.rotations,
+            centers=self.centers,
+            points=points,
+            cameras_seeing=cameras_seeing,
+            points_seen=points_seen,
+            pixels=pixels,
+            lenses=self.lenses,
+            lens_of_camera=self.lens_of_camera,
+            rig=None
+            if is_plain
+            else Rig(
+                frame_of_camera=self.frame_of_camera,
+                rotations=self.sensor_rotations,
+                translations=self.sensor_translations,
+            ),
+            fixed=self.fixed,
+        )
+
+
+def read_frames(reconstruction: pycolmap.Reconstruction, fixed_frames: Collection[int] = ()) -> PosedFrames:
+    """Return the posed frames of a reconstruction as arrays.
+
+    Args:
+        reconstruction: whose frames with a pose are read.
+        fixed_frames: ids of those that stay; others are ignored.
+    """
+    image_ids = sorted(reconstruction.reg_image_ids())
+    images = [reconstruction.image(i) for i in image_ids]
+    frame_ids = sorted({image.frame_id for image in images})
+    place = {frame: k for k, frame in enumerate(frame_ids)}
+    frame_poses = [_pose(reconstruction.frame(i)) for i in frame_ids]
+    rotations = np.array([pose.rotation.matrix() for pose in frame_poses]).reshape(-1, 3, 3)
+    translations = np.array([pose.translation for pose in frame_poses]).reshape(-1, 3)
+    camera_ids = sorted({image.camera_id for image in images})
+    views = {i: _views(reconstruction.camera(i)) for i in camera_ids}
+    lenses = tuple(_lens(reconstruction.camera(i)) for i in camera_ids)
+    sensors = [_sensor_from_rig(reconstruction, image) for image in images]
+    counts = np.array([len(views[image.camera_id]) for image in images], dtype=np.int64)
+    of_image = np.repeat(np.arange(len(images)), counts)
+    turns = np.concatenate([views[image.camera_id] for image in images])
+    sensor_rotations = np.array([rotation for rotation, _ in sensors])[of_image]
+    sensor_translations = np.array([translation for _, translation in sensors])[of_image]
+    is_turned = (counts > 1)[of_image]
+    sensor_rotations[is_turned] = turns[is_turned] @ sensor_rotations[is_turned]
+    sensor_translations[is_turned] = np.einsum("cab,cb->ca", turns[is_turned], sensor_translations[is_turned])
+    return PosedFrames(
+        frame_ids=tuple(frame_ids),
+        rotations=rotations,
+        centers=-np.einsum("nba,nb->na", rotations, translations),
+        fixed=np.isin(frame_ids, sorted(fixed_frames)),
+        image_ids=tuple(image_ids),
+        images=of_image,
+        frame_of_camera=np.array([place[image.frame_id] for image in images])[of_image],
+        sensor_rotations=sensor_rotations,
+        sensor_translations=sensor_translations,
+        lenses=lenses,
+        lens_of_camera=np.array([camera_ids.index(image.camera_id) for image in images])[of_image],
+        colmap_camera_of_lens=tuple(camera_ids),
+    )
+
+
+def collect_tracks(
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource, min_length: int
+) -> ObservedTracks:
+    """Return the tracks of matches, or of a model's points, that posed images observe.
+
+    Args:
+        frames: of `reconstruction`, which has the keypoints of its images.
+        reconstruction: the same.
+        tracks: as in `colmap.structure.triangulate`.
+        min_length: tracks of fewer observations are left out.
+    """
+    may_split = isinstance(tracks, pycolmap.CorrespondenceGraph)
+    if isinstance(tracks, pycolmap.CorrespondenceGraph):
+        seen = _join_graph(frames, reconstruction, tracks)
+    else:
+        seen = _points_of(frames, tracks)
+    images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
+    keypoints = np.concatenate([keypoints for keypoints, _ in seen])
+    ids = np.concatenate([names for _, names in seen])
+    _, track, lengths = np.unique(ids, return_inverse=True, return_counts=True)
+    kept = lengths[track] >= min_length
+    images, keypoints, ids = images[kept], keypoints[kept], ids[kept]
+    cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
+    order = np.argsort(ids, kind="stable")
+    names, lengths = np.unique(ids, return_counts=True)
+    return ObservedTracks(
+        offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+        cameras=cameras[order],
+        keypoints=keypoints[order],
+        pixels=pixels[order],
+        on_plane=on_plane[order],
+        ids=names,
+        may_split=may_split,
+    )
+
+
+def with_poses(
+    reconstruction: pycolmap.Reconstruction, old: PosedFrames, new: PosedFrames
+) -> pycolmap.Reconstruction:
+    """Return a copy whose frames stand, and lenses are, as in `new`; points stay where they are.
+
+    Args:
+        reconstruction: whose frames `old` were read from.
+        old: before; what is the same in `new` to the last bit keeps its bits.
+        new: after.
+    """
+    copy = pycolmap.Reconstruction(reconstruction)
+    for k, frame_id in enumerate(new.frame_ids):
+        rotation, center = new.rotations[k], new.centers[k]
+        turns = bool((rotation != old.rotations[k]).any())
+        if not turns and (center == old.centers[k]).all():
+            continue
+        frame = copy.frame(frame_id)
+        turn = pycolmap.Rotation3d(rotation) if turns else _pose(frame).rotation
+        frame.rig_from_world = pycolmap.Rigid3d(turn, -(rotation @ center))
+    for before, after, camera_id in zip(old.lenses, new.lenses, new.colmap_camera_of_lens, strict=True):
+        if after.parameters != before.parameters:
+            copy.camera(camera_id).params = list(after.parameters)
+    return copy
+
+
+def add_points(
+    reconstruction: pycolmap.Reconstruction,
+    frames: PosedFrames,
+    tracks: ObservedTracks,
+    found: TriangulatedPoints,
+    colors: "pycolmap.Reconstruction | None" = None,
+) -> None:
+    """Add points and their tracks to our own `reconstruction`, which has none.
+
+    Args:
+        reconstruction: changed in place.
+        frames: of it.
+        tracks: whose observations they are.
+        found: the points. Those of a model's own tracks get their ids; others are numbered from 1.
+        colors: the model whose points give theirs, by the same ids.
+    """
+    used = np.flatnonzero(found.points_seen >= 0)
+    used = used[np.argsort(found.points_seen[used], kind="stable")]
+    ends = np.cumsum(np.bincount(found.points_seen[used], minlength=len(found.points))).tolist()
+    image_ids = np.array(frames.image_ids)[frames.images[tracks.cameras[used]]].tolist()
+    elements = list(map(pycolmap.TrackElement, image_ids, tracks.keypoints[used].tolist()))
+    ids = range(1, len(ends) + 1) if tracks.may_split else tracks.ids[found.tracks].tolist()
+    begin = 0
+    for point_id, end, xyz in zip(ids, ends, found.points, strict=True):
+        track = pycolmap.Track(elements[begin:end])
+        point = pycolmap.Point3D(xyz=xyz, track=track)
+        if colors is not None:
+            point.color = colors.point3D(point_id).color
+        reconstruction.add_point3D_with_id(point_id, point)
+        begin = end
+
+
+def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
+    """Return rig_from_world of a frame of a posed image."""
+    pose = frame.rig_from_world
+    assert pose is not None
+    return pose
+
+
+def _lens(camera: pycolmap.Camera) -> Lens:
+    """Return the lens of a camera, or that of the views of one that is undistorted."""
+    if camera.model_name in _ADJUSTED_MODELS:
+        return Lens(camera.model_name, tuple(camera.params.tolist()))
+    return Lens("SIMPLE_PINHOLE", (_focal_length_px(camera), 0.0, 0.0), fixed=True)
+
+
+def _focal_length_px(camera: pycolmap.Camera) -> float:
+    """Return pixels per radian at the axis; those of an equirectangular camera are the same everywhere."""
+    if camera.model == pycolmap.CameraModelId.EQUIRECTANGULAR:
+        return float(camera.params[0] / (2.0 * np.pi))
+    return float(camera.mean_focal_length())
+
+
+def _views(camera: pycolmap.Camera) -> FloatArray:
+    """Return the views of a camera, (v, 3, 3) view_from_camera: itself if it is adjusted as it is."""
+    if camera.model_name in _ADJUSTED_MODELS:
+        return np.eye(3)[None]
+    return _CUBE
+
+
+def _sensor_from_rig(
+    reconstruction: pycolmap.Reconstruction, image: pycolmap.Image
+) -> tuple[FloatArray, FloatArray]:
+    """Return rotation and translation of the sensor of an image, exactly the identity for a reference."""
+    sensor = reconstruction.camera(image.camera_id).sensor_id
+    rig = reconstruction.rig(reconstruction.frame(image.frame_id).rig_id)
+    if rig.is_ref_sensor(sensor):
+        return np.eye(3), np.zeros(3)
+    pose = rig.sensor_from_rig(sensor)
+    assert pose is not None  # `read_model` refuses others
+    return pose.rotation.matrix(), pose.translation
+
+
+def _join_graph(
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph
+) -> list[tuple[IntArray, IntArray]]:
+    """Return, for each image, the keypoints that are matched and the track of each."""
+    place = {image_id: k for k, image_id in enumerate(frames.image_ids)}
+    counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
+    pairs, matches = [], []
+    for first, second in sorted(map(pycolmap.pair_id_to_image_pair, graph.image_pairs())):
+        if first in place and second in place:
+            pairs.append((place[first], place[second]))
+            matches.append(graph.extract_matches_between_images(first, second))
+    offsets = np.cumsum([0, *map(len, matches)])
+    joined = np.concatenate([np.empty((0, 2), np.uint32), *matches]).astype(np.int64)
+    track = join_matches(counts, np.array(pairs, dtype=np.int64).reshape(-1, 2), offsets, joined)
+    parts = np.split(track, np.cumsum(counts)[:-1])
+    return [(np.flatnonzero(part >= 0), part[part >= 0]) for part in parts]
+
+
+def _look_up(
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, images: IntArray, keypoints: IntArray
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Return camera, pixels (m, 2) and rays on the plane z = 1 (m, 2) of keypoints; `images` ascend."""
+    cameras = np.searchsorted(frames.images, images)
+    pixels, on_plane = np.empty((len(images), 2)), np.empty((len(images), 2))
+    ends = np.searchsorted(images, np.arange(len(frames.image_ids) + 1)).tolist()
+    for k, (begin, end) in enumerate(itertools.pairwise(ends)):
+        image = reconstruction.image(frames.image_ids[k])
+        camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
+        xy = points2d_xy(image)[keypoints[own]]
+        if camera.model_name in _ADJUSTED_MODELS:
+            pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
+            continue
+        rays = np.asarray(camera.cam_ray_from_img(xy)).reshape(-1, 3)
+        view = np.argmax(rays @ _CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
+        local = np.einsum("mab,mb->ma", _CUBE[view], rays)
+        on_plane[own] = local[:, :2] / local[:, 2:]
+        pixels[own] = _focal_length_px(camera) * on_plane[own]
+        cameras[own] += view
+    return cameras, pixels, on_plane
+
+
+def _cube() -> FloatArray:
+    """Return rotations (14, 3, 3) whose last rows are the faces and corners of a cube, +z first."""
+    axes = np.concatenate([np.eye(3)[::-1], -np.eye(3), np.array(list(np.ndindex(2, 2, 2))) * 2.0 - 1.0])
+    z = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+    across = np.cross(z, np.where(np.abs(z[:, :1]) < 0.5, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
+    y = across / np.linalg.norm(across, axis=1, keepdims=True)
+    return np.stack([np.cross(y, z), y, z], axis=1)
+
+
+_CUBE = _cube()
+
+
+def _points_of(frames: PosedFrames, model: pycolmap.Reconstruction) -> list[tuple[IntArray, IntArray]]:
+    """Return, for each image, the keypoints that observe a point of a model, and its id."""
+    seen = [observed_points(model.image(i)) for i in frames.image_ids]
+    return [(keypoints, ids.astype(np.int64)) for keypoints, ids in seen]
