@@ -243,11 +243,8 @@ def run_tests(
     os.chdir(ROOT)
     compiled, names = jit.kernel, {module_name(path) for path in files_of(group)}
 
-    def kernel(**options: bool) -> Callable[[Any], Any]:
-        def decorate(function: Any) -> Any:
-            return function if function.__module__ in names else compiled(**options)(function)
-
-        return decorate
+    def kernel(function: Any) -> Any:
+        return function if function.__module__ in names else compiled(function)
 
     jit.kernel = kernel
     if changed is not None:
