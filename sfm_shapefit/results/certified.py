@@ -15,7 +15,8 @@ from sfm_shapefit.solver.options import Status
 
 # A camera that is farther off, of the spread of all, has no say in the common scale, axes and shift.
 _CAP_OF_SIZE = 0.5
-# A median that is smaller is rounding.
+_OTHERS = {True: ", and no other is as good", False: ", but others may be as good", None: ""}
+# A distance that is smaller is rounding.
 _SAME = 1e-9
 
 
@@ -44,7 +45,7 @@ def compare_with_certified(placement: Placement, centers: FloatArray, *, adjuste
     if not solved.status.has_certificate:
         return Departure(statement=f"nothing is certified; delivered: {delivered}", median=None, largest=None)
     to = f"to {max(solved.gap, 0.0):.1e}"
-    certified = f"ShapeFit's optimum is certified {to}"
+    certified = f"ShapeFit's optimum is certified {to}{_OTHERS[solved.unique]}"
     if solved.status is not Status.CONVERGED:
         certified = f"ShapeFit's optimum is not certified to the tolerance, only {to}"
     kept = np.isfinite(centers).all(axis=1)
