@@ -232,3 +232,12 @@ def test_where_gradients_do_not_converge_the_start_is_that_of_least_squares():
     problem, iterate, _, step = steps.allocate(graph)
     assert not approach(problem, iterate, step)
     np.testing.assert_allclose(shape(solved(graph)[0]), shape(truth), atol=1e-6)
+
+
+@SOLVERS
+def test_a_limit_of_iterations_is_kept_and_each_is_told_once(solver):
+    graph, _ = draw_graph(5, n=12, d=3, sigma=0.05, q=0.3)
+    told = []
+    *_, done = solver(graph, 1e-300, 3, lambda info: told.append(info.iteration))
+    assert done == 3
+    assert told == [1, 2, 3]
