@@ -16,8 +16,7 @@ from sfm_shapefit.colmap.relative_rotations import (
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.execution import PairWork, measure_with_workers
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.locate_options import LEAST_MATCHES, Relative
+from sfm_shapefit.locate_options import LEAST_MATCHES, MapOptions, Relative
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 # About a second of work, be they many pairs of few matches or few of many.
@@ -47,7 +46,7 @@ def relative_rotations(
     *,
     min_matches: int = LEAST_MATCHES,
     source: Relative = "matches",
-    threads: int = 1,
+    threads: int = 0,
     executor: Executor | None = None,
     progress: Progress | None = None,
 ) -> DatabaseRotations:
@@ -60,7 +59,7 @@ def relative_rotations(
         min_matches: pairs with fewer inlier matches are left out; at least 1.
         source: "matches": estimated from the inlier matches; "stored": as the database stores them, see
             `stored_relative_rotations`.
-        threads: among which the pairs are shared out.
+        threads: among which the pairs are shared out; 0 for one per core.
         executor: of `concurrent.futures`; its workers estimate instead, and open the database themselves. It
             is not shut down.
         progress: called with "relative rotations", the pairs that are done and their number.
@@ -70,15 +69,18 @@ def relative_rotations(
         `found.are_sound()` says which pairs to believe.
 
     Raises:
+        ValueError: if an option has no such value.
         InputError: if the database cannot be used; the message says what to do.
         WorkerError: if a worker died and the executor does not replace it.
     """
+    options = MapOptions(relative_rotations=source, threads=threads)
     if min_matches < 1:
-        raise InputError(f"min_matches must be at least 1, got {min_matches}")
+        raise ValueError(f"min_matches must be at least 1, got {min_matches}")
     path, clock = Path(database), Clock(progress) if progress else Clock()
     with clock("relative rotations"):
         model = read_model(read_images(path).reconstruction)
-        found = measure_rotations(path, model, min_matches, source, Sharing(threads, executor, clock.advance))
+        sharing = Sharing(options.num_threads(), executor, clock.advance)
+        found = measure_rotations(path, model, min_matches, source, sharing)
     columns = {field.name: getattr(found, field.name) for field in fields(RelativeRotations)}
     return DatabaseRotations(**columns, names=model.names)
 

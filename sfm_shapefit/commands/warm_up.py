@@ -50,6 +50,7 @@ FURTHER = (
     "place_flat_graph",
     "locate_around_fixed",
     "map_matches",
+    "relate_images",
     "compare_baselines",
     "draw_images",
 )

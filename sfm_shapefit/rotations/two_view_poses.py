@@ -25,6 +25,10 @@ The median counts all matches, so false ones widen it. n / (n - 5) makes up for 
 noise. The variance is at least (s / 10)^2, and (1 rad)^-2 is added to the information: a rotation is never
 known less, and the matrix stays positive definite. Without parallax H_tt is noise, or 0 to rounding, and then
 is not inverted: a pure rotation is determined by itself.
+
+Simulated, 100 matches of .5 px: the covariance of the estimates is .93 to .99 of the inverse information, and
+.5 to .6 of it with a fifth of the matches false. Where the parallax is one to three times the noise, the
+translation may be anywhere, and standard deviations are up to three times those that the information says.
 """
 
 from concurrent.futures import ThreadPoolExecutor
@@ -179,7 +183,7 @@ def _fill_system(
     return total
 
 
-@kernel
+@inner_kernel
 def _linearize(
     a: FloatArray,
     b: FloatArray,

@@ -15,11 +15,13 @@ from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.commands.inspect import inspect
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.commands.map import map_database
+from sfm_shapefit.commands.relative_rotations import relative_rotations
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rigidity.pieces import parallel_rigid_pieces
+from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
 from sfm_shapefit.solver.splitting.linear import IterativeSolver
@@ -159,6 +161,13 @@ def map_matches(folder: Path) -> None:
     """Map a database, and refine the rotations."""
     model = _workspace(folder, WorkspaceOptions(model="rotations"))
     map_database(model.parents[1] / "database.db")
+
+
+def relate_images(folder: Path) -> None:
+    """Estimate relative rotations, and score their triangles, for those who call it from Python."""
+    database = _workspace(folder, WorkspaceOptions(model="rotations")).parents[1] / "database.db"
+    found = relative_rotations(database, threads=2)
+    score_triplets(len(found.names), found)
 
 
 def compare_baselines(_folder: Path) -> None:
