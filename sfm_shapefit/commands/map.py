@@ -30,6 +30,7 @@ from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
 
@@ -71,7 +72,9 @@ def map_database(
     with clock("relative rotations"):
         sharing = Sharing(options.num_threads(), advance=clock.advance)
         relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
-    run = _Run(options, clock, path, images, unposed)
+        scores = score_triplets(unposed.num_images, relative).tolist()
+    triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
+    run = _Run(options, clock, path, images, unposed, triplet_scores)
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.average_components(relative, reasons):
         try:
@@ -108,6 +111,8 @@ class _Run(NamedTuple):
     images: UnposedImages
     unposed: PosedModel
     """The images as a model."""
+    triplet_scores: dict[tuple[int, int], float]
+    """Of the pairs with a relative rotation."""
 
     def average_components(
         self, relative: RelativeRotations, reasons: dict[int, str]
@@ -152,7 +157,11 @@ class _Run(NamedTuple):
         known = self.options.known_distance
         if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
             # The known distance belongs to another component.
-            settings |= {"known_distance": None, "scale": "unit"}
+            known, settings["known_distance"] = None, None
+            settings["scale"] = "auto"
+        if known is None and settings["scale"] in ("auto", "input"):
+            # There is no input whose scale could be taken.
+            settings["scale"] = "unit"
         options = LocateOptions(**settings)
         model = self._pose(image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
@@ -166,7 +175,10 @@ class _Run(NamedTuple):
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             locating = Locating(inputs, rigid, priors, centers=centers)
             with self.clock("locate"):
-                return locate_source(source, locating, options, Clock(self.clock.progress))
+                found = locate_source(source, locating, options, Clock(self.clock.progress))
+        ends = members[found.directions.pairs].tolist()
+        scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
+        return replace(found, triplet_scores=scores)
 
     def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
         """Return images with these rotations and all centers 0."""

@@ -82,6 +82,8 @@ class LocateResult(Displayed):
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
+    triplet_scores: FloatArray | None = None
+    """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
     agreeing_observations: float = math.nan
@@ -187,7 +189,7 @@ class LocateResult(Displayed):
         usable = iter(pair_rows(self.placement, support, [piece.placement for piece in self.further]))
         names = self.model.names
         axes = self.gauge.axes
-        return [
+        rows = [
             _turn(next(usable), axes)
             if status is DirectionStatus.USABLE
             else PairRow(name1=names[i], name2=names[j], support=support, reason=status.value)
@@ -198,6 +200,10 @@ class LocateResult(Displayed):
                 strict=True,
             )
         ]
+        if self.triplet_scores is None:
+            return rows
+        scores = self.triplet_scores.tolist()
+        return [replace(row, triplet_score=score) for row, score in zip(rows, scores, strict=True)]
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:

@@ -68,6 +68,9 @@ class PairRow:
     """inlier, outlier, or undetermined."""
     reason: str = ""
     """Why it is undetermined."""
+    triplet_score: float = math.nan
+    """Weighted share of the triangles of relative rotations that close with it; only where `map` averaged and
+    the pair is in a triangle. A low one is a sign of repeated structure."""
 
 
 Row = TypeVar("Row", CameraRow, PairRow)
@@ -81,6 +84,8 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
+_ADDED_COLUMNS = {"triplet_score"}
+"""What earlier outputs lack."""
 
 
 def write_rows(
@@ -124,7 +129,13 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
 
     with path.open(newline="", encoding="utf-8") as stream:
         return [
-            row_type(**{item.name: value(cells, item.name, item.type) for item in fields(row_type)})
+            row_type(
+                **{
+                    item.name: value(cells, item.name, item.type)
+                    for item in fields(row_type)
+                    if item.name in cells or item.name not in _ADDED_COLUMNS
+                }
+            )
             for cells in csv.DictReader(stream)
         ]
 
