@@ -1,0 +1,94 @@
+"""How exact given rotations are, as far as the matches tell: held, or weighted by a standard deviation.
+
+With rotations free, an adjustment turns each frame by some d_f from where it was given. Part of that is the
+error of the given rotation, and part is chance. To tell them apart, the points are drawn into two halves, and
+each half turns the frames by itself (common turns of all frames taken off):
+
+    d_f^1 = e_f + n_f^1,    d_f^2 = e_f + n_f^2,        e_f the given error, n_f the noise of a half
+
+    agreement   d_f^1 . d_f^2 / 3        has the mean |e_f|^2 / 3 = sigma^2, whatever the noise is
+    chance      |d_f^1 - d_f^2|^2 / 12   has the mean of |n_f|^2 / 3 for all points together
+
+Noise that neighboring keypoints share is in both, other than in a covariance from residuals. If the median
+agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
+away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it.
+
+What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
+rotations. Who measured rotations better than the matches know them has to say so.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sfm_shapefit.adjustment.options import AdjustmentOptions
+from sfm_shapefit.adjustment.problem import AdjustmentProblem
+from sfm_shapefit.adjustment.priors import rotation_vectors
+from sfm_shapefit.adjustment.solve import adjust
+from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.geometry import mean_rotation_l1
+
+# A frame that sees fewer points in a half says nothing.
+_FEWEST_POINTS = 10
+_FEWEST_FRAMES = 3
+# The halves end at this relative fall of the cost: what is left is far below the spread between them.
+_FALL = 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotationErrors:
+    """What the matches say of the given rotations; standard deviations per axis, in radians."""
+
+    sigma_rad: float
+    """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
+    chance_rad: float
+    """Median over the frames of what chance turns them by, all points together."""
+    num_frames: int
+    """Frames that say anything."""
+
+    @property
+    def are_to_be_held(self) -> bool:
+        """Whether freeing the rotations would bring more noise than it takes errors away."""
+        return self.sigma_rad == 0.0
+
+
+def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOptions) -> RotationErrors:
+    """Estimate the errors of a problem's rotations from what two halves of its points make of them.
+
+    Args:
+        problem: at the given rotations; its own prior does not count.
+        options: of the adjustment; rotations are free here whatever they say.
+    """
+    bare = replace(problem, rotation_prior=None)
+    free = replace(options, hold_rotations=False, cost_tolerance=_FALL)
+    is_first = np.random.default_rng(0).permutation(problem.num_points) % 2 == 0
+    halves = [bare.with_points(half) for half in (is_first, ~is_first)]
+    turns = [_turns(bare, adjust(half, free).problem.rotations) for half in halves]
+    seen = np.min([_count_points(half) for half in halves], axis=0)
+    known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
+    first, second = (turn[known] for turn in turns)
+    if np.sum(known) < _FEWEST_FRAMES:
+        return RotationErrors(sigma_rad=0.0, chance_rad=0.0, num_frames=int(np.sum(known)))
+    agreement = np.einsum("fa,fa->f", first, second) / 3.0
+    chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
+    is_chance = np.median(agreement) <= np.median(chance)
+    return RotationErrors(
+        sigma_rad=0.0 if is_chance else float(np.sqrt(max(agreement.mean(), np.median(agreement)))),
+        chance_rad=float(np.sqrt(np.median(chance))),
+        num_frames=int(np.sum(known)),
+    )
+
+
+def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
+    """Return by which vectors (n, 3) the frames turned; without fixed frames, their common turn taken off."""
+    given = problem.rotations
+    if not problem.is_fixed().any():
+        given = given @ mean_rotation_l1(given.transpose(0, 2, 1) @ rotations)
+    return rotation_vectors(rotations @ given.transpose(0, 2, 1))
+
+
+def _count_points(problem: AdjustmentProblem) -> BoolArray:
+    """Return how many points each frame sees, (n,)."""
+    cameras = problem.cameras_seeing
+    frames = cameras if problem.rig is None else problem.rig.frame_of_camera[cameras]
+    return np.bincount(frames, minlength=problem.num_frames)
