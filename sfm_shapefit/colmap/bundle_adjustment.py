@@ -7,11 +7,11 @@ Our own triangulates at the pixel threshold and solves twice:
     all tracks, triangulated at the pixel threshold                 Cauchy, 1 px     1e-3
     all tracks, triangulated there anew                             0.25 to 1 px     1e-4
 
-The threshold is 4 px; with another one, all scales follow. Poses are coarse if the threshold loses a tenth of
-the observations that four times as much finds. The last scale is the one of 0.25, 0.5 and 1 px that the errors
-themselves call for (`choose_loss_scale_px`): 0.25 px on photographs, whose best features are far better than
-most; 1 px under normal errors of 0.5 px, where 0.25 px would cost a third. Tracks are joined from the matches
-that agree with the poses, anew for each solve.
+The threshold is 4 px; with another one, all scales follow. Poses are coarse if the threshold loses a tenth
+of the observations that four times as much finds. The last scale is the one of 0.25, 0.5 and 1 px that the
+errors themselves call for (`choose_loss_scale_px`): 0.25 px on photographs, whose best features are far
+better than most; 1 px under normal errors of 0.5 px, where 0.25 px would cost a third. Tracks are joined
+from the matches that agree with the poses, anew for each solve.
 
 Three solves (1, 0.5 and 0.25 px), each to 1e-4, end at the same errors against the truth on eight real scenes,
 in 1.3 to 4 times the time; a single one at 0.5 px ends elsewhere on hard ones.

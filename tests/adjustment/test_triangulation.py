@@ -111,7 +111,7 @@ def test_of_two_observations_of_one_image_the_better_one_counts():
     tracks, poses, points = made(num_points=1, share=1.0)
     doubled = replace(
         tracks,
-        offsets=tracks.offsets + [0, 1],
+        offsets=np.array([0, len(tracks.cameras) + 1]),
         cameras=np.insert(tracks.cameras, 3, 3),
         keypoints=np.insert(tracks.keypoints, 3, 9),
         pixels=np.insert(tracks.pixels, 3, 0.0, axis=0),
@@ -171,7 +171,7 @@ def matched(tracks, extra=()):
 
 
 def test_wrong_matches_do_not_join_tracks():
-    tracks, poses, points = made(noise_px=0.3, num_points=300)
+    tracks, poses, _ = made(noise_px=0.3, num_points=300)
     rng = np.random.default_rng(5)
     wrong = rng.integers(0, len(tracks.cameras), (400, 2))
     found = matched(tracks, wrong[tracks.cameras[wrong[:, 0]] != tracks.cameras[wrong[:, 1]]])
