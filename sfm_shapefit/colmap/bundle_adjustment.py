@@ -13,8 +13,8 @@ errors themselves call for (`choose_loss_scale_px`): 0.25 px on photographs, who
 better than most; 1 px under normal errors of 0.5 px, where 0.25 px would cost a third. Tracks are joined
 from the matches that agree with the poses, anew for each solve.
 
-Three solves (1, 0.5 and 0.25 px), each to 1e-4, end at the same errors against the truth on eight real scenes,
-in 1.3 to 4 times the time; a single one at 0.5 px ends elsewhere on hard ones.
+Three solves (1, 0.5 and 0.25 px), each to 1e-4, end at the same errors against the truth on eight real
+scenes, in 1.3 to 4 times the time; a single one at 0.5 px ends elsewhere on hard ones.
 
 One thread does all, as the answer must not depend on their number.
 """
