@@ -22,7 +22,9 @@ from typing import TYPE_CHECKING
 from typing import Any as _Any
 
 if TYPE_CHECKING:
+    from sfm_shapefit.adjustment.options import AdjustmentOptions
     from sfm_shapefit.colmap.quiet import hear_pycolmap
+    from sfm_shapefit.commands.adjust import AdjustedModel, bundle_adjust
     from sfm_shapefit.commands.convert import convert
     from sfm_shapefit.commands.evaluate import evaluate
     from sfm_shapefit.commands.inspect import inspect
@@ -43,6 +45,8 @@ if TYPE_CHECKING:
 
 _HOMES = {
     "colmap.quiet": ("hear_pycolmap",),
+    "adjustment.options": ("AdjustmentOptions",),
+    "commands.adjust": ("AdjustedModel", "bundle_adjust"),
     "commands.convert": ("convert",),
     "commands.evaluate": ("evaluate",),
     "commands.inspect": ("inspect",),
@@ -65,6 +69,8 @@ _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __version__ = "0.1.0"
 __all__ = [
+    "AdjustedModel",
+    "AdjustmentOptions",
     "Certificate",
     "InputError",
     "LocateOptions",
@@ -80,6 +86,7 @@ __all__ = [
     "UnsolvableError",
     "ViewGraph",
     "WriteOptions",
+    "bundle_adjust",
     "certify",
     "convert",
     "evaluate",

@@ -70,6 +70,7 @@ REFUSED = [
     (LocateOptions, {"factor_memory_mb": -1}, "factor_memory_mb must be at least 0"),
     (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
+    (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
     (LocateOptions, {"refine_rotations": True, "directions": "relative-poses"}, "works on matches"),
     (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
     (LocateOptions, {"scale": "distance"}, "needs known_distance"),

@@ -45,6 +45,8 @@ def run(args: argparse.Namespace) -> int:
         with tempfile.TemporaryDirectory() as temporary:
             work = Path(temporary)
             different = list(differing_files(scene, work))
+            adjusted = differing_files(scene, work / "adjusted", always=("--bundle-adjust",))
+            different += [f"adjusted, {name}" for name in adjusted]
             if (scene / "database.db").exists():
                 different += [f"map, {name}" for name in differing_files(scene, work / "map", command="map")]
             worst = max(
@@ -67,14 +69,19 @@ VARIANTS: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {
 }
 
 
-def differing_files(scene: Path, work: Path, command: str = "locate") -> Iterator[str]:
-    """Yield which file differs in which variant of the run, of those that the command has."""
+def differing_files(
+    scene: Path, work: Path, command: str = "locate", always: tuple[str, ...] = ()
+) -> Iterator[str]:
+    """Yield which file differs in which variant of the run, of those that the command has.
+
+    All runs have the flags `always`.
+    """
     once = {"PYTHONHASHSEED": "0"}
-    first = contents(_run(command, scene, work / "first", ("--threads", "1"), once))
+    first = contents(_run(command, scene, work / "first", ("--threads", "1", *always), once))
     for name, (flags, environment) in VARIANTS.items():
         if command == "map" and "--executor" in flags:
             continue
-        other = contents(_run(command, scene, work / "other", flags, environment))
+        other = contents(_run(command, scene, work / "other", (*flags, *always), environment))
         yield from (f"{name}: {file}" for file in sorted(first | other) if first.get(file) != other.get(file))
         shutil.rmtree(work / "other")
 

@@ -43,7 +43,13 @@ from sfm_shapefit.adjustment.problem import (
     RotationPrior,
     isotropic_information,
 )
-from sfm_shapefit.adjustment.solve import Adjusted, Ending, adjust, reprojection_errors_px
+from sfm_shapefit.adjustment.solve import (
+    Adjusted,
+    Ending,
+    adjust,
+    choose_loss_scale_px,
+    reprojection_errors_px,
+)
 
 __all__ = [
     "Adjusted",
@@ -58,6 +64,7 @@ __all__ = [
     "Rig",
     "RotationPrior",
     "adjust",
+    "choose_loss_scale_px",
     "estimate_covariances",
     "isotropic_information",
     "reprojection_errors_px",

@@ -2,6 +2,7 @@
 
 import enum
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -137,6 +138,34 @@ def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
     """Return how far each observation misses its pixel, (m,); NaN if its point is behind the camera."""
     layout = lay_out(problem, AdjustmentOptions())
     return np.asarray(np.linalg.norm(reprojection_residuals(layout, values_of(problem)), axis=1))
+
+
+def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float]) -> float:
+    """Return the scale of the Cauchy loss with which a problem near its minimum would be adjusted finest.
+
+    With errors r the covariance of what is estimated is in proportion to
+
+        E |psi(r)|^2 / (E div psi(r))^2,        psi(r) = r / (1 + |r|^2 / c^2),
+
+    the asymptotic variance of an M-estimator. Where most observations are far better than the worst, as
+    those of features in photographs, small c are better; under normal errors 2.4 standard deviations are.
+
+    Args:
+        problem: at or near its minimum.
+        scales_px: to choose from.
+
+    Source: Huber, "Robust Estimation of a Location Parameter", 1964; for adaptive scales, Huber, "Robust
+    Statistics", 1981, section 4.
+    """
+    squares = reprojection_errors_px(problem) ** 2
+    squares = squares[np.isfinite(squares)]
+
+    def variance(scale_px: float) -> float:
+        weights = 1.0 / (1.0 + squares / scale_px**2)
+        slope = float(np.sum(weights**2))  # (div psi) / 2 = w - w^2 |r|^2 / c^2 = w^2
+        return float(np.sum(weights**2 * squares)) / max(slope, 1e-300) ** 2
+
+    return min(scales_px, key=variance)
 
 
 def values_of(problem: AdjustmentProblem) -> Values:

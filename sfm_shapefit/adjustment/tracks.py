@@ -5,12 +5,31 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.directions.tracks import sampson_px
+from sfm_shapefit.geometry import normalized
 from sfm_shapefit.viewgraph import connected_components
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class CameraPoses:
+    """Where cameras stand; what tracks and their triangulation must know of them."""
+
+    rotations: FloatArray
+    """(c, 3, 3) cam_from_world."""
+    centers: FloatArray
+    """(c, 3)"""
+    focal_lengths_px: FloatArray
+    """(c,)"""
+    images: IntArray
+    """(c,) the image of each; views of one image follow one another."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ObservedTracks:
-    """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera."""
+    """Observations in tracks. Track t has the observations offsets[t]:offsets[t + 1], by ascending camera.
+
+    It joins under `join` itself, so that it may stand for `MatchedKeypoints`: what tracks it has are known.
+    """
 
     offsets: IntArray
     """(t + 1,)"""
@@ -51,6 +70,10 @@ class ObservedTracks:
             ids=self.ids[chosen],
         )
 
+    def join(self, _poses: CameraPoses, _limit_px: float) -> "ObservedTracks":
+        """Return itself: these tracks do not depend on poses."""
+        return self
+
     def of_points(self, points_seen: IntArray) -> "ObservedTracks":
         """Return the tracks of points, one each: what observations (m,) see, -1 for those to be left out."""
         rows = np.argsort(points_seen, kind="stable")[np.sum(points_seen < 0) :]
@@ -66,24 +89,53 @@ class ObservedTracks:
         )
 
 
-def join_matches(num_keypoints: IntArray, pairs: IntArray, offsets: IntArray, matches: IntArray) -> IntArray:
-    """Return the track of each keypoint, (K,), numbered by their first keypoints; -1 for those unmatched.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MatchedKeypoints:
+    """Keypoints of cameras, and which of them are matched with which."""
 
-    A track is a connected component of matched keypoints, those of camera c being the keypoints from
-    sum(num_keypoints[:c]) on.
+    cameras: IntArray
+    """(K,) ascending by image."""
+    keypoints: IntArray
+    """(K,) which of the image's keypoints it is."""
+    pixels: FloatArray
+    """(K, 2) as the adjustment's lens takes them."""
+    on_plane: FloatArray
+    """(K, 2) see `ObservedTracks`."""
+    matches: IntArray
+    """(m, 2) rows of the above."""
 
-    Args:
-        num_keypoints: (c,) of each camera.
-        pairs: (p, 2) of cameras.
-        offsets: (p + 1,) the matches of pair k are offsets[k]:offsets[k + 1].
-        matches: (m, 2) keypoints of the pair's two cameras, below their numbers.
-    """
-    first = np.concatenate([[0], np.cumsum(num_keypoints)])
-    ends = matches + np.repeat(first[pairs], np.diff(offsets), axis=0)
-    is_matched = np.zeros(int(first[-1]), dtype=np.bool_)
-    is_matched[ends] = True
-    matched = np.flatnonzero(is_matched)
-    place = np.cumsum(is_matched) - 1
-    tracks = np.full(int(first[-1]), -1)
-    tracks[matched] = connected_components(len(matched), place[ends])
-    return tracks
+    def join(self, poses: CameraPoses, limit_px: float) -> ObservedTracks:
+        """Return the connected components under the matches that agree with the poses.
+
+        A wrong match would join two tracks; nearly all wrong ones miss their epipolar line.
+
+        Args:
+            poses: of the cameras.
+            limit_px: largest Sampson error of a match that joins.
+        """
+        rays = normalized(self._rays(poses))
+        first, second = self.cameras[self.matches].T
+        directions = normalized(poses.centers[second] - poses.centers[first])
+        angles = 2.0 / (poses.focal_lengths_px[first] + poses.focal_lengths_px[second])
+        a, b = rays[self.matches[:, 0]], rays[self.matches[:, 1]]
+        joining = self.matches[sampson_px(a, b, directions, angles) <= limit_px]
+        is_joined = np.zeros(len(self.cameras), dtype=np.bool_)
+        is_joined[joining] = True
+        rows = np.flatnonzero(is_joined)
+        place = np.cumsum(is_joined) - 1
+        track = connected_components(len(rows), place[joining])
+        rows = rows[np.argsort(track, kind="stable")]
+        lengths = np.bincount(track)
+        return ObservedTracks(
+            offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
+            cameras=self.cameras[rows],
+            keypoints=self.keypoints[rows],
+            pixels=self.pixels[rows],
+            on_plane=self.on_plane[rows],
+            ids=np.arange(len(lengths)),
+        )
+
+    def _rays(self, poses: CameraPoses) -> FloatArray:
+        """Return the rays (K, 3) in axes of the world, of no particular length."""
+        ahead = np.concatenate([self.on_plane, np.ones((len(self.on_plane), 1))], axis=1)
+        return np.asarray(np.einsum("kba,kb->ka", poses.rotations[self.cameras], ahead))

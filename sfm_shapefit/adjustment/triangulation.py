@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from sfm_shapefit.adjustment.tracks import ObservedTracks
+from sfm_shapefit.adjustment.tracks import CameraPoses, ObservedTracks
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import inner_kernel, kernel
 
@@ -35,20 +35,6 @@ _STILL = 1e-9
 _WIDE_AMONG = 64
 # So many points a track may be of.
 _MOST_POINTS = 3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CameraPoses:
-    """Where cameras stand; what `triangulate_tracks` must know of them."""
-
-    rotations: FloatArray
-    """(c, 3, 3) cam_from_world."""
-    centers: FloatArray
-    """(c, 3)"""
-    focal_lengths_px: FloatArray
-    """(c,)"""
-    images: IntArray
-    """(c,) the image of each; views of one image follow one another."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

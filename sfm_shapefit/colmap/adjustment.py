@@ -15,8 +15,8 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
-from sfm_shapefit.adjustment.tracks import ObservedTracks, join_matches
-from sfm_shapefit.adjustment.triangulation import CameraPoses, TriangulatedPoints
+from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import observed_points, points2d_xy
 from sfm_shapefit.colmap.structure import TrackSource
@@ -141,30 +141,24 @@ def read_frames(reconstruction: pycolmap.Reconstruction, fixed_frames: Collectio
 
 
 def collect_tracks(
-    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource, min_length: int
-) -> ObservedTracks:
-    """Return the tracks of matches, or of a model's points, that posed images observe.
+    frames: PosedFrames, reconstruction: pycolmap.Reconstruction, tracks: TrackSource
+) -> ObservedTracks | MatchedKeypoints:
+    """Return the tracks of a model's points, or the matches of a graph, that posed images observe.
 
     Args:
         frames: of `reconstruction`, which has the keypoints of its images.
         reconstruction: the same.
         tracks: as in `colmap.structure.triangulate`.
-        min_length: tracks of fewer observations are left out.
     """
-    may_split = isinstance(tracks, pycolmap.CorrespondenceGraph)
     if isinstance(tracks, pycolmap.CorrespondenceGraph):
-        seen = _join_graph(frames, reconstruction, tracks)
-    else:
-        seen = _points_of(frames, tracks)
+        return _read_matches(frames, reconstruction, tracks)
+    seen = [observed_points(tracks.image(i)) for i in frames.image_ids]
     images = np.repeat(np.arange(len(seen)), [len(keypoints) for keypoints, _ in seen])
     keypoints = np.concatenate([keypoints for keypoints, _ in seen])
-    ids = np.concatenate([names for _, names in seen])
-    _, track, lengths = np.unique(ids, return_inverse=True, return_counts=True)
-    kept = lengths[track] >= min_length
-    images, keypoints, ids = images[kept], keypoints[kept], ids[kept]
+    points = np.concatenate([ids for _, ids in seen]).astype(np.int64)
     cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
-    order = np.argsort(ids, kind="stable")
-    names, lengths = np.unique(ids, return_counts=True)
+    order = np.argsort(points, kind="stable")
+    names, lengths = np.unique(points, return_counts=True)
     return ObservedTracks(
         offsets=np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64),
         cameras=cameras[order],
@@ -172,8 +166,45 @@ def collect_tracks(
         pixels=pixels[order],
         on_plane=on_plane[order],
         ids=names,
-        may_split=may_split,
+        may_split=False,
     )
+
+
+def read_bundle(
+    reconstruction: pycolmap.Reconstruction, frames: PosedFrames
+) -> tuple[IntArray, AdjustmentProblem]:
+    """Return the points that posed images observe, by id, and the problem of all that they observe.
+
+    An observation that its lens gives no ray is left out.
+
+    Args:
+        reconstruction: with points.
+        frames: of it.
+    """
+    tracks = collect_tracks(frames, reconstruction, reconstruction)
+    assert isinstance(tracks, ObservedTracks)
+    points = np.array([reconstruction.point3D(i).xyz for i in tracks.ids.tolist()]).reshape(-1, 3)
+    has_ray = np.isfinite(tracks.on_plane).all(axis=1)
+    seen = np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
+    problem = frames.problem_of(points, tracks.cameras[has_ray], seen[has_ray], tracks.pixels[has_ray])
+    return tracks.ids, problem
+
+
+def with_points(
+    reconstruction: pycolmap.Reconstruction, point_ids: IntArray, points: FloatArray
+) -> pycolmap.Reconstruction:
+    """Return a copy with points moved, and all errors of points updated.
+
+    Args:
+        reconstruction: not changed.
+        point_ids: (k,) of some of its points.
+        points: (k, 3) where they go.
+    """
+    copy = pycolmap.Reconstruction(reconstruction)
+    for point_id, xyz in zip(point_ids.tolist(), points, strict=True):
+        copy.point3D(point_id).xyz = xyz
+    copy.update_point_3d_errors()
+    return copy
 
 
 def with_poses(
@@ -274,22 +305,32 @@ def _sensor_from_rig(
     return pose.rotation.matrix(), pose.translation
 
 
-def _join_graph(
+def _read_matches(
     frames: PosedFrames, reconstruction: pycolmap.Reconstruction, graph: pycolmap.CorrespondenceGraph
-) -> list[tuple[IntArray, IntArray]]:
-    """Return, for each image, the keypoints that are matched and the track of each."""
+) -> MatchedKeypoints:
+    """Return the matches between the images."""
     place = {image_id: k for k, image_id in enumerate(frames.image_ids)}
     counts = np.array([reconstruction.image(i).num_points2D() for i in frames.image_ids], dtype=np.int64)
-    pairs, matches = [], []
+    begins = np.concatenate([[0], np.cumsum(counts)])
+    parts = [np.empty((0, 2), dtype=np.int64)]
     for first, second in sorted(map(pycolmap.pair_id_to_image_pair, graph.image_pairs())):
         if first in place and second in place:
-            pairs.append((place[first], place[second]))
-            matches.append(graph.extract_matches_between_images(first, second))
-    offsets = np.cumsum([0, *map(len, matches)])
-    joined = np.concatenate([np.empty((0, 2), np.uint32), *matches]).astype(np.int64)
-    track = join_matches(counts, np.array(pairs, dtype=np.int64).reshape(-1, 2), offsets, joined)
-    parts = np.split(track, np.cumsum(counts)[:-1])
-    return [(np.flatnonzero(part >= 0), part[part >= 0]) for part in parts]
+            matches = graph.extract_matches_between_images(first, second)
+            parts.append(matches.astype(np.int64) + begins[[place[first], place[second]]])
+    ends = np.concatenate(parts)
+    is_matched = np.zeros(int(begins[-1]), dtype=np.bool_)
+    is_matched[ends] = True
+    matched = np.flatnonzero(is_matched)
+    images = np.searchsorted(begins, matched, side="right") - 1
+    keypoints = matched - begins[images]
+    cameras, pixels, on_plane = _look_up(frames, reconstruction, images, keypoints)
+    return MatchedKeypoints(
+        cameras=cameras,
+        keypoints=keypoints,
+        pixels=pixels,
+        on_plane=on_plane,
+        matches=(np.cumsum(is_matched) - 1)[ends],
+    )
 
 
 def _look_up(
@@ -325,9 +366,3 @@ def _cube() -> FloatArray:
 
 
 _CUBE = _cube()
-
-
-def _points_of(frames: PosedFrames, model: pycolmap.Reconstruction) -> list[tuple[IntArray, IntArray]]:
-    """Return, for each image, the keypoints that observe a point of a model, and its id."""
-    seen = [observed_points(model.image(i)) for i in frames.image_ids]
-    return [(keypoints, ids.astype(np.int64)) for keypoints, ids in seen]

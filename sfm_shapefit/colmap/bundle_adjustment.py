@@ -5,12 +5,16 @@ Our own triangulates at the pixel threshold and solves twice:
     start                                                           loss             to a relative fall of
     poses that are coarse: few tracks, triangulated at 16 px        Cauchy, 1 px     1e-4 (`adjust_thinly`)
     all tracks, triangulated at the pixel threshold                 Cauchy, 1 px     1e-3
-    all tracks, triangulated there anew                             Cauchy, 0.25 px  1e-4
+    all tracks, triangulated there anew                             0.25 to 1 px     1e-4
 
-The threshold is 4 px; the scales of the losses follow another one. Poses are coarse if the threshold loses a
-tenth of the observations that four times as much finds. Three solves (1, 0.5 and 0.25 px), each to 1e-4, end
-at the same errors against the truth on seven real scenes, in 1.3 to 4 times the time; a single one at 0.25 px
-ends in false optima on hard ones. With the first solve at once on everything at 16 px, likewise.
+The threshold is 4 px; with another one, all scales follow. Poses are coarse if the threshold loses a tenth
+of the observations that four times as much finds. The last scale is the one of 0.25, 0.5 and 1 px that the
+errors themselves call for (`choose_loss_scale_px`): 0.25 px on photographs, whose best features are far
+better than most; 1 px under normal errors of 0.5 px, where 0.25 px would cost a third. Tracks are joined
+from the matches that agree with the poses, anew for each solve.
+
+Three solves (1, 0.5 and 0.25 px), each to 1e-4, end at the same errors against the truth on eight real
+scenes, in 1.3 to 4 times the time; a single one at 0.5 px ends elsewhere on hard ones.
 
 One thread does all, as the answer must not depend on their number.
 """
@@ -21,18 +25,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment import AdjustmentProblem, adjust, reprojection_errors_px
+from sfm_shapefit.adjustment import AdjustmentProblem, adjust, choose_loss_scale_px, reprojection_errors_px
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
-from sfm_shapefit.adjustment.tracks import ObservedTracks
+from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
-from sfm_shapefit.colmap.adjustment import PosedFrames, add_points, collect_tracks, read_frames, with_poses
+from sfm_shapefit.colmap.adjustment import add_points, collect_tracks, read_frames, with_poses
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 
-# Of each solve of all tracks: scale of the Cauchy loss in pixel thresholds, and the relative fall to end at.
-_SOLVES = ((0.25, 1e-3), (0.0625, 1e-4))
+# Of the two solves of all tracks: scales of the Cauchy loss in pixel thresholds, and the relative falls to
+# end at.
+_FIRST_SCALE, _FIRST_FALL = 0.25, 1e-3
+_LAST_SCALES, _LAST_FALL = (0.0625, 0.125, 0.25), 1e-4
 # Of the thin solve: the limit of its tracks, and the scale of its loss, in pixel thresholds.
 _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
@@ -88,7 +94,7 @@ def bundle_adjust(
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
     else:
-        run = _Run.of(seed, tracks, structure_options, fixed_frames)
+        run = _Run(seed, tracks, structure_options, fixed_frames)
         unfiltered, initial_error_px, iterations, converged = run.adjust_all(seed, tracks)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
@@ -121,46 +127,44 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run.of(seed, tracks, structure_options or StructureOptions(), fixed_frames)
-    run.adjust_thinly(run.triangulate(_THIN_LIMIT))
+    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames)
+    run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
     return with_poses(copy_without_points(seed), run.start, run.frames)
 
 
 class _Run:
     """The frames and tracks of one adjustment; frames move on."""
 
-    def __init__(self, frames: PosedFrames, tracks: ObservedTracks, options: StructureOptions) -> None:
-        self.start, self.frames, self.tracks, self.options = frames, frames, tracks, options
-        self.iterations, self.converged = 0, False
-        few = len(frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
-        two = few or not (options.ignore_two_view_tracks and tracks.may_split)
-        self.min_length = max(options.min_track_length, 2 if two else 3)
-
-    @classmethod
-    def of(
-        cls,
+    def __init__(
+        self,
         seed: pycolmap.Reconstruction,
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
-    ) -> "_Run":
-        """Read the frames of a seed, and the tracks."""
-        frames = read_frames(seed, fixed_frames)
-        return cls(frames, collect_tracks(frames, seed, tracks, 2), options)
+    ) -> None:
+        self.start = self.frames = read_frames(seed, fixed_frames)
+        self.source, self.options = collect_tracks(self.frames, seed, tracks), options
+        self.iterations, self.converged = 0, False
+        few = len(self.frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
+        checked = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
+        self.min_length = max(options.min_track_length, 3 if checked else 2)
 
-    def triangulate(self, widening: float, tracks: ObservedTracks | None = None) -> TriangulatedPoints:
-        """Return the points of tracks at the frames' poses, at so many pixel thresholds."""
+    def triangulate(self, widening: float) -> tuple[ObservedTracks, TriangulatedPoints]:
+        """Return the tracks and points at the frames' poses, at so many pixel thresholds."""
         limits = PointLimits(
             max_error_px=widening * self.options.max_reprojection_error_px,
             min_angle_deg=self.options.min_triangulation_angle_deg,
             min_length=self.min_length,
         )
-        return triangulate_tracks(tracks or self.tracks, self.frames.poses(), limits)
+        poses = self.frames.poses()
+        tracks = self.source.join(poses, limits.max_error_px)
+        found = triangulate_tracks(tracks, poses, limits)
+        return tracks, found
 
-    def adjust_thinly(self, found: TriangulatedPoints) -> None:
+    def adjust_thinly(self, tracks: ObservedTracks, found: TriangulatedPoints) -> None:
         """Move the frames to where few of the points found want them."""
         refuse_without_points(len(found.points))
-        thin = self.tracks.of_points(found.points_seen)
+        thin = tracks.of_points(found.points_seen)
         images = self.frames.images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, len(self.frames.image_ids))
         seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
@@ -182,19 +186,23 @@ class _Run:
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, int, bool]:
         """Return the adjusted model, not filtered; the first mean error; all steps; and the convergence."""
-        found, loose = self.triangulate(1.0), self.triangulate(_THIN_LIMIT)
+        (joined, found), (loosely, loose) = self.triangulate(1.0), self.triangulate(_THIN_LIMIT)
         refuse_without_points(len(loose.points))
-        initial_error_px = _mean_error_px(self.frames.problem(self.tracks, found))
+        initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
-            self.adjust_thinly(loose)
-        for scale, fall in _SOLVES:
-            found = self.triangulate(1.0)
-            refuse_without_points(len(found.points))
-            adjusted = self.solve(self.frames.problem(self.tracks, found), scale, fall)
+            self.adjust_thinly(loosely, loose)
+        joined, found = self.triangulate(1.0)
+        refuse_without_points(len(found.points))
+        adjusted = self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
+        scales_px = [scale * self.options.max_reprojection_error_px for scale in _LAST_SCALES]
+        last_scale = choose_loss_scale_px(adjusted, scales_px) / self.options.max_reprojection_error_px
+        joined, found = self.triangulate(1.0)
+        refuse_without_points(len(found.points))
+        adjusted = self.solve(self.frames.problem(joined, found), last_scale, _LAST_FALL)
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks
-        add_points(answer, self.frames, self.tracks, found, colors)
+        add_points(answer, self.frames, joined, found, colors)
         return answer, initial_error_px, self.iterations, self.converged
 
 

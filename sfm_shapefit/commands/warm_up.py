@@ -45,6 +45,7 @@ FURTHER = (
     "locate_rigs",
     "solve_iteratively",
     "adjust_bundles",
+    "adjust_few_tracks",
     "place_long_graph",
     "locate_from_tracks",
     "place_flat_graph",

@@ -92,7 +92,7 @@ def build_tracks(
         pair = np.repeat(np.arange(len(row)), counts)[kept]
         d = directions.directions[row[pair]]
         angle = batch.pixel_angles[pair]
-        agrees = _sampson_px(batch.rays_i[kept], batch.rays_j[kept], d, angle) <= threshold_px
+        agrees = sampson_px(batch.rays_i[kept], batch.rays_j[kept], d, angle) <= threshold_px
         chosen = np.flatnonzero(kept)[agrees]
         keys.append(batch.pairs[pair[agrees]] * _KEYPOINTS + batch.keypoints[chosen])
         rays.append(np.stack([batch.rays_i[chosen], batch.rays_j[chosen]], axis=1).reshape(-1, 3))
@@ -114,7 +114,7 @@ def _draw_matches(batch: MatchBatch, counts: IntArray, share: float) -> BoolArra
     return np.asarray(drawn.any(axis=1))
 
 
-def _sampson_px(a: FloatArray, b: FloatArray, d: FloatArray, pixel_angle: FloatArray) -> FloatArray:
+def sampson_px(a: FloatArray, b: FloatArray, d: FloatArray, pixel_angle: FloatArray) -> FloatArray:
     """Return the Sampson error of matches (k, 3) against directions (k, 3) in pixels, see `directions`."""
     along_a, along_b = np.sum(a * d, axis=1), np.sum(b * d, axis=1)
     gradient = np.sqrt(np.maximum(2.0 - along_a**2 - along_b**2, 1e-12))

@@ -10,6 +10,7 @@ import numpy as np
 from sfm_shapefit import synthetic
 from sfm_shapefit.adjustment import AdjustmentProblem, Lens, adjust, estimate_covariances
 from sfm_shapefit.baselines import FILTERS, LOCATORS
+from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.commands.inspect import inspect
@@ -136,6 +137,12 @@ def locate_from_tracks(folder: Path) -> None:
     model = _workspace(folder, WorkspaceOptions(database=False))
     locate(model, threads=1, bundle_adjust=True)
     inspect(model, theory=True)
+
+
+def adjust_few_tracks(folder: Path) -> None:
+    """Adjust the poses of a model on few tracks."""
+    model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
+    adjust_thinly(model, model)
 
 
 def locate_rigs(folder: Path) -> None:

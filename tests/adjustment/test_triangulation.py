@@ -1,0 +1,221 @@
+"""Tracks joined from matches, triangulated in spite of wrong observations, and few of them chosen."""
+
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.adjustment import adjust, choose_loss_scale_px, triangulation
+from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
+from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
+from sfm_shapefit.adjustment.triangulation import PointLimits, triangulate_tracks
+from tests.adjustment.made import disturb, ring_problem
+
+LIMITS = PointLimits(max_error_px=4.0, min_angle_deg=1.5, min_length=3)
+FOCAL = 500.0
+
+
+def made(noise_px=0.0, num_points=200, share=0.5, seed=0):
+    """Tracks of a ring of cameras, their poses and the true points."""
+    rng = np.random.default_rng(seed)
+    problem = ring_problem(rng, num_points=num_points, noise_px=noise_px, share=share)
+    order = np.lexsort((problem.cameras_seeing, problem.points_seen))
+    pixels = problem.pixels[order]
+    lengths = np.bincount(problem.points_seen, minlength=num_points)
+    tracks = ObservedTracks(
+        offsets=np.concatenate([[0], np.cumsum(lengths)]),
+        cameras=problem.cameras_seeing[order],
+        keypoints=problem.points_seen[order],
+        pixels=pixels,
+        on_plane=(pixels - [320.0, 240.0]) / FOCAL,
+        ids=np.arange(num_points),
+    )
+    poses = CameraPoses(
+        rotations=problem.rotations,
+        centers=problem.centers,
+        focal_lengths_px=np.full(problem.num_cameras, FOCAL),
+        images=np.arange(problem.num_cameras),
+    )
+    return tracks, poses, problem.points
+
+
+def with_wrong(tracks, share, seed=1, off_px=100.0):
+    """The tracks with a share of their observations elsewhere, and which."""
+    rng = np.random.default_rng(seed)
+    wrong = rng.random(len(tracks.cameras)) < share
+    turns = rng.uniform(0.0, 2.0 * np.pi, len(wrong))
+    shifts = off_px / FOCAL * np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    return replace(tracks, on_plane=tracks.on_plane + shifts * wrong[:, None]), wrong
+
+
+def test_exact_tracks_give_their_points():
+    tracks, poses, points = made()
+    found = triangulate_tracks(tracks, poses, LIMITS)
+    np.testing.assert_array_equal(found.tracks, np.flatnonzero(tracks.lengths() >= 3))
+    np.testing.assert_allclose(found.points, points[found.tracks], atol=1e-12)
+    expected = np.repeat(tracks.lengths() >= 3, tracks.lengths())
+    np.testing.assert_array_equal(found.points_seen >= 0, expected)
+
+
+def test_the_point_minimizes_the_squared_errors_of_its_observations():
+    tracks, poses, _ = made(noise_px=0.5)
+    found = triangulate_tracks(tracks, poses, LIMITS)
+
+    def cost(points):
+        used = found.points_seen >= 0
+        at, camera = points[found.points_seen[used]], tracks.cameras[used]
+        x = np.einsum("mab,mb->ma", poses.rotations[camera], at - poses.centers[camera])
+        squares = np.sum((x[:, :2] / x[:, 2:] - tracks.on_plane[used]) ** 2, axis=1)
+        return np.bincount(found.points_seen[used], squares)
+
+    least = cost(found.points)
+    for axis in np.eye(3):
+        for step in (1e-4, -1e-4):
+            assert (cost(found.points + step * axis) > least).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fifth_of_wrong_observations_is_left_out(seed):
+    tracks, poses, points = made(noise_px=0.3, share=0.9, seed=seed)
+    damaged, wrong = with_wrong(tracks, 0.2, seed)
+    found = triangulate_tracks(replace(damaged, may_split=False), poses, LIMITS)
+    assert len(found.points) >= 0.99 * len(points)
+    np.testing.assert_allclose(found.points, points[found.tracks], atol=0.02)
+    of_point = found.points_seen >= 0
+    assert not (of_point & wrong).any()
+    assert np.mean(of_point[~wrong]) > 0.99
+
+
+def test_a_track_of_two_points_is_split_only_where_it_may_be():
+    tracks, poses, points = made(num_points=2, share=1.0)
+    rows = np.lexsort((tracks.keypoints, tracks.cameras))
+    both = replace(
+        tracks,
+        offsets=np.array([0, len(rows)]),
+        cameras=tracks.cameras[rows],
+        keypoints=tracks.keypoints[rows],
+        pixels=tracks.pixels[rows],
+        on_plane=tracks.on_plane[rows],
+        ids=np.array([7]),
+    )
+    found = triangulate_tracks(both, poses, LIMITS)
+    assert len(found.points) == 2
+    np.testing.assert_allclose(found.points[np.argsort(found.points[:, 0])], points[np.argsort(points[:, 0])])
+    for point in range(2):
+        assert len(set(both.keypoints[found.points_seen == point])) == 1
+    assert len(triangulate_tracks(replace(both, may_split=False), poses, LIMITS).points) == 1
+
+
+def test_of_two_observations_of_one_image_the_better_one_counts():
+    tracks, poses, points = made(num_points=1, share=1.0)
+    doubled = replace(
+        tracks,
+        offsets=np.array([0, len(tracks.cameras) + 1]),
+        cameras=np.insert(tracks.cameras, 3, 3),
+        keypoints=np.insert(tracks.keypoints, 3, 9),
+        pixels=np.insert(tracks.pixels, 3, 0.0, axis=0),
+        on_plane=np.insert(tracks.on_plane, 3, tracks.on_plane[3] + 2.0 / FOCAL, axis=0),
+    )
+    found = triangulate_tracks(doubled, poses, LIMITS)
+    assert np.flatnonzero(found.points_seen < 0).tolist() == [3]
+    np.testing.assert_allclose(found.points, points, atol=0.05)
+
+
+@pytest.mark.parametrize("what", ["behind", "narrow", "no ray", "far off"])
+def test_what_cannot_be_a_point_is_none(what):
+    tracks, poses, _ = made(num_points=20, share=1.0)
+    limits = replace(LIMITS, min_length=4)
+    if what == "behind":
+        poses = replace(poses, rotations=poses.rotations * np.array([-1.0, 1.0, -1.0])[:, None])
+        tracks = replace(tracks, on_plane=tracks.on_plane * [-1.0, 1.0])
+    elif what == "narrow":  # two cameras 30 degrees apart on their ring, seen from near its center
+        limits = replace(LIMITS, min_length=2, min_angle_deg=60.0)
+        tracks = replace(tracks, on_plane=np.where(tracks.cameras[:, None] < 2, tracks.on_plane, np.nan))
+        assert len(triangulate_tracks(tracks, poses, replace(limits, min_angle_deg=10.0)).points) == 20
+    elif what == "no ray":
+        tracks = replace(tracks, on_plane=np.full_like(tracks.on_plane, np.nan))
+    else:
+        tracks, _ = with_wrong(tracks, 1.0)
+    found = triangulate_tracks(tracks, poses, limits)
+    assert len(found.points) <= (3 if what == "far off" else 0)
+    assert (found.points_seen < len(found.points)).all()
+
+
+def test_slices_and_neighbors_change_no_bit(monkeypatch):
+    tracks, poses, _ = made(noise_px=0.5)
+    whole = triangulate_tracks(tracks, poses, LIMITS)
+    monkeypatch.setattr(triangulation, "_SLICE", 37)
+    sliced = triangulate_tracks(tracks, poses, LIMITS)
+    np.testing.assert_array_equal(whole.points, sliced.points)
+    np.testing.assert_array_equal(whole.points_seen, sliced.points_seen)
+    part = triangulate_tracks(tracks.subset(np.arange(100, 200)), poses, LIMITS)
+    np.testing.assert_array_equal(part.points, whole.points[whole.tracks >= 100])
+    assert len(triangulate_tracks(tracks.subset(np.arange(0)), poses, LIMITS).points) == 0
+
+
+def matched(tracks, extra=()):
+    """Matches of each observation with the next of its track, and further ones."""
+    order = np.lexsort((tracks.keypoints, tracks.cameras))
+    place = np.argsort(order)
+    same = np.repeat(np.arange(tracks.num_tracks), tracks.lengths())
+    next_one = np.flatnonzero(same[1:] == same[:-1])
+    matches = place[np.stack([next_one, next_one + 1], axis=1)]
+    return MatchedKeypoints(
+        cameras=tracks.cameras[order],
+        keypoints=tracks.keypoints[order],
+        pixels=tracks.pixels[order],
+        on_plane=tracks.on_plane[order],
+        matches=np.concatenate([matches, np.array(extra, dtype=np.int64).reshape(-1, 2)]),
+    )
+
+
+def test_wrong_matches_do_not_join_tracks():
+    tracks, poses, _ = made(noise_px=0.3, num_points=300)
+    rng = np.random.default_rng(5)
+    wrong = rng.integers(0, len(tracks.cameras), (400, 2))
+    found = matched(tracks, wrong[tracks.cameras[wrong[:, 0]] != tracks.cameras[wrong[:, 1]]])
+    joined = found.join(poses, 4.0)
+    mixed = [len(set(joined.keypoints[a:b])) > 1 for a, b in itertools.pairwise(joined.offsets)]
+    assert np.mean(mixed) < 0.05
+    one = found.join(poses, 1e9)  # without the check, most are one track
+    assert one.lengths().max() > 0.5 * len(tracks.cameras)
+    placed = triangulate_tracks(joined, poses, LIMITS)
+    assert len(placed.points) >= 0.95 * np.sum(tracks.lengths() >= 3)
+
+
+def test_thin_tracks_give_every_image_its_share_and_do_not_depend_on_the_order():
+    tracks, _, _ = made(noise_px=0.5, num_points=60_000, share=0.4)
+    chosen = choose_thin_tracks(tracks.offsets, tracks.cameras, tracks.pixels, 12)
+    seen = np.bincount(tracks.subset(chosen).cameras)
+    wanted = 20_000 // 12
+    assert wanted / 3 <= seen.min()
+    assert seen.max() < 2 * wanted
+    assert tracks.lengths()[chosen].mean() > tracks.lengths().mean()
+    shuffled = np.random.default_rng(0).permutation(tracks.num_tracks)
+    other = tracks.subset(shuffled)
+    again = choose_thin_tracks(other.offsets, other.cameras, other.pixels, 12)
+    np.testing.assert_array_equal(np.sort(shuffled[again]), chosen)
+
+
+def test_thin_tracks_are_all_where_there_are_few():
+    tracks, _, _ = made(num_points=50)
+    chosen = choose_thin_tracks(tracks.offsets, tracks.cameras, tracks.pixels, 12)
+    assert chosen.tolist() == np.flatnonzero(tracks.lengths() > 0).tolist()
+
+
+@pytest.mark.parametrize(("heavy", "scale_px"), [(False, 1.0), (True, 0.25)])
+def test_normal_errors_call_for_a_wide_loss_and_sharp_ones_with_a_tail_for_a_narrow_one(heavy, scale_px):
+    rng = np.random.default_rng(0)
+    problem = ring_problem(rng, num_points=400, noise_px=0.0 if heavy else 0.5)
+    if heavy:
+        spread = np.where(rng.random(problem.num_observations) < 0.7, 0.1, 1.0)
+        noise = spread[:, None] * rng.standard_normal(problem.pixels.shape)
+        problem = replace(problem, pixels=problem.pixels + noise)
+    start = adjust(disturb(problem, rng), loss_scale_px=1.0).problem
+    assert choose_loss_scale_px(start, (0.25, 0.5, 1.0)) == scale_px
+    errors = {
+        c: np.linalg.norm(adjust(start, loss_scale_px=c).problem.centers - problem.centers)
+        for c in (0.25, 1.0)
+    }
+    assert errors[scale_px] == min(errors.values())
