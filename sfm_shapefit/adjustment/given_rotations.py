@@ -18,14 +18,15 @@ rotations. Who measured rotations better than the matches know them has to say s
 """
 
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.adjustment.options import AdjustmentOptions
-from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.priors import rotation_vectors
-from sfm_shapefit.adjustment.solve import adjust
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.adjustment.problem import AdjustmentProblem, RotationPrior, isotropic_information
+from sfm_shapefit.adjustment.solve import adjust, reprojection_errors_px
+from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.geometry import mean_rotation_l1
 
 # A frame that sees fewer points in a half says nothing.
@@ -33,23 +34,44 @@ _FEWEST_POINTS = 10
 _FEWEST_FRAMES = 3
 # The halves end at this relative fall of the cost: what is left is far below the spread between them.
 _FALL = 1e-4
+# Of a normal error in the plane, the median length over the standard deviation per axis.
+_MEDIAN_LENGTH = 1.1774
+
+
+class RotationWeight(NamedTuple):
+    """How an adjustment treats the rotations that it was given."""
+
+    hold: bool = False
+    """They stay what they are, to the last bit."""
+    sigma_rad: float | None = None
+    """Standard deviation per axis by which they pull; None: they do not."""
+    noise_px: float = 0.5
+    """Standard deviation of an observation per axis, which the pull is weighed against."""
+
+    def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
+        """Return the problem with the pull of the given rotations (n, 3, 3)."""
+        if self.hold or self.sigma_rad is None:
+            return problem
+        information = isotropic_information(np.full(problem.num_frames, self.sigma_rad))
+        return replace(problem, rotation_prior=RotationPrior(rotations=given, information=information))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RotationErrors:
-    """What the matches say of the given rotations; standard deviations per axis, in radians."""
+    """What the matches say of the given rotations; standard deviations per axis."""
 
     sigma_rad: float
     """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
     chance_rad: float
     """Median over the frames of what chance turns them by, all points together."""
+    noise_px: float
+    """Of an observation, from the median of all errors with free rotations."""
     num_frames: int
     """Frames that say anything."""
 
-    @property
-    def are_to_be_held(self) -> bool:
-        """Whether freeing the rotations would bring more noise than it takes errors away."""
-        return self.sigma_rad == 0.0
+    def weight(self) -> RotationWeight:
+        """Return how to treat the rotations: held, if freeing them would bring more noise than it takes."""
+        return RotationWeight(self.sigma_rad == 0.0, self.sigma_rad or None, self.noise_px)
 
 
 def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOptions) -> RotationErrors:
@@ -62,20 +84,23 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     bare = replace(problem, rotation_prior=None)
     free = replace(options, hold_rotations=False, cost_tolerance=_FALL)
     is_first = np.random.default_rng(0).permutation(problem.num_points) % 2 == 0
-    halves = [bare.with_points(half) for half in (is_first, ~is_first)]
-    turns = [_turns(bare, adjust(half, free).problem.rotations) for half in halves]
-    seen = np.min([_count_points(half) for half in halves], axis=0)
+    halves = [bare.of_points(half) for half in (is_first, ~is_first)]
+    ends = [adjust(half, free).problem for half in halves]
+    seen = np.min([_count_observations(half) for half in halves], axis=0)
     known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
-    first, second = (turn[known] for turn in turns)
-    if np.sum(known) < _FEWEST_FRAMES:
-        return RotationErrors(sigma_rad=0.0, chance_rad=0.0, num_frames=int(np.sum(known)))
+    first, second = (_turns(bare, end.rotations)[known] for end in ends)
+    errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
+    noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH
+    if len(first) < _FEWEST_FRAMES:
+        return RotationErrors(sigma_rad=0.0, chance_rad=0.0, noise_px=noise_px, num_frames=len(first))
     agreement = np.einsum("fa,fa->f", first, second) / 3.0
     chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
     is_chance = np.median(agreement) <= np.median(chance)
     return RotationErrors(
         sigma_rad=0.0 if is_chance else float(np.sqrt(max(agreement.mean(), np.median(agreement)))),
         chance_rad=float(np.sqrt(np.median(chance))),
-        num_frames=int(np.sum(known)),
+        noise_px=noise_px,
+        num_frames=len(first),
     )
 
 
@@ -87,8 +112,8 @@ def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
     return rotation_vectors(rotations @ given.transpose(0, 2, 1))
 
 
-def _count_points(problem: AdjustmentProblem) -> BoolArray:
-    """Return how many points each frame sees, (n,)."""
+def _count_observations(problem: AdjustmentProblem) -> IntArray:
+    """Return how many observations each frame has, (n,)."""
     cameras = problem.cameras_seeing
     frames = cameras if problem.rig is None else problem.rig.frame_of_camera[cameras]
-    return np.bincount(frames, minlength=problem.num_frames)
+    return np.bincount(frames, minlength=problem.num_frames).astype(np.int64)

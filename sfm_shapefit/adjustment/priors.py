@@ -23,6 +23,11 @@ def turn(rotations: FloatArray, vectors: FloatArray) -> FloatArray:
     return turned
 
 
+def rotation_vectors(rotations: FloatArray) -> FloatArray:
+    """Return the vectors (n, 3) in radians whose exponentials are the rotations (n, 3, 3)."""
+    return np.asarray(Rotation.from_matrix(rotations).as_rotvec())
+
+
 def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> float:
     """Return the cost of all priors in px^2; those of fixed frames are constants and left out."""
     moves = ~problem.is_fixed()
@@ -61,8 +66,7 @@ def add_center_prior(
 def _turns(problem: AdjustmentProblem, values: Values) -> FloatArray:
     """Return the rotation vectors from the prior's rotations, (n, 3)."""
     assert problem.rotation_prior is not None
-    apart = values.rotations @ problem.rotation_prior.rotations.transpose(0, 2, 1)
-    return np.asarray(Rotation.from_matrix(apart).as_rotvec())
+    return rotation_vectors(values.rotations @ problem.rotation_prior.rotations.transpose(0, 2, 1))
 
 
 def _shifts(problem: AdjustmentProblem, values: Values) -> FloatArray:

@@ -210,6 +210,17 @@ class AdjustmentProblem:
         """Return the problem with the same observations at other values."""
         return replace(self, rotations=rotations, centers=centers, points=points, lenses=lenses)
 
+    def of_points(self, chosen: BoolArray) -> Self:
+        """Return the problem of some points (k,) and what sees them; frames and cameras stay."""
+        seen = chosen[self.points_seen]
+        return replace(
+            self,
+            points=self.points[chosen],
+            cameras_seeing=self.cameras_seeing[seen],
+            points_seen=(np.cumsum(chosen) - 1)[self.points_seen[seen]],
+            pixels=self.pixels[seen],
+        )
+
     def _take(self, name: str, dtype: type, shape: tuple[int, ...]) -> None:
         """Store a field as a contiguous array of its type, or refuse it."""
         array: npt.NDArray[Any] = np.ascontiguousarray(getattr(self, name), dtype=dtype)

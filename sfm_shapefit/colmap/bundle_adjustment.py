@@ -19,13 +19,21 @@ scenes, in 1.3 to 4 times the time; a single one at 0.5 px ends elsewhere on har
 One thread does all, as the answer must not depend on their number.
 """
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment import AdjustmentProblem, adjust, choose_loss_scale_px, reprojection_errors_px
+from sfm_shapefit.adjustment import (
+    AdjustmentOptions,
+    AdjustmentProblem,
+    adjust,
+    choose_loss_scale_px,
+    reprojection_errors_px,
+)
+from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
@@ -43,7 +51,10 @@ _LAST_SCALES, _LAST_FALL = (0.0625, 0.125, 0.25), 1e-4
 _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
 _FINE = 0.9
+# Of the solve after a placement.
+_GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
+_FREE = RotationWeight()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -62,6 +73,36 @@ class Adjusted:
     """Steps of all solves together."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AdjustedPlacement:
+    """Placed cameras after adjustment, and what became of their rotations."""
+
+    reconstruction: pycolmap.Reconstruction
+    """The adjusted poses, without points."""
+    weight: RotationWeight
+    """How the given rotations were treated."""
+    errors: RotationErrors | None
+    """What the matches said of them, if they were asked."""
+
+    @property
+    def statement(self) -> str:
+        """What was chosen and why, in words."""
+        if self.errors is None:
+            if self.weight.hold:
+                return "centers and points adjusted, rotations held, as asked"
+            sigma = self.weight.sigma_rad
+            kept = "free" if sigma is None else f"weighted by {math.degrees(sigma):.2g} deg"
+            return f"centers, points and rotations adjusted, rotations {kept}, as asked"
+        chance = f"{math.degrees(self.errors.chance_rad):.2g} deg"
+        if self.weight.hold:
+            return f"centers and points adjusted, rotations held: freed, they would turn by chance ({chance})"
+        sigma_deg = math.degrees(self.errors.sigma_rad)
+        return (
+            f"centers, points and rotations adjusted: the matches put the given rotations off by "
+            f"{sigma_deg:.2g} deg per axis, where chance gives {chance}, so they were weighted by that"
+        )
+
+
 def bundle_adjust(
     seed: pycolmap.Reconstruction,
     tracks: TrackSource,
@@ -69,6 +110,7 @@ def bundle_adjust(
     *,
     adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
+    weight: RotationWeight = _FREE,
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -78,6 +120,7 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        weight: of the seed's rotations; they are free by default, and always with Ceres.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
@@ -94,7 +137,7 @@ def bundle_adjust(
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
     else:
-        run = _Run(seed, tracks, structure_options, fixed_frames)
+        run = _Run(seed, tracks, structure_options, fixed_frames, weight)
         unfiltered, initial_error_px, iterations, converged = run.adjust_all(seed, tracks)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
@@ -132,6 +175,40 @@ def adjust_thinly(
     return with_poses(copy_without_points(seed), run.start, run.frames)
 
 
+def adjust_placement(
+    seed: pycolmap.Reconstruction,
+    tracks: TrackSource,
+    structure_options: StructureOptions,
+    weight: RotationWeight | None,
+    *,
+    fixed_frames: Collection[int] = (),
+) -> AdjustedPlacement:
+    """Adjust placed cameras whose rotations were given, on all tracks at once, at a loss of 0.5 px.
+
+    Args:
+        seed: the placed images, which is not changed; any points are ignored.
+        tracks: as in `triangulate`.
+        structure_options: filters.
+        weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
+        fixed_frames: ids of frames whose poses stay what they are to the last bit.
+
+    Raises:
+        UnsolvableError: if no point can be triangulated.
+    """
+    run = _Run(seed, tracks, structure_options, fixed_frames)
+    joined, found = run.triangulate(1.0)
+    refuse_without_points(len(found.points))
+    problem, errors = run.frames.problem(joined, found), None
+    if weight is None:
+        loss_scale_px = _GIVEN_SCALE * structure_options.max_reprojection_error_px
+        errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
+        weight = errors.weight()
+    run.weight = weight
+    run.solve(problem, _GIVEN_SCALE, _GIVEN_FALL)
+    poses = with_poses(copy_without_points(seed), run.start, run.frames)
+    return AdjustedPlacement(reconstruction=poses, weight=weight, errors=errors)
+
+
 class _Run:
     """The frames and tracks of one adjustment; frames move on."""
 
@@ -141,7 +218,9 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
+        weight: RotationWeight = _FREE,
     ) -> None:
+        self.weight = weight
         self.start = self.frames = read_frames(seed, fixed_frames)
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged = 0, False
@@ -174,7 +253,13 @@ class _Run:
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = scale * self.options.max_reprojection_error_px
-        adjusted = adjust(problem, loss_scale_px=loss_scale_px, cost_tolerance=fall)
+        adjusted = adjust(
+            self.weight.apply(problem, self.start.rotations),
+            loss_scale_px=loss_scale_px,
+            cost_tolerance=fall,
+            hold_rotations=self.weight.hold,
+            noise_px=self.weight.noise_px,
+        )
         self.frames = replace(
             self.frames, rotations=adjusted.problem.rotations, centers=adjusted.problem.centers
         )
