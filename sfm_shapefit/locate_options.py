@@ -12,6 +12,7 @@ from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.settings import explained, option
 
+Rotations = Literal["auto", "measured", "free"]
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 Relative = Literal["matches", "stored"]
@@ -66,6 +67,20 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Let the position priors that set the scale also pull the cameras, each by its standard "
         "deviation; priors that are far off have no part.",
     )
+    adjust: bool = option(
+        True,
+        "Adjust centers and points to the pixels after placement, all tracks at once, and rotations as far "
+        "as they are doubtful; up to 2,000 cameras. Not with objectives that deliver an optimum as it is.",
+    )
+    rotations: Rotations = option(
+        "auto",
+        'What to make of the given rotations in an adjustment: "measured" holds them, "free" forgets them; '
+        '"auto" estimates their standard deviation from the matches, and holds them where that is nothing.',
+    )
+    rotation_sigma_deg: float = option(
+        0.0,
+        "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
+    )
     refine_rotations: bool = option(
         False,
         "Refine the given rotations on the matches before cameras are placed, camera by camera where "
@@ -95,6 +110,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._check_distance()
+        self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
         if self.adjuster != "own" and not self.bundle_adjust:
@@ -108,6 +124,18 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             and self.directions != "relative-poses"
         ):
             raise ValueError("max_rotation_error_deg belongs to directions=relative-poses; leave out one")
+
+    def _check_rotations(self) -> None:
+        """Refuse what is said of rotations where it has no effect."""
+        if not 0.0 <= self.rotation_sigma_deg < 180.0:
+            raise ValueError(f"rotation_sigma_deg must lie in [0, 180), got {self.rotation_sigma_deg}")
+        if self.rotation_sigma_deg and self.rotations != "auto":
+            raise ValueError(
+                f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
+            )
+        said = self.rotation_sigma_deg or self.rotations != "auto"
+        if said and not (self.adjust or self.bundle_adjust):
+            raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
 
     def _check_distance(self) -> None:
         """Refuse a known distance that is none, or that the scale asked for has no use for."""
@@ -172,6 +200,10 @@ class MapOptions(LocateOptions):
         super().__post_init__()
         if self.directions == "tracks":
             raise ValueError("a database has no tracks; directions must be auto, matches or relative-poses")
+        if self.rotations != "auto" or self.rotation_sigma_deg:
+            raise ValueError(
+                "map finds the rotations itself; what given ones are worth is for locate to know"
+            )
         if self.min_matches:
             self.check_range("min_matches", LEAST_MATCHES)
         self.check_range("min_model_size", 3)

@@ -8,7 +8,7 @@ is at most 1.3 times that of the image, even for rays at right angles to the cam
 """
 
 import itertools
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +20,7 @@ from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import observed_points, points2d_xy
 from sfm_shapefit.colmap.structure import TrackSource
+from sfm_shapefit.geometry import normalized
 
 _ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
@@ -109,9 +110,8 @@ def read_frames(reconstruction: pycolmap.Reconstruction, fixed_frames: Collectio
     images = [reconstruction.image(i) for i in image_ids]
     frame_ids = sorted({image.frame_id for image in images})
     place = {frame: k for k, frame in enumerate(frame_ids)}
-    frame_poses = [_pose(reconstruction.frame(i)) for i in frame_ids]
-    rotations = np.array([pose.rotation.matrix() for pose in frame_poses]).reshape(-1, 3, 3)
-    translations = np.array([pose.translation for pose in frame_poses]).reshape(-1, 3)
+    rotations = rotations_of_frames(reconstruction, frame_ids)
+    translations = np.array([_pose(reconstruction.frame(i)).translation for i in frame_ids]).reshape(-1, 3)
     camera_ids = sorted({image.camera_id for image in images})
     views = {i: _views(reconstruction.camera(i)) for i in camera_ids}
     lenses = tuple(_lens(reconstruction.camera(i)) for i in camera_ids)
@@ -264,6 +264,17 @@ def add_points(
         begin = end
 
 
+def rotations_of_frames(reconstruction: pycolmap.Reconstruction, frame_ids: Sequence[int]) -> FloatArray:
+    """Return rig_from_world (n, 3, 3) of posed frames by their ids."""
+    found = [_matrix(_pose(reconstruction.frame(i)).rotation) for i in frame_ids]
+    return np.array(found).reshape(-1, 3, 3)
+
+
+def _matrix(rotation: pycolmap.Rotation3d) -> FloatArray:
+    """Return the matrix of a rotation; the quaternion of a model in text need not be of length 1."""
+    return np.asarray(pycolmap.Rotation3d(normalized(rotation.quat)).matrix())
+
+
 def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
     """Return rig_from_world of a frame of a posed image."""
     pose = frame.rig_from_world
@@ -302,7 +313,7 @@ def _sensor_from_rig(
         return np.eye(3), np.zeros(3)
     pose = rig.sensor_from_rig(sensor)
     assert pose is not None  # `read_model` refuses others
-    return pose.rotation.matrix(), pose.translation
+    return _matrix(pose.rotation), pose.translation
 
 
 def _read_matches(

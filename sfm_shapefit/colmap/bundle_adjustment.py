@@ -22,6 +22,7 @@ One thread does all, as the answer must not depend on their number.
 import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -37,7 +38,13 @@ from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeig
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
-from sfm_shapefit.colmap.adjustment import add_points, collect_tracks, read_frames, with_poses
+from sfm_shapefit.colmap.adjustment import (
+    add_points,
+    collect_tracks,
+    read_frames,
+    rotations_of_frames,
+    with_poses,
+)
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
@@ -103,6 +110,13 @@ class AdjustedPlacement:
         )
 
 
+class GivenRotations(NamedTuple):
+    """The rotations of a model, and how an adjustment treats them."""
+
+    weight: RotationWeight
+    model: pycolmap.Reconstruction
+
+
 def bundle_adjust(
     seed: pycolmap.Reconstruction,
     tracks: TrackSource,
@@ -110,7 +124,7 @@ def bundle_adjust(
     *,
     adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
-    weight: RotationWeight = _FREE,
+    given: GivenRotations | None = None,
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -120,7 +134,7 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        weight: of the seed's rotations; they are free by default, and always with Ceres.
+        given: rotations that were given, and how they are treated; all are free if None, and with Ceres.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
@@ -137,7 +151,9 @@ def bundle_adjust(
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
     else:
-        run = _Run(seed, tracks, structure_options, fixed_frames, weight)
+        run = _Run(seed, tracks, structure_options, fixed_frames)
+        if given is not None:
+            run.weight, run.given = given.weight, rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, iterations, converged = run.adjust_all(seed, tracks)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
@@ -218,10 +234,9 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
-        weight: RotationWeight = _FREE,
     ) -> None:
-        self.weight = weight
         self.start = self.frames = read_frames(seed, fixed_frames)
+        self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged = 0, False
         few = len(self.frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
@@ -254,7 +269,7 @@ class _Run:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = scale * self.options.max_reprojection_error_px
         adjusted = adjust(
-            self.weight.apply(problem, self.start.rotations),
+            self.weight.apply(problem, self.given),
             loss_scale_px=loss_scale_px,
             cost_tolerance=fall,
             hold_rotations=self.weight.hold,

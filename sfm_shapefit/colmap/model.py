@@ -175,6 +175,26 @@ def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
     return read_model(copy)
 
 
+def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
+    """Return the model with the frames' rotations of another, about their own centers; no input is touched.
+
+    Args:
+        model: the posed images.
+        turned: with some of the frames of it; where a rotation is the same, the pose keeps its bits.
+    """
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for frame_id in sorted(turned.reg_frame_ids()):
+        frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
+        pose = frame.rig_from_world
+        assert pose is not None  # posed frames of one model are posed in the other
+        assert other is not None
+        rotation = other.rotation
+        if (rotation.quat != pose.rotation.quat).any():
+            center = -(pose.rotation.matrix().T @ pose.translation)
+            frame.rig_from_world = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ center))
+    return read_model(copy)
+
+
 def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     """Return the unit rays R^T f(xy) of pixels in world axes.
 

@@ -5,6 +5,7 @@ Each stage is one function from values to a new value; the input is never change
 
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -12,7 +13,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands.stages.adjustment import adjust_placed, is_adjusted, turned_deg
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
@@ -27,9 +30,10 @@ from sfm_shapefit.commands.stages.seed import (
     select_trusted,
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
+from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors
-from sfm_shapefit.placement.move import move_cameras
+from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
@@ -121,16 +125,24 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         measured = add_evidence(measured, source, directions, options)
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
-            placement = move_cameras(placement, known.centers[placement.cameras], options)
+            centers = known.centers[placement.cameras]
+            placement = move_cameras(placement, bring_to_scale(placement, centers), options)
         kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         rule = GaugeRule(model, rigid, options, known.priors)
         gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
         if known.priors is not None and options.refine_with_priors:
             placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
             kept = select_trusted(placement, options.min_trust)
+    located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
+    if known.centers is None and is_adjusted(options, len(placement.cameras)):
+        with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
+            source, placement, adjustment = adjust_placed(source, located, options, clock)
+            kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
+            gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
+            given = GivenRotations(adjustment.weight, model.reconstruction)
+            located = Located(placement, kept, gauge, rigid.fixed, rule, given)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
-    located = Located(placement, kept, gauge, rigid.fixed, rule)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     located = located._replace(gauge=seeded.gauge)
     warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
@@ -138,7 +150,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         reconstruction=seeded.reconstruction,
         inputs=known.inputs,
         options=options,
-        model=model,
+        model=source.model,
         directions=directions,
         placement=placement,
         kept=kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
@@ -146,6 +158,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         agreeing_observations=seeded.agreeing_observations,
         gauge=seeded.gauge,
         adjusted=seeded.adjusted,
+        adjustment=adjustment,
+        turned_deg=None if adjustment is None else turned_deg(model.rotations, source.model.rotations),
         timings_s=clock.seconds,
         warnings=warnings,
         further=further,

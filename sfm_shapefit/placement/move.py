@@ -16,33 +16,39 @@ _CAP_OF_SIZE = 0.5
 _LEAST_SPREAD = 1e-12
 
 
-def move_cameras(placement: Placement, centers: FloatArray, options: PlacementOptions) -> Placement:
-    """Return the placement with its cameras moved to given centers, and its points after them.
+def move_cameras(placement: Placement, locations: FloatArray, options: PlacementOptions) -> Placement:
+    """Return the placement with its cameras moved, and its points after them.
 
     Args:
         placement: of k cameras.
-        centers: (k, 3) of these, in the placement's axes, in any scale and from any origin; a camera whose
-            row is NaN stays where it is.
+        locations: (k, 3) of these, in the solver's units; a camera whose row is NaN stays where it is.
         options: as they were given to `place`.
 
     Raises:
         UnsolvableError: if the factor for standard deviations would take more memory than allowed.
     """
-    refined, cameras = placement.refined, placement.locations
-    known = np.isfinite(centers).all(axis=1)
-    size = median_spread(cameras)
-    into = fit_similarity_l1(centers[known], cameras[known], rotate=False, cap=_CAP_OF_SIZE * size)
-    locations = refined.locations.copy()
-    locations[: len(cameras)][known] = into.apply(centers[known])
-    by = float(np.median(np.linalg.norm(locations[: len(cameras)] - cameras, axis=1))) / size
-    part = placement.measured_part()
+    refined, before = placement.refined, placement.locations
+    known = np.isfinite(locations).all(axis=1)
+    moved = refined.locations.copy()
+    moved[: len(before)][known] = locations[known]
+    by = float(np.median(np.linalg.norm(moved[: len(before)] - before, axis=1))) / median_spread(before)
     adjusted = replace(
         refined,
-        locations=_follow(part, locations),
+        locations=_follow(placement.measured_part(), moved),
         reason=f"{refined.reason}; then adjusted to the pixels, which moved cameras by {by:.2%} (median)",
         reset_nodes=np.setdiff1d(refined.reset_nodes, np.flatnonzero(known)),
     )
     return replace_locations(placement, adjusted, options)
+
+
+def bring_to_scale(placement: Placement, centers: FloatArray) -> FloatArray:
+    """Return centers of the placement's cameras (k, 3), of any scale and origin, in the solver's units.
+
+    The axes are the placement's; rows of NaN stay so.
+    """
+    known, there = np.isfinite(centers).all(axis=1), placement.locations
+    cap = _CAP_OF_SIZE * median_spread(there)
+    return fit_similarity_l1(centers[known], there[known], rotate=False, cap=cap).apply(centers)
 
 
 def _follow(part: MeasuredGraph, locations: FloatArray) -> FloatArray:

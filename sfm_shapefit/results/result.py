@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Adjusted
+from sfm_shapefit.colmap.bundle_adjustment import Adjusted, AdjustedPlacement
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
@@ -71,6 +71,9 @@ class LocateResult(Displayed):
     """From the solver's units to the output's."""
     adjusted: Adjusted | None
     """How bundle adjustment went, if it was asked for; its model is `reconstruction`, uncolored."""
+    adjustment: AdjustedPlacement | None
+    """What became of the placement and of the given rotations, before any bundle adjustment; None if the
+    placement stayed as it was found."""
     timings_s: dict[str, float]
     """Wall-clock seconds per stage."""
     warnings: tuple[str, ...]

@@ -67,8 +67,8 @@ class MatchSource:
 
     def turned(self, model: PosedModel) -> "MatchSource":
         """Return the same matches for a model of the same images with other rotations."""
-        assert self.database is not None
-        return replace(self, model=model, database=self.database.turned(model))
+        database = None if self.database is None else self.database.turned(model)
+        return replace(self, model=model, database=database)
 
     def with_economy(self, economy: Economy) -> "MatchSource":
         """Return the same source, which gives up so much for memory."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Adjusted, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenRotations, bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     deregister_of_few_points,
@@ -47,6 +47,8 @@ class Located(NamedTuple):
     """(n,) the images that keep their poses to the last bit; none if None."""
     rule: GaugeRule | None = None
     """What sets the gauge, and again after bundle adjustment; "unit" if None."""
+    given: GivenRotations | None = None
+    """The rotations of the input, and how bundle adjustment treats them; they are free if None."""
 
     @property
     def cameras(self) -> IntArray:
@@ -97,7 +99,10 @@ def build_seeded_model(
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            adjusted = bundle_adjust(seed, tracks, options, adjuster=options.adjuster, fixed_frames=frames)
+            how = options.adjuster
+            adjusted = bundle_adjust(
+                seed, tracks, options, adjuster=how, fixed_frames=frames, given=located.given
+            )
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
