@@ -58,7 +58,7 @@ _LAST_SCALES, _LAST_FALL = (0.0625, 0.125, 0.25), 1e-4
 _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
 _FINE = 0.9
-# Of the solve after a placement.
+# Of the solves after a placement: the scale at which the rotations are judged, and where they end.
 _GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
 _FREE = RotationWeight()
@@ -199,7 +199,7 @@ def adjust_placement(
     *,
     fixed_frames: Collection[int] = (),
 ) -> AdjustedPlacement:
-    """Adjust placed cameras whose rotations were given, on all tracks at once, at a loss of 0.5 px.
+    """Adjust placed cameras whose rotations were given, on all tracks at once.
 
     Args:
         seed: the placed images, which is not changed; any points are ignored.
@@ -220,7 +220,7 @@ def adjust_placement(
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    run.solve(problem, _GIVEN_SCALE, _GIVEN_FALL)
+    run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(reconstruction=poses, weight=weight, errors=errors)
 
@@ -282,6 +282,11 @@ class _Run:
         self.converged = adjusted.converged
         return adjusted.problem
 
+    def choose_scale(self, problem: AdjustmentProblem) -> float:
+        """Return the scale of the last loss that the errors of a problem call for, in pixel thresholds."""
+        threshold_px = self.options.max_reprojection_error_px
+        return choose_loss_scale_px(problem, [scale * threshold_px for scale in _LAST_SCALES]) / threshold_px
+
     def adjust_all(
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, int, bool]:
@@ -294,8 +299,7 @@ class _Run:
         joined, found = self.triangulate(1.0)
         refuse_without_points(len(found.points))
         adjusted = self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
-        scales_px = [scale * self.options.max_reprojection_error_px for scale in _LAST_SCALES]
-        last_scale = choose_loss_scale_px(adjusted, scales_px) / self.options.max_reprojection_error_px
+        last_scale = self.choose_scale(adjusted)
         joined, found = self.triangulate(1.0)
         refuse_without_points(len(found.points))
         adjusted = self.solve(self.frames.problem(joined, found), last_scale, _LAST_FALL)
