@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import sfm_shapefit
+from sfm_shapefit.colmap import relative_rotations as door
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands import relative_rotations as module
@@ -59,7 +60,9 @@ def test_an_executor_changes_no_bit(found, monkeypatch):
         shared = sfm_shapefit.relative_rotations(
             DATABASE, executor=pool, progress=lambda *now: seen.append(now)
         )
+        many = sfm_shapefit.relative_rotations(DATABASE, executor=pool, min_matches=60)
     assert_same_bits(shared, found)
+    assert_same_bits(many, found.subset(found.num_matches >= 60))
     assert {stage for stage, _, _ in seen} == {"relative rotations"}
     assert len(seen) > 5
 
@@ -85,12 +88,31 @@ def test_few_matches_and_stored_poses_are_as_asked(found, tmp_path):
     assert len(sfm_shapefit.relative_rotations(DATABASE, source="stored").pairs) == 0
 
 
-def test_progress_ends_with_all_pairs(found):
+def test_progress_ends_with_all_pairs_though_some_are_left_out(found):
     seen = []
-    sfm_shapefit.relative_rotations(DATABASE, progress=lambda _stage, done, total: seen.append((done, total)))
+    sfm_shapefit.relative_rotations(
+        DATABASE, min_matches=60, progress=lambda _stage, done, total: seen.append((done, total))
+    )
     (total,) = {total for _, total in seen[1:-1]}
     assert seen[-2] == (total, total)
-    assert total >= len(found.pairs)
+    assert total >= len(found.pairs) > (found.num_matches >= 60).sum()
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_interrupt_ends_the_work_after_the_slices_at_hand(monkeypatch, threads):
+    monkeypatch.setattr(door, "_PAIRS_PER_SLICE", 8)
+    begun, estimate = [], door._estimate_slice
+    monkeypatch.setattr(
+        door, "_estimate_slice", lambda batch, first: (begun.append(first), estimate(batch, first))[1]
+    )
+
+    def interrupt(_stage, done, _total):
+        if done > 1:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm_shapefit.relative_rotations(DATABASE, threads=threads, progress=interrupt)
+    assert len(begun) < 10  # of 22
 
 
 @pytest.mark.parametrize(
