@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from sfm_shapefit.refinement.options import PlacementOptions
     from sfm_shapefit.results.map_result import MapResult
     from sfm_shapefit.results.result import LocateResult
+    from sfm_shapefit.rotations.average import average_rotations
+    from sfm_shapefit.rotations.averaged import AveragedRotations
     from sfm_shapefit.solver.certificate import Certificate, certify
     from sfm_shapefit.solver.options import SolverOptions, SolverResult, Status
     from sfm_shapefit.solver.solve import solve
@@ -60,6 +62,8 @@ _HOMES = {
     "refinement.options": ("PlacementOptions",),
     "results.map_result": ("MapResult",),
     "results.result": ("LocateResult",),
+    "rotations.average": ("average_rotations",),
+    "rotations.averaged": ("AveragedRotations",),
     "solver.certificate": ("Certificate", "certify"),
     "solver.options": ("SolverOptions", "SolverResult", "Status"),
     "solver.solve": ("solve",),
@@ -71,6 +75,7 @@ __version__ = "0.1.0"
 __all__ = [
     "AdjustedModel",
     "AdjustmentOptions",
+    "AveragedRotations",
     "Certificate",
     "InputError",
     "LocateOptions",
@@ -86,6 +91,7 @@ __all__ = [
     "UnsolvableError",
     "ViewGraph",
     "WriteOptions",
+    "average_rotations",
     "bundle_adjust",
     "certify",
     "convert",

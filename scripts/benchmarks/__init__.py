@@ -7,6 +7,7 @@ A module has `BENCHMARK`, which `harness.driver` runs, or the functions `add_arg
 INDEX = {
     "adjustment": "Our bundle adjustment beside pycolmap's on real sets, and large made problems.",
     "answers": "What every command answers: recorded, and compared with an earlier recording.",
+    "averaging": "Rotation averaging: made graphs against an oracle, real sets beside pycolmap's.",
     "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
     "directions": "Directions from matches: speed, memory and calibration.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",

@@ -9,6 +9,8 @@ mapper does; cameras outside that component have no rotation.
 Source: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013, as in GLOMAP.
 """
 
+from typing import Literal
+
 import numpy as np
 import numpy.typing as npt
 import pycolmap
@@ -17,7 +19,9 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.colmap.quiet import quiet_output
 from sfm_shapefit.errors import InputError, UnsolvableError
-from sfm_shapefit.rotations.averaged import Loss
+
+Loss = Literal["geman-mcclure", "half-norm"]
+"""Of the residual angles of pairs, as pycolmap names them."""
 
 _LOSSES = {
     "geman-mcclure": pycolmap.RotationWeightType.GEMAN_MCCLURE,

@@ -134,7 +134,13 @@ class _Run(NamedTuple):
                 inside = relative.subset(np.asarray(np.isin(relative.pairs, members).all(axis=1)))
                 local = replace(inside, pairs=np.searchsorted(members, inside.pairs))
                 try:
-                    answer = average_consistently(len(members), local, self.options.min_matches)
+                    answer = average_consistently(
+                        len(members),
+                        local,
+                        self.options.min_matches,
+                        averaging=self.options.averaging,
+                        threads=self.options.num_threads(),
+                    )
                 except UnsolvableError as error:
                     reasons |= dict.fromkeys(members.tolist(), str(error))
                     continue
@@ -146,9 +152,7 @@ class _Run(NamedTuple):
                 waiting = [*waiting, *(group for group in among if len(group) > 1)]
             kept = answer.registered
             if kept.sum() >= self.options.min_model_size:
-                rotations, agreements = answer.rotations[kept], answer.agreements[kept]
-                own = replace(answer, rotations=rotations, registered=kept[kept], agreements=agreements)
-                yield members[kept], own
+                yield members[kept], answer.subset(kept)
 
     def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""

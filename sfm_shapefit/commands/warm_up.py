@@ -50,6 +50,7 @@ FURTHER = (
     "locate_from_tracks",
     "place_flat_graph",
     "locate_around_fixed",
+    "average_graphs",
     "map_matches",
     "relate_images",
     "compare_baselines",

@@ -228,14 +228,16 @@ class Averaging(TypedDict):
     """How rotations were averaged, and how well they agree with the pairs."""
 
     statement: Annotated[str, "How the rotations were found, in words."]
+    averaging: Annotated[str, "Who averaged: own or pycolmap."]
     num_registered: Annotated[int, "Images that have a rotation."]
-    min_matches: Annotated[int, "Pairs with fewer matches were left out."]
-    loss: Annotated[str, "Of the residual angles."]
-    known_focal_lengths_only: Annotated[
-        bool, "Whether pairs that contradict known focal lengths were left out."
-    ]
+    num_pairs: Annotated[int, "Pairs whose residuals count."]
     agreeing_share: Annotated[float, "Share of the pairs, by the square root of their matches, that agree."]
+    num_unsettled: Annotated[int, "Images that most of their pairs contradict, in every answer tried."]
+    median_sigma_deg: Annotated[float | None, "Median standard deviation of a rotation; null if not known."]
     num_tried: Annotated[int, "Averagings of which this one is the most consistent."]
+    certified: Annotated[
+        bool | None, "Whether no rotations fit the kept pairs better; null if that was not checked."
+    ]
 
 
 class Model(TypedDict):

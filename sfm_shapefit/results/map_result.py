@@ -10,7 +10,7 @@ from typing import Any, cast
 
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.locate_options import MapOptions
-from sfm_shapefit.results.json_types import LocateSummary, MapSummary
+from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -62,15 +62,7 @@ class MapResult(Displayed):
                     "folder": str(number),
                     "num_images": len(model.names),
                     "num_placed": int(model.located.kept.sum()),
-                    "averaging": {
-                        "statement": model.averaging.statement,
-                        "num_registered": int(model.averaging.registered.sum()),
-                        "min_matches": model.averaging.min_matches,
-                        "loss": model.averaging.loss,
-                        "known_focal_lengths_only": model.averaging.sound_only,
-                        "agreeing_share": model.averaging.share,
-                        "num_tried": model.averaging.num_tried,
-                    },
+                    "averaging": cast("Averaging", model.averaging.summary()),
                     "located": cast("LocateSummary", model.located.summary()),
                 }
                 for number, model in enumerate(self.models)

@@ -1,44 +1,96 @@
-"""Rotations that averaging found, and how far the pairs agree with them."""
+"""Rotations averaged from relative ones, and how far they can be believed."""
 
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.display import Displayed
 
-Loss = Literal["geman-mcclure", "half-norm"]
-"""Of the residual angles of pairs, as pycolmap names them."""
+Averaging = Literal["own", "pycolmap"]
+"""Who averages: this package, or pycolmap."""
 
 AGREEMENT_DEG = 5.0
 """Pairs agree with averaged rotations up to here."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class AveragedRotations:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class AveragedRotations(Displayed):
     """One answer of rotation averaging, and how far the pairs agree with it."""
 
     rotations: FloatArray
-    """(n, 3, 3) cam_from_world; the identity where there is none."""
+    """(n, 3, 3) cam_from_world, up to a common rotation of the world; the identity where there is none."""
     registered: BoolArray
-    """(n,) which images have a rotation."""
-    min_matches: int
-    """Pairs with fewer matches were left out."""
-    loss: Loss
-    sound_only: bool
-    """Whether pairs that contradict known focal lengths were left out."""
-    score: float
-    share: float
-    """Of the pairs of registered images, by the square root of their matches: how many agree."""
-    fit: float
+    """(n,) which images have a rotation: those of the largest component of the pairs."""
+    sigmas_deg: FloatArray
+    """(n,) standard deviation of each rotation per axis, relative to the mean turn of all. It counts errors
+    of pairs as independent; what they share, as errors of the calibration, comes on top. Infinite where the
+    pairs that agree do not tie the image to the largest part of the others, NaN without rotation, or where
+    the averaging does
+    not say."""
     agreements: FloatArray
-    """(n,) the same share for the pairs of each image; NaN where it has none."""
+    """(n,) of the weight of each image's pairs, the share that agrees within 5 deg; NaN where it has none."""
+    best_agreements: FloatArray
+    """(n,) the largest such share in any answer that was tried."""
+    share: float
+    """Of the weight of all pairs of registered images: what agrees within 5 deg."""
+    num_pairs: int
+    """Pairs whose residuals count in the answer."""
+    averaging: Averaging = "own"
     num_tried: int = 1
     """How many answers it was chosen from."""
+    certified: bool | None = None
+    """Whether no rotations fit the kept pairs, with their final weights, better than those next to these, see
+    `rotations.dual_certificate`. It does not say that these are the right pairs. None if not checked."""
+
+    @property
+    def unsettled(self) -> BoolArray:
+        """Which images have a rotation that most of their pairs contradict, in every answer tried, (n,)."""
+        return np.asarray(self.registered & (self.best_agreements < 0.5))
+
+    def subset(self, images: BoolArray) -> "AveragedRotations":
+        """Return the answer for some of the images, in their order."""
+        return replace(
+            self,
+            rotations=self.rotations[images],
+            registered=self.registered[images],
+            sigmas_deg=self.sigmas_deg[images],
+            agreements=self.agreements[images],
+            best_agreements=self.best_agreements[images],
+        )
 
     @property
     def statement(self) -> str:
         """How the rotations were found, for the user."""
         tried = f", the most consistent of {self.num_tried} tried" if self.num_tried > 1 else ""
+        by = "" if self.averaging == "own" else " by pycolmap"
+        text = (
+            f"averaged{by} over {self.num_pairs} pairs{tried}; {self.share:.0%} of the pairs' weight agrees "
+            f"within {AGREEMENT_DEG:g} deg"
+        )
+        if self.certified is None:
+            return text
+        proof = "proved to be the best for" if self.certified else "not proved to be the best for"
+        return f"{text}; {proof} the pairs that are kept"
+
+    def summary(self) -> dict[str, Any]:
+        """Return the facts in plain values."""
+        known = self.sigmas_deg[np.isfinite(self.sigmas_deg)]
+        return {
+            "statement": self.statement,
+            "averaging": self.averaging,
+            "num_registered": int(self.registered.sum()),
+            "num_pairs": self.num_pairs,
+            "agreeing_share": self.share,
+            "num_unsettled": int(self.unsettled.sum()),
+            "median_sigma_deg": float(np.median(known)) if len(known) else None,
+            "num_tried": self.num_tried,
+            "certified": self.certified,
+        }
+
+    def _headline(self) -> str:
         return (
-            f"averaged over pairs with at least {self.min_matches} matches ({self.loss}){tried}; "
-            f"{self.share:.0%} of the pairs' weight agrees within {AGREEMENT_DEG:g} deg"
+            f"rotations of {int(self.registered.sum())} of {len(self.registered)} images, "
+            f"{self.share:.0%} of the pairs' weight agrees"
         )

@@ -176,19 +176,23 @@ def worst_error_deg(answer, truth):
 
 def test_the_most_consistent_of_several_averagings_is_kept():
     truth, relative = problem(num_false=30)  # of the 49 pairs between the halves
-    misled = average_consistently(14, relative, min_matches=15)
+    misled = average_consistently(14, relative, min_matches=15, averaging="pycolmap")
     assert worst_error_deg(misled, truth) == pytest.approx(90.0, abs=1.0)
-    answer = average_consistently(14, relative)
-    assert answer.registered.all()
-    assert answer.min_matches == 20
-    assert worst_error_deg(answer, truth) < 0.5
     weights = np.sqrt(relative.num_matches)
     right = relative.num_matches == 100
-    assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
+    for averaging, certified in (("pycolmap", None), ("own", True)):
+        answer = average_consistently(14, relative, averaging=averaging)
+        assert (answer.averaging, answer.certified) == (averaging, certified)
+        assert answer.registered.all()
+        assert answer.num_tried > 1
+        assert answer.num_pairs == right.sum()
+        assert worst_error_deg(answer, truth) < 0.5
+        assert answer.share == pytest.approx(weights[right].sum() / weights.sum())
 
 
 def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_are_left_out():
     truth, relative = problem()
+    assert not average_consistently(14, relative).unsettled.any()
     bad = (relative.pairs == 3).any(axis=1)
     unsound = np.random.default_rng(3).permutation(len(relative.pairs)) < 30  # one pose explains few matches
     answers = []
@@ -200,6 +204,7 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_
         answers.append(average_consistently(14, part))
     assert answers[0].agreements[3] < 0.25
     assert np.delete(answers[0].agreements, 3).min() > 0.8
-    assert answers[1].sound_only
+    assert list(np.flatnonzero(answers[0].unsettled)) == [3]
+    assert answers[1].num_pairs == 61
     assert answers[1].share > 0.99
     assert worst_error_deg(answers[1], truth) < 0.5

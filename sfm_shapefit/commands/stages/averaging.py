@@ -1,8 +1,9 @@
 """Averaged rotations that can be trusted: several averagings, the most consistent kept, checked on its pairs.
 
-Rotation averaging has no certificate, and its answer depends on which pairs it sees: on lego100 with the
-stored poses of all pairs of 15 matches nine cameras end up to 166 degrees off, with those of 30 none. So
-several limits and two losses are tried, and each answer is judged on the same pairs, all of them:
+Our own averaging (`rotations.average`) tries several answers itself. pycolmap's has an answer that depends on
+which pairs it sees: on lego100 with the stored poses of all pairs of 15 matches nine cameras end up to 166
+degrees off, with those of 30 none. So several limits and two losses are tried, and each answer is judged on
+the same pairs, all of them:
 
     w_ij       sqrt(number of matches): a false pair of a thousand matches is not a thousand witnesses
     agree_ij   both cameras have a rotation, and R_j R_i^T is within 5 degrees of the pair's own
@@ -16,17 +17,20 @@ The answers within 0.005 of the best score are equally consistent; of those the 
 Weighted by the number of matches itself, the score prefers an answer with six wrong cameras on lego100.
 """
 
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.rotation_averaging import average_rotations
+from sfm_shapefit.colmap.rotation_averaging import Loss, average_rotations
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.locate_options import LEAST_MATCHES
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations, Loss
+from sfm_shapefit.rotations.average import average_relative_rotations
+from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations, Averaging
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 _LIMITS = (LEAST_MATCHES, 20, 30, 50, 80)
@@ -35,29 +39,54 @@ _EQUAL_SCORES = 0.005
 
 
 def average_consistently(
-    num_images: int, relative: RelativeRotations, min_matches: int = 0
+    num_images: int,
+    relative: RelativeRotations,
+    min_matches: int = 0,
+    *,
+    averaging: Averaging = "own",
+    threads: int = 1,
 ) -> AveragedRotations:
     """Return the most consistent rotations of some images; of several components one is answered.
 
-    With `min_matches` 0 several limits are tried.
+    Args:
+        num_images: n. relative: pairs of them. min_matches: pairs of fewer matches are left out. With 0, all
+        count in our own averaging, and pycolmap's
+            tries several limits.
+        averaging: who averages.
+        threads: of our own averaging; the answer does not depend on it.
 
     Raises:
         UnsolvableError: if no averaging succeeds.
     """
-    answers = _answers(num_images, relative, min_matches)
-    if not answers:
-        raise UnsolvableError(
-            f"the relative rotations of {len(relative.pairs)} pairs cannot be averaged; match more images"
-        )
-    best = max(answer.score for answer in answers)
-    chosen = max((a for a in answers if a.score >= best - _EQUAL_SCORES), key=lambda a: a.fit)
-    return replace(chosen, num_tried=len(answers))
+    if averaging == "own":
+        used = relative.num_matches >= min_matches
+        if used.any():
+            return average_relative_rotations(num_images, relative.subset(used), threads)
+    else:
+        judged = list(_answers(num_images, relative, min_matches))
+        if judged:
+            best = max(one.score for one in judged)
+            chosen = max(
+                (one for one in judged if one.score >= best - _EQUAL_SCORES), key=lambda one: one.fit
+            )
+            highest = np.fmax.reduce([one.answer.agreements for one in judged])
+            return replace(chosen.answer, best_agreements=highest, num_tried=len(judged))
+    raise UnsolvableError(
+        f"the relative rotations of {len(relative.pairs)} pairs cannot be averaged; match more images"
+    )
 
 
-def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> list[AveragedRotations]:
-    """Return an answer per setting that is different from the others and succeeds."""
+class _Judged(NamedTuple):
+    """An answer of pycolmap, and how consistent it is."""
+
+    answer: AveragedRotations
+    score: float
+    fit: float
+
+
+def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> Iterator[_Judged]:
+    """Yield pycolmap's answer per setting that is different from the others and succeeds."""
     seen: set[tuple[int, bool]] = set()
-    answers = []
     sound = relative.are_sound()
     for sound_only in (True, False):
         for limit in (min_matches,) if min_matches else _LIMITS:
@@ -74,17 +103,10 @@ def _answers(num_images: int, relative: RelativeRotations, min_matches: int) -> 
                     found = average_rotations(
                         num_images, given.pairs, given.rotations, given.num_matches, loss=loss
                     )
-                    answers.append(_judge(relative, found, limit, loss, sound_only))
-    return answers
+                    yield _judge(relative, found, len(given.pairs))
 
 
-def _judge(
-    relative: RelativeRotations,
-    found: tuple[FloatArray, BoolArray],
-    min_matches: int,
-    loss: Loss,
-    sound_only: bool,
-) -> AveragedRotations:
+def _judge(relative: RelativeRotations, found: tuple[FloatArray, BoolArray], num_pairs: int) -> _Judged:
     """Compare averaged rotations with the sound pairs, or with all if none is sound."""
     rotations, registered = found
     sound = relative.are_sound()
@@ -99,15 +121,16 @@ def _judge(
     n = len(registered)
     ends, total = pairs.pairs.T.ravel(), np.bincount(pairs.pairs.T.ravel(), np.tile(weights, 2), n)
     with np.errstate(invalid="ignore"):
-        agreements = np.bincount(ends, np.tile(agreeing, 2), n) / total
-    return AveragedRotations(
+        agreements = np.asarray(np.bincount(ends, np.tile(agreeing, 2), n) / total, dtype=np.float64)
+    answer = AveragedRotations(
         rotations=rotations,
         registered=registered,
-        score=float(agreeing.sum() / weights.sum() * registered.mean()),
+        sigmas_deg=np.full(n, np.nan),
+        agreements=agreements,
+        best_agreements=agreements,
         share=float(agreeing.sum() / max(float((weights * both).sum()), 1e-300)),
-        fit=float(near.sum() / weights.sum()),
-        agreements=np.asarray(agreements, dtype=np.float64),
-        min_matches=min_matches,
-        loss=loss,
-        sound_only=sound_only,
+        num_pairs=num_pairs,
+        averaging="pycolmap",
     )
+    score = float(agreeing.sum() / weights.sum() * registered.mean())
+    return _Judged(answer, score, float(near.sum() / weights.sum()))

@@ -3,6 +3,7 @@
 An example takes an empty folder for its files, and a fraction of a second once its kernels are compiled.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,17 @@ from sfm_shapefit.commands.inspect import inspect
 from sfm_shapefit.commands.locate import locate
 from sfm_shapefit.commands.map import map_database
 from sfm_shapefit.commands.relative_rotations import relative_rotations
+from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.laplacian.operators import adjacency
 from sfm_shapefit.placement.place import place
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.refinement.cg_normal_solver import IterativeNormal
 from sfm_shapefit.rigidity.pieces import parallel_rigid_pieces
+from sfm_shapefit.rotations.annealing import anneal, follow_spanning_tree, refine_fully
+from sfm_shapefit.rotations.average import check_pairs
+from sfm_shapefit.rotations.averaging_system import plan_system
+from sfm_shapefit.rotations.averaging_uncertainty import estimate_sigmas
+from sfm_shapefit.rotations.dual_certificate import certify_rotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.solver.newton import solve_newton_sparse
 from sfm_shapefit.solver.solve import solve
@@ -29,6 +36,7 @@ from sfm_shapefit.solver.splitting.linear import IterativeSolver
 from sfm_shapefit.solver.splitting.lud import solve_lud
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
+from sfm_shapefit.synthetic.rotation_graphs import rotation_problem
 from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
 
@@ -184,6 +192,26 @@ def compare_baselines(_folder: Path) -> None:
         place(graph, objective=locator)
     for name in FILTERS:
         place(graph, filter=name)
+
+
+def average_graphs(_folder: Path) -> None:
+    """Average rotations with a factor, and as on large graphs without one."""
+    edges = np.ascontiguousarray(_random_graph().edges)
+    problem = rotation_problem(20, edges)
+    average_consistently(20, problem.relative, threads=2)
+    average_consistently(20, problem.relative, averaging="pycolmap")
+    given, _ = check_pairs(edges, problem.relative.rotations, problem.relative.information, None, 20)
+    for is_expander in (False, True):
+        system = replace(
+            plan_system(20, given.pairs, given.supports, 1),
+            plan=None,
+            factors_blocks=False,
+            is_expander=is_expander,
+        )
+        turns = anneal(given, system, follow_spanning_tree(given), 0.5)
+        turns, last = refine_fully(given, system, turns)
+        estimate_sigmas(given, system, last)
+        certify_rotations(system, given.measured, given.supports, turns)
 
 
 def draw_images(folder: Path) -> None:

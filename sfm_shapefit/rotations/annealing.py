@@ -1,0 +1,191 @@
+"""Rotations from pairs: along a spanning tree, by annealed rounds, then with the full information.
+
+    tree       the maximum spanning tree by the pairs' support, from its most supported pair
+    annealed   weights sqrt(support) / (1 + (|x| / tau)^2)^2, tau from 30 or 60 deg, times 3/4 a round, down
+               to 5 deg; each round one step of a Laplacian system, no camera farther than .5 rad
+    full       blocks R_j^T H R_j, pairs beyond 5 deg left out, Geman and McClure's loss of the Mahalanobis
+               length at three times its median
+
+Between them cameras move to where most of their pairs want them: a camera whose link in the tree is false may
+sit where that pair alone fits, and no narrowing loss frees it.
+
+The wide loss in the beginning has one minimum near the tree's answer; the narrow one in the end does not see
+false pairs. The full information from the start is not robust: false pairs state theirs as well.
+
+Sources: Chatterjee, Govindu, "Efficient and robust large-scale rotation averaging", ICCV 2013 (reweighted
+steps on the Laplacian); Black, Rangarajan, "On the unification of line processes", IJCV 1996, and Blake,
+Zisserman, "Visual reconstruction", 1987 (annealing a robust loss); Zhang et al., "Revisiting rotation
+averaging: uncertainties and robust losses", CVPR 2023 (information of the pairs).
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.sparse import coo_array, csgraph
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.rotations.averaged import AGREEMENT_DEG
+from sfm_shapefit.rotations.averaging_kernels import (
+    close_triangles,
+    follow_tree,
+    move_to_modes,
+    turn_cameras,
+    weigh_blocks,
+    weigh_pairs,
+)
+from sfm_shapefit.rotations.averaging_system import AveragingSystem
+
+_ROUNDS = 14
+_COOLING = 0.75
+_COLDEST = np.radians(AGREEMENT_DEG)
+_LONGEST_STEP = 0.5
+FULL_LIMIT = np.radians(AGREEMENT_DEG)
+"""Pairs with a larger residual are left out of the phase with the full information."""
+_SCALE_OF_MEDIAN = 3.0
+# Triangles that close to within about this angle count as closed.
+_CLOSING_SCALE = np.radians(AGREEMENT_DEG)
+# Python can be interrupted between slices of so many.
+_PAIRS_PER_SLICE = 200_000
+# Predictions of a camera's rotation within about this angle vote for each other.
+_VOTING_SCALE = np.radians(10.0)
+_MARGIN = 0.05
+_SWEEPS = 5
+# Steps shorter than this, in radians, end the rounds.
+_SETTLED = 1e-7
+# Right sides of the rounds are solved to this share where there is no factor, the last ones further.
+_REDUCTION, _LAST_REDUCTION = 3e-2, 1e-4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class AveragingPairs:
+    """What is averaged: k pairs that join n cameras."""
+
+    num_cameras: int
+    pairs: IntArray
+    """(k, 2)"""
+    measured: FloatArray
+    """(k, 4) cam_j_from_cam_i, unit quaternions (x, y, z, w)."""
+    information: FloatArray
+    """(k, 3, 3) in axes of camera j, rad^-2, capped."""
+    supports: FloatArray
+    """(k,) how many matches stand behind each pair, W n."""
+
+    def subset(self, rows: IntArray | BoolArray) -> "AveragingPairs":
+        """Return the given pairs, in that order."""
+        return AveragingPairs(
+            num_cameras=self.num_cameras,
+            pairs=np.ascontiguousarray(self.pairs[rows]),
+            measured=np.ascontiguousarray(self.measured[rows]),
+            information=np.ascontiguousarray(self.information[rows]),
+            supports=self.supports[rows],
+        )
+
+
+class Linearized(NamedTuple):
+    """The last system with the full information."""
+
+    blocks: FloatArray
+    """(k, 3, 3) robust blocks in world axes, 0 for pairs that are left out."""
+    distances: FloatArray
+    """(k,) Mahalanobis lengths, NaN for pairs that are left out."""
+
+
+def follow_spanning_tree(given: AveragingPairs) -> FloatArray:
+    """Return the rotations (n, 4) along the maximum spanning tree, all with the root at the identity."""
+    n, pairs = given.num_cameras, given.pairs
+    # Ranks instead of supports: a stored 0 would be no link, and equal ones keep the order of the pairs.
+    ranks = np.empty(len(pairs))
+    ranks[np.argsort(-given.supports, kind="stable")] = np.arange(1.0, len(pairs) + 1.0)
+    tree = csgraph.minimum_spanning_tree(coo_array((ranks, tuple(pairs.T)), shape=(n, n)).tocsr()).tocoo()
+    taken = np.argsort(ranks)[tree.data.astype(np.int64) - 1]
+    root = int(pairs[np.argmin(ranks), 0]) if len(pairs) else 0
+    links = coo_array((np.ones(len(taken)), tuple(pairs[taken].T)), shape=(n, n)).tocsr()
+    order, parents = csgraph.breadth_first_order(links, root, directed=False)
+    parents = np.where(parents < 0, -1, parents).astype(np.int64)
+    pair_of = np.full(n, -1, dtype=np.int64)
+    i, j = pairs[taken].T
+    pair_of[np.where(parents[i] == j, i, j)] = taken
+    turns = np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    follow_tree(order.astype(np.int64), parents, pair_of, pairs, given.measured, turns)
+    return turns
+
+
+def closing_shares(given: AveragingPairs, system: AveragingSystem) -> FloatArray:
+    """Return which share of its triangles closes for each pair, (k,), one half where it has none.
+
+    Pairs ascend, with i < j. The share counts a triangle that closes, and one that does not, of average
+    weight beside those that there are.
+    """
+    graph, k, weights = system.graph, len(given.pairs), np.sqrt(given.supports)
+    closing, all_votes = np.empty(k), np.empty(k)
+    for begin in range(0, k, _PAIRS_PER_SLICE):
+        close_triangles(
+            begin, min(begin + _PAIRS_PER_SLICE, k), graph.pointers, graph.neighbors, graph.edge_of,
+            given.pairs, given.measured, weights, float(_CLOSING_SCALE), closing, all_votes,
+        )  # fmt: skip
+    mean = float(weights.mean())
+    return np.asarray((closing + mean) / (all_votes + 2.0 * mean))
+
+
+def anneal(given: AveragingPairs, system: AveragingSystem, turns: FloatArray, widest: float) -> FloatArray:
+    """Return rotations (n, 4) after rounds of a robust loss that narrows from `widest`, in radians."""
+    turns, k = turns.copy(), len(given.pairs)
+    weights = np.sqrt(given.supports / given.supports.mean())
+    found, gradient = np.empty(k), np.empty((given.num_cameras, 3))
+    for step in range(_ROUNDS):
+        tau = max(widest * _COOLING**step, float(_COLDEST))
+        weigh_pairs(given.pairs, given.measured, turns, weights, tau, found, gradient)
+        turned = turn_cameras(turns, system.solve_scalar(found, gradient, _REDUCTION), _LONGEST_STEP)
+        if tau <= _COLDEST and turned <= _SETTLED:
+            break
+    return turns
+
+
+def reattach(given: AveragingPairs, system: AveragingSystem, turns: FloatArray) -> tuple[FloatArray, int]:
+    """Return rotations (n, 4) with cameras moved to where most of their pairs want them, and the moves."""
+    turns, graph, all_moved = turns.copy(), system.graph, 0
+    weights = np.sqrt(given.supports)
+    for _ in range(_SWEEPS):
+        moved = move_to_modes(
+            graph.pointers, graph.neighbors, graph.edge_of, given.pairs, given.measured, turns, weights,
+            float(_VOTING_SCALE), _MARGIN,
+        )  # fmt: skip
+        all_moved += moved
+        if not moved:
+            break
+    return turns, all_moved
+
+
+def refine_fully(
+    given: AveragingPairs, system: AveragingSystem, turns: FloatArray, rounds: int = 8
+) -> tuple[FloatArray, Linearized]:
+    """Return rotations (n, 4) after rounds with the full information, and the system at the answer."""
+    turns, k = turns.copy(), len(given.pairs)
+    distances, blocks = np.empty(k), np.empty((k, 3, 3))
+    gradient = np.empty((given.num_cameras, 3))
+
+    def weigh(scale: float) -> float:
+        weigh_blocks(
+            given.pairs,
+            given.measured,
+            turns,
+            given.information,
+            FULL_LIMIT,
+            scale,
+            distances,
+            blocks,
+            gradient,
+        )
+        inside = distances[~np.isnan(distances)]
+        return max(_SCALE_OF_MEDIAN * float(np.median(inside)) if len(inside) else 1.0, 1e-12)
+
+    scale = weigh(1.0)
+    scale = weigh(scale)
+    for step in range(rounds):
+        tol = _LAST_REDUCTION if step == rounds - 1 else _REDUCTION
+        turned = turn_cameras(turns, system.solve_blocks(blocks, gradient, tol), _LONGEST_STEP)
+        scale = weigh(scale)
+        if turned <= _SETTLED:
+            break
+    return turns, Linearized(blocks, distances)

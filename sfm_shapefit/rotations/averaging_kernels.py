@@ -1,0 +1,340 @@
+"""The passes over pairs and cameras that rotation averaging consists of, on unit quaternions (x, y, z, w).
+
+With R_i = cam_i_from_world and the measured R_ij = cam_j_from_cam_i, the residual of a pair, in world axes,
+is
+
+    x = log(R_j^T R_ij R_i),        R_i <- R_i exp(s_i)  changes it to  x - (s_j - s_i)  to first order,
+
+so that one step minimizes sum_e w_e |x_e - (s_j - s_i)|^2: a Laplacian system L s = D^T W x with (D s)_e =
+s_j - s_i. Information H of a pair, in axes of camera j, becomes the block R^T H R in world axes, R half
+way from R_j to R_ij R_i: so it does not matter which camera of a pair is named first. For
+isotropic weights zeros of the gradient D^T W x are exact stationary points, because x is an eigenvector of
+the derivative of log with eigenvalue 1; else they are so up to terms of the order |x|.
+
+Weights are those of Geman and McClure's loss, w = 1 / (1 + (r / s)^2)^2.
+
+Source: Govindu, "Lie-algebraic averaging for globally consistent motion estimation", CVPR 2004; Geman,
+McClure, "Statistical methods for tomographic image reconstruction", 1987.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.jit import inner_kernel, kernel
+
+
+@inner_kernel
+def _world_residual(measured: Any, at_i: Any, at_j: Any, out: Any) -> float:
+    """Fill out[:3] with log(R_j^T R_ij R_i) and return its squared length."""
+    ax, ay, az, aw = measured[0], measured[1], measured[2], measured[3]
+    bx, by, bz, bw = at_i[0], at_i[1], at_i[2], at_i[3]
+    # p = R_ij R_i
+    px = aw * bx + ax * bw + ay * bz - az * by
+    py = aw * by - ax * bz + ay * bw + az * bx
+    pz = aw * bz + ax * by - ay * bx + az * bw
+    pw = aw * bw - ax * bx - ay * by - az * bz
+    # R_j^T p
+    cx, cy, cz, cw = -at_j[0], -at_j[1], -at_j[2], at_j[3]
+    x = cw * px + cx * pw + cy * pz - cz * py
+    y = cw * py - cx * pz + cy * pw + cz * px
+    z = cw * pz + cx * py - cy * px + cz * pw
+    w = cw * pw - cx * px - cy * py - cz * pz
+    sine = np.sqrt(x * x + y * y + z * z)
+    if w < 0.0:
+        x, y, z, w = -x, -y, -z, -w
+    angle = 2.0 * np.arctan2(sine, w)
+    factor = angle / sine if sine > 1e-150 else 2.0
+    out[0], out[1], out[2] = factor * x, factor * y, factor * z
+    return float(angle * angle)
+
+
+@inner_kernel
+def _multiply_on_right(q: Any, s0: float, s1: float, s2: float) -> None:
+    """Replace the unit quaternion q by q exp(s), of unit length again."""
+    half = 0.5 * np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+    factor = 0.5 * (np.sin(half) / half if half > 1e-150 else 1.0)
+    bx, by, bz, bw = factor * s0, factor * s1, factor * s2, np.cos(half)
+    ax, ay, az, aw = q[0], q[1], q[2], q[3]
+    x = aw * bx + ax * bw + ay * bz - az * by
+    y = aw * by - ax * bz + ay * bw + az * bx
+    z = aw * bz + ax * by - ay * bx + az * bw
+    w = aw * bw - ax * bx - ay * by - az * bz
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    q[0], q[1], q[2], q[3] = x / norm, y / norm, z / norm, w / norm
+
+
+@kernel
+def weigh_pairs(
+    pairs: Any, measured: Any, turns: Any, weights: Any, scale: float, found: Any, gradient: Any
+) -> None:
+    """Fill the robust weights (k,) and the gradient D^T W x (n, 3).
+
+    The robust weight is weights[e] / (1 + (|x| / scale)^2)^2.
+    """
+    x = np.empty(3)
+    for i in range(len(gradient)):
+        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        square = _world_residual(measured[e], turns[i], turns[j], x)
+        loss = 1.0 + square / (scale * scale)
+        w = weights[e] / (loss * loss)
+        found[e] = w
+        for c in range(3):
+            gradient[i, c] -= w * x[c]
+            gradient[j, c] += w * x[c]
+
+
+@kernel
+def residual_squares(pairs: Any, measured: Any, turns: Any, squares: Any) -> None:
+    """Fill the squared residual angles (k,); NaN where a camera has no rotation."""
+    x = np.empty(3)
+    for e in range(len(pairs)):
+        squares[e] = _world_residual(measured[e], turns[pairs[e, 0]], turns[pairs[e, 1]], x)
+
+
+@inner_kernel
+def _turn_information(h: Any, q: Any, r: Any, hr: Any, block: Any) -> None:
+    """Fill the block R^T H R with R of the unit quaternion q; r and hr are scratch (3, 3)."""
+    x, y, z, w = q[0], q[1], q[2], q[3]
+    r[0, 0], r[0, 1], r[0, 2] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)
+    r[1, 0], r[1, 1], r[1, 2] = 2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)
+    r[2, 0], r[2, 1], r[2, 2] = 2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)
+    for a in range(3):
+        for b in range(3):
+            hr[a, b] = h[a, 0] * r[0, b] + h[a, 1] * r[1, b] + h[a, 2] * r[2, b]
+    for a in range(3):
+        for b in range(a + 1):
+            value = r[0, a] * hr[0, b] + r[1, a] * hr[1, b] + r[2, a] * hr[2, b]
+            block[a, b] = value
+            block[b, a] = value
+
+
+@kernel
+def weigh_blocks(
+    pairs: Any, measured: Any, turns: Any, information: Any, limit: float, scale: float,
+    distances: Any, blocks: Any, gradient: Any,
+) -> None:  # fmt: skip
+    """Fill Mahalanobis lengths (k,), robust blocks w R_j^T H R_j (k, 3, 3), and the gradient D^T B x (n, 3).
+
+    Pairs whose residual angle is beyond `limit`, in radians, have the length NaN and the block 0.
+    """
+    x, r, hr, hx, half = np.empty(3), np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(4)
+    for i in range(len(gradient)):
+        gradient[i, 0], gradient[i, 1], gradient[i, 2] = 0.0, 0.0, 0.0
+    for e in range(len(pairs)):
+        i, j = pairs[e, 0], pairs[e, 1]
+        square = _world_residual(measured[e], turns[i], turns[j], x)
+        block = blocks[e]
+        if square > limit * limit:
+            distances[e] = np.nan
+            for a in range(3):
+                for b in range(3):
+                    block[a, b] = 0.0
+            continue
+        for a in range(4):
+            half[a] = turns[j, a]
+        _multiply_on_right(half, 0.5 * x[0], 0.5 * x[1], 0.5 * x[2])
+        _turn_information(information[e], half, r, hr, block)
+        length = 0.0
+        for a in range(3):
+            hx[a] = block[a, 0] * x[0] + block[a, 1] * x[1] + block[a, 2] * x[2]
+            length += x[a] * hx[a]
+        length = np.sqrt(max(length, 0.0))
+        distances[e] = length
+        loss = 1.0 + (length / scale) * (length / scale)
+        w = 1.0 / (loss * loss)
+        for a in range(3):
+            gradient[i, a] -= w * hx[a]
+            gradient[j, a] += w * hx[a]
+            for b in range(3):
+                block[a, b] *= w
+
+
+@kernel
+def turn_cameras(turns: Any, steps: Any, limit: float) -> float:
+    """Replace R_i by R_i exp(s_i), steps (n, 3) limited to so many radians; return the longest one."""
+    longest = 0.0
+    for i in range(len(turns)):
+        s0, s1, s2 = steps[i, 0], steps[i, 1], steps[i, 2]
+        length = np.sqrt(s0 * s0 + s1 * s1 + s2 * s2)
+        longest = max(longest, length)
+        if length > limit:
+            s0, s1, s2 = s0 * (limit / length), s1 * (limit / length), s2 * (limit / length)
+        _multiply_on_right(turns[i], s0, s1, s2)
+    return longest
+
+
+@kernel
+def follow_tree(order: Any, parents: Any, links: Any, pairs: Any, measured: Any, turns: Any) -> None:
+    """Fill the rotations that the links of a tree give: R_j = R_ij R_i, or R_i = R_ij^T R_j.
+
+    Args:
+        order: (t,) cameras, parents before children; a root has parent -1, and its rotation is given.
+        parents: (n,) parent of each camera.
+        links: (n,) the pair that joins a camera with its parent.
+        pairs: (k, 2)
+        measured: (k, 4)
+        turns: (n, 4) in place.
+    """
+    for k in range(len(order)):
+        i = order[k]
+        if parents[i] < 0:
+            continue
+        e = links[i]
+        q, p, out = measured[e], turns[parents[i]], turns[i]
+        sign = 1.0 if pairs[e, 1] == i else -1.0
+        ax, ay, az, aw = sign * q[0], sign * q[1], sign * q[2], q[3]
+        x = aw * p[0] + ax * p[3] + ay * p[2] - az * p[1]
+        y = aw * p[1] - ax * p[2] + ay * p[3] + az * p[0]
+        z = aw * p[2] + ax * p[1] - ay * p[0] + az * p[3]
+        w = aw * p[3] - ax * p[0] - ay * p[1] - az * p[2]
+        norm = np.sqrt(x * x + y * y + z * z + w * w)
+        out[0], out[1], out[2], out[3] = x / norm, y / norm, z / norm, w / norm
+
+
+@kernel
+def apply_blocks(pairs: Any, blocks: Any, ridge: float, x: Any, out: Any) -> None:
+    """Fill out (n, 3) with (D^T B D + ridge I) x, blocks (k, 3, 3)."""
+    for i in range(len(x)):
+        out[i, 0], out[i, 1], out[i, 2] = ridge * x[i, 0], ridge * x[i, 1], ridge * x[i, 2]
+    for e in range(len(pairs)):
+        i, j, b = pairs[e, 0], pairs[e, 1], blocks[e]
+        d0, d1, d2 = x[i, 0] - x[j, 0], x[i, 1] - x[j, 1], x[i, 2] - x[j, 2]
+        for a in range(3):
+            pulled = b[a, 0] * d0 + b[a, 1] * d1 + b[a, 2] * d2
+            out[i, a] += pulled
+            out[j, a] -= pulled
+
+
+@kernel
+def sum_blocks(pairs: Any, blocks: Any, diagonal: Any) -> None:
+    """Add the block of each pair, (k, b, b), to the blocks of its two nodes, (n, b, b)."""
+    for e in range(len(pairs)):
+        for end in range(2):
+            i = pairs[e, end]
+            for a in range(blocks.shape[1]):
+                for b in range(blocks.shape[2]):
+                    diagonal[i, a, b] += blocks[e, a, b]
+
+
+@kernel
+def cap_information(information: Any, variance: float, out: Any) -> None:
+    """Fill (H^-1 + variance I)^-1 = H (I + variance H)^-1 for symmetric blocks (k, 3, 3)."""
+    for e in range(len(information)):
+        h = information[e]
+        a, b, c = 1.0 + variance * h[0, 0], variance * h[0, 1], variance * h[0, 2]
+        d, f, g = 1.0 + variance * h[1, 1], variance * h[1, 2], 1.0 + variance * h[2, 2]
+        # The adjugate of the symmetric I + variance H, and its determinant.
+        m00, m01, m02 = d * g - f * f, c * f - b * g, b * f - c * d
+        m11, m12, m22 = a * g - c * c, b * c - a * f, a * d - b * b
+        scale = 1.0 / (a * m00 + b * m01 + c * m02)
+        # H (I + v H)^-1 = (I - (I + v H)^-1) / v loses digits where v H is small; so multiply.
+        for row in range(3):
+            h0, h1, h2 = h[row, 0] * scale, h[row, 1] * scale, h[row, 2] * scale
+            out[e, row, 0] = h0 * m00 + h1 * m01 + h2 * m02
+            out[e, row, 1] = h0 * m01 + h1 * m11 + h2 * m12
+            out[e, row, 2] = h0 * m02 + h1 * m12 + h2 * m22
+        for row in range(3):
+            for column in range(row):
+                mean = 0.5 * (out[e, row, column] + out[e, column, row])
+                out[e, row, column] = mean
+                out[e, column, row] = mean
+
+
+@kernel
+def move_to_modes(
+    pointers: Any, neighbors: Any, edge_of: Any, pairs: Any, measured: Any, turns: Any, weights: Any,
+    scale: float, margin: float,
+) -> int:  # fmt: skip
+    """Move each camera to what most of its pairs predict, one after the other; return how many moved.
+
+    A pair (i, j) predicts R_ij R_i for camera j. A rotation's votes are the sum of weights / (1 + (angle /
+    scale)^2)^2 over the predictions. A camera whose rotation has less than half of all its weights moves to
+    the prediction of most votes, if these exceed its own by the margin.
+    """
+    n, moved, most = len(turns), 0, 0
+    for c in range(n):
+        most = max(most, pointers[c + 1] - pointers[c])
+    predicted, weight = np.empty((most, 4)), np.empty(most)
+    for c in range(n):
+        count, total, own = pointers[c + 1] - pointers[c], 0.0, 0.0
+        for k in range(count):
+            p = pointers[c] + k
+            e, other = edge_of[p], neighbors[p]
+            q, b = measured[e], turns[other]
+            sign = 1.0 if pairs[e, 1] == c else -1.0
+            ax, ay, az, aw = sign * q[0], sign * q[1], sign * q[2], q[3]
+            predicted[k, 0] = aw * b[0] + ax * b[3] + ay * b[2] - az * b[1]
+            predicted[k, 1] = aw * b[1] - ax * b[2] + ay * b[3] + az * b[0]
+            predicted[k, 2] = aw * b[2] + ax * b[1] - ay * b[0] + az * b[3]
+            predicted[k, 3] = aw * b[3] - ax * b[0] - ay * b[1] - az * b[2]
+            weight[k] = weights[e]
+            total += weights[e]
+            own += weights[e] * _closeness(predicted[k], turns[c], scale)
+        if own >= 0.5 * total:
+            continue
+        best, best_votes = -1, own * (1.0 + margin)
+        for k in range(count):
+            votes = 0.0
+            for other in range(count):
+                votes += weight[other] * _closeness(predicted[k], predicted[other], scale)
+            if votes > best_votes:
+                best, best_votes = k, votes
+        if best >= 0:
+            moved += 1
+            norm = np.sqrt(
+                predicted[best, 0] ** 2 + predicted[best, 1] ** 2
+                + predicted[best, 2] ** 2 + predicted[best, 3] ** 2
+            )  # fmt: skip
+            for a in range(4):
+                turns[c, a] = predicted[best, a] / norm
+    return moved
+
+
+@inner_kernel
+def _closeness(a: Any, b: Any, scale: float) -> float:
+    """Return 1 / (1 + (angle / scale)^2)^2 of two unit quaternions, with 4 sin(angle / 4) for the angle."""
+    cosine = abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] + a[3] * b[3])
+    loss = 1.0 + 8.0 * max(1.0 - cosine, 0.0) / (scale * scale)
+    return float(1.0 / (loss * loss))
+
+
+@kernel
+def close_triangles(
+    begin: int, end: int, pointers: Any, neighbors: Any, edge_of: Any, pairs: Any, measured: Any,
+    weights: Any, scale: float, closing: Any, all_votes: Any,
+) -> None:  # fmt: skip
+    """Fill the votes of the triangles that close, and of all of them, for the pairs begin..end-1.
+
+    Neighbors ascend within each row. A triangle (i, j, k) has, for the pair (i, j), as many votes as the
+    weaker of its other two pairs; it closes by 1 / (1 + (angle / scale)^2)^2 of R_ij^T R_kj R_ik.
+    """
+    around = np.empty(4)
+    for e in range(begin, end):
+        i, j = pairs[e, 0], pairs[e, 1]
+        a, b = pointers[i], pointers[j]
+        closed, total = 0.0, 0.0
+        while a < pointers[i + 1] and b < pointers[j + 1]:
+            if neighbors[a] < neighbors[b]:
+                a += 1
+            elif neighbors[a] > neighbors[b]:
+                b += 1
+            else:
+                first, second = edge_of[a], edge_of[b]
+                p, q = measured[first], measured[second]  # from i to the third, and from it to j
+                s = 1.0 if pairs[first, 0] == i else -1.0
+                px, py, pz, pw = s * p[0], s * p[1], s * p[2], p[3]
+                s = 1.0 if pairs[second, 1] == j else -1.0
+                qx, qy, qz, qw = s * q[0], s * q[1], s * q[2], q[3]
+                around[0] = qw * px + qx * pw + qy * pz - qz * py
+                around[1] = qw * py - qx * pz + qy * pw + qz * px
+                around[2] = qw * pz + qx * py - qy * px + qz * pw
+                around[3] = qw * pw - qx * px - qy * py - qz * pz
+                w = min(weights[first], weights[second])
+                total += w
+                closed += w * _closeness(around, measured[e], scale)
+                a += 1
+                b += 1
+        closing[e], all_votes[e] = closed, total

@@ -1,0 +1,131 @@
+"""How well averaged rotations are known: the inverse of the last system, scaled by what the pairs disagree.
+
+With the robust blocks B_e = w_e R_j^T H_e R_j of all pairs and L = D^T B D, rotations that were averaged from
+pairs of covariance v H_e^-1 have, in world axes and relative to their own mean turn, the covariance
+
+    C = c v P L^+ P,        P = I - 1 1^T / n.
+
+c corrects for the loss: an M-estimator with weights w(d^2) of normal residuals in three dimensions has the
+covariance a / b^2 (D^T H D)^-1 with a = E[w^2 d^2] / 3 and b = E[w + 2/3 w' d^2] (Huber, "Robust Statistics",
+section 7.6), and L is E[w] D^T H D on average, so c = E[w] a / b^2; 0.823 for Geman and McClure's loss at
+three medians. v is what residuals say: Mahalanobis lengths d_e^2 / (1 - h_e) have the median 2.366 v, where
+the leverage h_e = tr(B_e (Z_ii + Z_jj - Z_ij - Z_ij^T)) / 3 is the share of its residual that a pair does not
+show. Pairs whose residual says nothing (bridges have h = 1) are not asked; if all are such, v = 1: the given
+information is believed.
+
+Where the factor of L is small, the blocks of its inverse Z come from it. Else L^+ is sampled: for normal g_e,
+x = L^+ D^T B^(1/2) g has the covariance L^+. Given all other cameras, camera i is normal around
+m_i = A_i^-1 sum_j B_ij x_j with the covariance A_i^-1, where A_i = sum_j B_ij; so in the gauge of the mean
+
+    P L^+ P at i = (1 - 1/n)^2 A_i^-1 + Cov[(1 - 1/n) m_i + x_i / n],
+
+the first part exact, and the second one small in graphs whose factor is large (Siden, Lindgren, Bolin,
+Villani, "Efficient covariance approximations for large sparse precision matrices", JCGS 2018).
+"""
+
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.jit import kernel
+from sfm_shapefit.laplacian.selected import selected_inverse
+from sfm_shapefit.rotations.annealing import AveragingPairs, Linearized
+from sfm_shapefit.rotations.averaging_kernels import sum_blocks
+from sfm_shapefit.rotations.averaging_system import AveragingSystem, plan_system
+from sfm_shapefit.viewgraph import connected_components
+
+_LOSS_FACTOR = 0.823
+_MEDIAN_SQUARE = 2.366
+# Pairs of a higher leverage say nothing of the residual scale.
+_MOST_LEVERAGE = 0.9
+_SAMPLES = 16
+_REDUCTION = 1e-2
+_SEED = 2
+
+
+def estimate_sigmas(given: AveragingPairs, system: AveragingSystem, last: Linearized) -> FloatArray:
+    """Return each camera's standard deviation per axis in radians, (n,), relative to the mean of all.
+
+    Infinite for cameras that the pairs of the last system do not tie to the largest part of the others.
+    """
+    n, inside = given.num_cameras, ~np.isnan(last.distances)
+    sigmas = np.full(n, np.inf)
+    labels = connected_components(n, given.pairs[inside])
+    main = labels == np.argmax(np.bincount(labels))
+    if main.sum() < 2:
+        return sigmas
+    if not main.all():
+        numbers = np.cumsum(main) - 1
+        kept = inside & main[given.pairs].all(axis=1)
+        pairs = np.ascontiguousarray(numbers[given.pairs[kept]])
+        last = Linearized(np.ascontiguousarray(last.blocks[kept]), last.distances[kept])
+        weights = np.trace(last.blocks, axis1=1, axis2=2)
+        system = plan_system(int(main.sum()), pairs, weights, system.threads)
+    variances, leverages = _factored(system, last) if system.factors_blocks else _sampled(system, last)
+    sigmas[main] = np.sqrt(_LOSS_FACTOR * residual_variance(last.distances, leverages) * variances)
+    return sigmas
+
+
+def residual_variance(distances: FloatArray, leverages: FloatArray) -> float:
+    """Return the variance of the residuals over that of the given information; 1 if they do not say."""
+    asked = (leverages <= _MOST_LEVERAGE) & ~np.isnan(distances)
+    if not asked.any():
+        return 1.0
+    return float(np.median(distances[asked] ** 2 / (1.0 - leverages[asked]))) / _MEDIAN_SQUARE
+
+
+def _factored(system: AveragingSystem, last: Linearized) -> tuple[FloatArray, FloatArray]:
+    """Return a third of the trace of P L^+ P at each camera, (n,), and the leverage of each pair, (k,)."""
+    factor = system.ground_blocks(last.blocks)
+    inverse = selected_inverse(factor, system.pairs)
+    i, j = system.pairs.T
+    difference = inverse.nodes[i] + inverse.nodes[j] - inverse.edges - inverse.edges.transpose(0, 2, 1)
+    leverages = np.einsum("kab,kab->k", last.blocks, difference) / 3.0
+    n = system.num_nodes
+    means = factor.solve(np.tile(np.eye(3) / n, (n, 1, 1)))
+    covariances = inverse.nodes - means - means.transpose(0, 2, 1) + means.mean(axis=0)
+    return np.trace(covariances, axis1=1, axis2=2) / 3.0, leverages
+
+
+def _sampled(system: AveragingSystem, last: Linearized) -> tuple[FloatArray, FloatArray]:
+    """Return the same from samples; the leverages are their mean."""
+    n, k = system.num_nodes, len(system.pairs)
+    rng = np.random.default_rng(_SEED)
+    diagonal = np.zeros((n, 3, 3))
+    sum_blocks(system.pairs, last.blocks, diagonal)
+    own = np.linalg.inv(diagonal)
+    apply = system.block_operator(last.blocks)
+    total, right = np.zeros(n), np.empty((n, 3))
+    for _ in range(_SAMPLES):
+        draw_right_side(system.pairs, last.blocks, rng.normal(size=(k, 3)), right)
+        x = system.solve_blocks(last.blocks, right, _REDUCTION)
+        # A m = A x - L x.
+        around = x - np.einsum("nab,nb->na", own, apply(x))
+        total += np.sum(((1.0 - 1.0 / n) * around + x / n) ** 2, axis=1)
+    exact = (1.0 - 1.0 / n) ** 2 * np.trace(own, axis1=1, axis2=2)
+    return (exact + total / _SAMPLES) / 3.0, np.full(k, (n - 1) / np.sum(~np.isnan(last.distances)))
+
+
+@kernel
+def draw_right_side(pairs: Any, blocks: Any, normals: Any, right: Any) -> None:
+    """Fill D^T B^(1/2) g, (n, 3), with Cholesky factors as roots of the blocks (k, 3, 3)."""
+    for i in range(len(right)):
+        right[i, 0], right[i, 1], right[i, 2] = 0.0, 0.0, 0.0
+    for e in range(len(pairs)):
+        b, g = blocks[e], normals[e]
+        if b[0, 0] <= 0.0:
+            continue
+        l00 = np.sqrt(b[0, 0])
+        l10, l20 = b[1, 0] / l00, b[2, 0] / l00
+        l11 = np.sqrt(max(b[1, 1] - l10 * l10, 0.0))
+        l21 = (b[2, 1] - l20 * l10) / l11 if l11 > 0.0 else 0.0
+        l22 = np.sqrt(max(b[2, 2] - l20 * l20 - l21 * l21, 0.0))
+        i, j = pairs[e, 0], pairs[e, 1]
+        r0, r1, r2 = l00 * g[0], l10 * g[0] + l11 * g[1], l20 * g[0] + l21 * g[1] + l22 * g[2]
+        right[i, 0] += r0
+        right[i, 1] += r1
+        right[i, 2] += r2
+        right[j, 0] -= r0
+        right[j, 1] -= r1
+        right[j, 2] -= r2
