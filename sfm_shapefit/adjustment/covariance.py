@@ -63,6 +63,52 @@ def estimate_covariances(
         UnsolvableError: if the observations leave more open than a similarity.
     """
     options = merge_options(options, AdjustmentOptions, overrides)
+    system = ground_system(problem, options)
+    blocks = system.factor.inverse_blocks()
+    if system.free.size:
+        blocks = _transform(blocks, system.factor, system.motions)
+    blocks *= options.noise_px**2
+    return _by_frame(system.layout, blocks, system.unseen, system.free.shape[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class GroundedSystem:
+    """The reduced system at a minimum, made regular and factored, and the motions that nothing holds."""
+
+    layout: Layout
+    factor: ReducedFactor
+    inverses: FloatArray
+    """(k, 6) of the points' blocks, packed."""
+    free: FloatArray
+    """(7, f) basis of the small similarities that nothing holds."""
+    motions: FloatArray
+    """(N, 6, f) how these move the nodes."""
+    unseen: BoolArray
+    """(n,) frames that see no point."""
+
+    def solve(self, right: FloatArray, *, gauge: bool = True) -> FloatArray:
+        """Return Z K^-1 of right sides (N, 6, r); K^-1 alone without the gauge."""
+        moved = self.factor.solve(np.ascontiguousarray(right))
+        if gauge and self.free.size:
+            drift = np.einsum("nai,nar->ir", _dual(self.motions), moved)
+            moved = moved - self.motions @ drift
+        return moved
+
+    def by_frame(self, blocks: FloatArray) -> FloatArray:
+        """Put blocks of the nodes (N, 3, 3) in the places of their frames: 0 if fixed, NaN if unseen."""
+        found = np.zeros((len(self.unseen), 3, 3))
+        moves = self.layout.node_of_frame >= 0
+        found[moves] = blocks[self.layout.node_of_frame[moves]]
+        found[self.unseen] = np.nan
+        return found
+
+
+def ground_system(problem: AdjustmentProblem, options: AdjustmentOptions) -> GroundedSystem:
+    """Return the reduced system at the minimum that a problem stands at, regular and factored.
+
+    Raises:
+        UnsolvableError: if the observations leave more open than a similarity.
+    """
     layout = lay_out(problem, options)
     workers = Workers(options.threads)
     normal = linearize_all(problem, layout, values_of(problem), options, workers)
@@ -76,11 +122,9 @@ def estimate_covariances(
     factor = choose_factor(layout, options)
     _ground(system, motions, _two_nodes(problem, layout, unseen))
     _factor(factor, system)
-    blocks = factor.inverse_blocks()
-    if free.size:
-        blocks = _transform(blocks, factor, motions)
-    blocks *= options.noise_px**2
-    return _by_frame(layout, blocks, unseen, free.shape[1])
+    return GroundedSystem(
+        layout=layout, factor=factor, inverses=system.inverses, free=free, motions=motions, unseen=unseen
+    )
 
 
 def _motions(problem: AdjustmentProblem, layout: Layout, free: FloatArray, unseen: BoolArray) -> FloatArray:
@@ -130,13 +174,7 @@ def _factor(factor: ReducedFactor, system: ReducedSystem) -> None:
 
 def _transform(blocks: FloatArray, factor: ReducedFactor, motions: FloatArray) -> FloatArray:
     """Return the diagonal blocks of Z K^-1 Z^T."""
-    dual = motions.copy()
-    dual[:, 3:] = 0.0
-    gram = np.einsum("nai,naj->ij", dual, motions)
-    if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
-        dual[:, 3:] = motions[:, 3:] * np.sum(motions[:, :3] ** 2) / np.sum(motions[:, 3:] ** 2)
-        gram = np.einsum("nai,naj->ij", dual, motions)
-    dual = dual @ np.linalg.inv(gram)
+    dual = _dual(motions)
     solved = factor.solve(dual)
     middle = np.einsum("nai,naj->ij", dual, solved)
     cross = motions @ solved.transpose(0, 2, 1)
@@ -144,6 +182,18 @@ def _transform(blocks: FloatArray, factor: ReducedFactor, motions: FloatArray) -
         blocks - cross - cross.transpose(0, 2, 1) + motions @ middle @ motions.transpose(0, 2, 1)
     )
     return transformed
+
+
+def _dual(motions: FloatArray) -> FloatArray:
+    """Return F (F^T N)^-1, (N, 6, f), which reads the motions off the centers."""
+    dual = motions.copy()
+    dual[:, 3:] = 0.0
+    gram = np.einsum("nai,naj->ij", dual, motions)
+    if np.linalg.eigvalsh(gram)[0] < _COLLINEAR * np.linalg.eigvalsh(gram)[-1]:
+        dual[:, 3:] = motions[:, 3:] * np.sum(motions[:, :3] ** 2) / np.sum(motions[:, 3:] ** 2)
+        gram = np.einsum("nai,naj->ij", dual, motions)
+    read: FloatArray = dual @ np.linalg.inv(gram)
+    return read
 
 
 def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: int) -> FrameCovariances:

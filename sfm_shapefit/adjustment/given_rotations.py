@@ -36,6 +36,8 @@ _FEWEST_FRAMES = 3
 _FALL = 1e-4
 # Of a normal error in the plane, the median length over the standard deviation per axis.
 _MEDIAN_LENGTH = 1.1774
+# Of a normal error in space, the median square over the mean.
+_MEDIAN_SQUARE = 0.7887
 
 
 class RotationWeight(NamedTuple):
@@ -47,6 +49,8 @@ class RotationWeight(NamedTuple):
     """Standard deviation per axis by which they pull; None: they do not."""
     noise_px: float = 0.5
     """Standard deviation of an observation per axis, which the pull is weighed against."""
+    open_rad: float = 0.0
+    """Standard deviation per axis of the errors that rotations may have although they are held."""
 
     def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
         """Return the problem with the pull of the given rotations (n, 3, 3)."""
@@ -64,6 +68,8 @@ class RotationErrors:
     """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
     chance_rad: float
     """Median over the frames of what chance turns them by, all points together."""
+    open_rad: float
+    """The same from the median agreement, where chance explains it too: what holding them leaves open."""
     noise_px: float
     """Of an observation, from the median of all errors with free rotations."""
     num_frames: int
@@ -71,7 +77,8 @@ class RotationErrors:
 
     def weight(self) -> RotationWeight:
         """Return how to treat the rotations: held, if freeing them would bring more noise than it takes."""
-        return RotationWeight(self.sigma_rad == 0.0, self.sigma_rad or None, self.noise_px)
+        hold = self.sigma_rad == 0.0
+        return RotationWeight(hold, self.sigma_rad or None, self.noise_px, self.open_rad if hold else 0.0)
 
 
 def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOptions) -> RotationErrors:
@@ -92,13 +99,16 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
     noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH
     if len(first) < _FEWEST_FRAMES:
-        return RotationErrors(sigma_rad=0.0, chance_rad=0.0, noise_px=noise_px, num_frames=len(first))
+        return RotationErrors(
+            sigma_rad=0.0, chance_rad=0.0, open_rad=0.0, noise_px=noise_px, num_frames=len(first)
+        )
     agreement = np.einsum("fa,fa->f", first, second) / 3.0
     chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
     is_chance = np.median(agreement) <= np.median(chance)
     return RotationErrors(
         sigma_rad=0.0 if is_chance else float(np.sqrt(max(agreement.mean(), np.median(agreement)))),
         chance_rad=float(np.sqrt(np.median(chance))),
+        open_rad=float(np.sqrt(max(np.median(agreement) / _MEDIAN_SQUARE, 0.0))),
         noise_px=noise_px,
         num_frames=len(first),
     )

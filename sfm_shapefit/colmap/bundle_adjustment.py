@@ -20,7 +20,7 @@ One thread does all, as the answer must not depend on their number.
 """
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -35,9 +35,11 @@ from sfm_shapefit.adjustment import (
     reprojection_errors_px,
 )
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
+from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import (
     add_points,
     collect_tracks,
@@ -49,6 +51,7 @@ from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without
 from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
+from sfm_shapefit.errors import UnsolvableError
 
 # Of the two solves of all tracks: scales of the Cauchy loss in pixel thresholds, and the relative falls to
 # end at.
@@ -61,6 +64,8 @@ _FINE = 0.9
 # Of the solves after a placement: the scale at which the rotations are judged, and where they end.
 _GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
+# With more frames, the standard deviations would take longer than all the rest.
+_MOST_FRAMES = 2_000
 _FREE = RotationWeight()
 
 
@@ -78,6 +83,9 @@ class Adjusted:
     """Whether the last solve met its tolerance within its limit of 100 steps."""
     iterations: int
     """Steps of all solves together."""
+    covariances: Mapping[int, FloatArray]
+    """(3, 3) of the center of each image by its id, in squared units of the seed, see
+    `adjustment.shared_errors`; an image of a rig has its frame's. Empty with Ceres, and for large models."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,6 +98,8 @@ class AdjustedPlacement:
     """How the given rotations were treated."""
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
+    covariances: Mapping[int, FloatArray]
+    """As of `Adjusted`."""
 
     @property
     def statement(self) -> str:
@@ -150,11 +160,13 @@ def bundle_adjust(
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
+        covariances: Mapping[int, FloatArray] = {}
     else:
         run = _Run(seed, tracks, structure_options, fixed_frames)
         if given is not None:
             run.weight, run.given = given.weight, rotations_of_frames(given.model, run.frames.frame_ids)
-        unfiltered, initial_error_px, iterations, converged = run.adjust_all(seed, tracks)
+        unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
+        iterations, converged, covariances = run.iterations, run.converged, run.covariances(last)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
@@ -162,6 +174,7 @@ def bundle_adjust(
         final_error_px=answer.compute_mean_reprojection_error(),
         converged=converged,
         iterations=iterations,
+        covariances=covariances,
     )
 
 
@@ -220,9 +233,11 @@ def adjust_placement(
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
-    return AdjustedPlacement(reconstruction=poses, weight=weight, errors=errors)
+    return AdjustedPlacement(
+        reconstruction=poses, weight=weight, errors=errors, covariances=run.covariances(adjusted)
+    )
 
 
 class _Run:
@@ -238,7 +253,7 @@ class _Run:
         self.start = self.frames = read_frames(seed, fixed_frames)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
-        self.iterations, self.converged = 0, False
+        self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
         few = len(self.frames.image_ids) < _FEWEST_IMAGES_OF_A_CHECKED_POINT
         checked = options.ignore_two_view_tracks and isinstance(self.source, MatchedKeypoints) and not few
         self.min_length = max(options.min_track_length, 3 if checked else 2)
@@ -267,7 +282,7 @@ class _Run:
 
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
-        loss_scale_px = scale * self.options.max_reprojection_error_px
+        loss_scale_px = self.loss_scale_px = scale * self.options.max_reprojection_error_px
         adjusted = adjust(
             self.weight.apply(problem, self.given),
             loss_scale_px=loss_scale_px,
@@ -282,6 +297,20 @@ class _Run:
         self.converged = adjusted.converged
         return adjusted.problem
 
+    def covariances(self, problem: AdjustmentProblem) -> dict[int, FloatArray]:
+        """Return the covariance of the center of each image by its id, at the optimum last solved for."""
+        if problem.num_frames > _MOST_FRAMES:
+            return {}
+        options = AdjustmentOptions(
+            loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
+        )
+        try:
+            found = estimate_center_errors(problem, options, self.weight.open_rad)
+        except UnsolvableError:
+            return {}
+        of_camera = found.covariances[self.frames.frame_of_camera]
+        return {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
+
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the last loss that the errors of a problem call for, in pixel thresholds."""
         threshold_px = self.options.max_reprojection_error_px
@@ -289,8 +318,8 @@ class _Run:
 
     def adjust_all(
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
-    ) -> tuple[pycolmap.Reconstruction, float, int, bool]:
-        """Return the adjusted model, not filtered; the first mean error; all steps; and the convergence."""
+    ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
+        """Return the adjusted model, not filtered; the first mean error; and the problem solved last."""
         (joined, found), (loosely, loose) = self.triangulate(1.0), self.triangulate(_THIN_LIMIT)
         refuse_without_points(len(loose.points))
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
@@ -307,7 +336,7 @@ class _Run:
         found = replace(found, points=adjusted.points)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks
         add_points(answer, self.frames, joined, found, colors)
-        return answer, initial_error_px, self.iterations, self.converged
+        return answer, initial_error_px, adjusted
 
 
 def _mean_error_px(problem: AdjustmentProblem) -> float:

@@ -15,7 +15,12 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.adjustment import adjust_placed, is_adjusted, turned_deg
+from sfm_shapefit.commands.stages.adjustment import (
+    adjust_placed,
+    is_adjusted,
+    turned_deg,
+    with_covariances,
+)
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
@@ -144,7 +149,10 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
-    located = located._replace(gauge=seeded.gauge)
+    if seeded.adjusted is not None:
+        scale = located.gauge.similarity.scale
+        placement = with_covariances(placement, model, seeded.adjusted.covariances, scale)
+    located = located._replace(placement=placement, gauge=seeded.gauge)
     warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
     return LocateResult(
         reconstruction=seeded.reconstruction,

@@ -61,6 +61,9 @@ class Placement(Displayed):
     """The iterations of the solve; empty for graphs so large that watching them would take long."""
     unit: float | None
     """Length of the unit of the offsets inside rigid groups, in the solver's units; None without groups."""
+    adjusted_covariances: FloatArray | None = None
+    """(k, 3, 3) of the centers of `cameras` where an adjustment has them, squared solver's units; NaN where
+    they are not known, None without an adjustment."""
 
     @property
     def graph(self) -> ViewGraph:
@@ -91,6 +94,15 @@ class Placement(Displayed):
     def locations(self) -> FloatArray:
         """The centers (k, d) of `cameras`, in the solver's units."""
         return self.refined.locations[: len(self.cameras)]
+
+    @property
+    def covariances(self) -> FloatArray:
+        """Covariances (k, d, d) of `locations`: of an adjustment, else from the noise of directions only."""
+        directions = self.assessment.covariances[: len(self.cameras)]
+        if self.adjusted_covariances is None:
+            return directions
+        known = np.isfinite(self.adjusted_covariances).all(axis=(1, 2), keepdims=True)
+        return np.where(known, self.adjusted_covariances, directions)
 
     @property
     def edges(self) -> IntArray:
@@ -229,7 +241,13 @@ def replace_locations(
 ) -> Placement:
     """Return a placement with other locations of the same nodes, judged anew."""
     assessment, second = _judge(placement.measured_part(), placement.nodes, refined, options)
-    return replace(placement, refined=refined, assessment=assessment, second_configuration=second)
+    return replace(
+        placement,
+        refined=refined,
+        assessment=assessment,
+        second_configuration=second,
+        adjusted_covariances=None,
+    )
 
 
 def _split(measured: MeasuredGraph, options: PlacementOptions) -> tuple[IntArray, list[RigidPiece]]:

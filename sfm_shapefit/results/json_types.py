@@ -156,6 +156,11 @@ class PlacementSummary(TypedDict):
         int, "Pairs without a usable direction, and those that contradict the solution."
     ]
     num_pairs_filtered: Annotated[int, "Pairs that --filter left out."]
+    sigma_of: Annotated[
+        str,
+        "What the standard deviations of cameras.csv know of: matching noise only, or, after an adjustment, "
+        "noise, rotations and calibration; and what they are relative to.",
+    ]
     residual_level_deg: Annotated[float, "Level of the agreeing pairs' residuals."]
     residuals_deg: Residuals
     loose_groups: Annotated[list[LooseGroup], "Groups of cameras that hang loose."]

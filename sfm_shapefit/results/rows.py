@@ -8,6 +8,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import PairDirections
+from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.placement.place import Placement, count_large
 from sfm_shapefit.results.json_types import Piece
@@ -76,7 +77,8 @@ def own_camera_rows(
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
-    sigmas = scale * (assessment.sigmas if axes is None else _turn_sigmas(assessment.covariances, axes))
+    covariances = placement.covariances
+    sigmas = scale * (standard_deviations(covariances) if axes is None else _turn_sigmas(covariances, axes))
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())

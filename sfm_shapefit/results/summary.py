@@ -103,6 +103,7 @@ def _summarize(
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "num_pairs_filtered": len(placement.dropped),
+        "sigma_of": sigma_of(placement),
         "residual_level_deg": placement.assessment.level_deg,
         "residuals_deg": residuals_deg(placement),
         "loose_groups": [
@@ -136,6 +137,15 @@ def _summarize(
         "warnings": list(warnings),
         "versions": {"sfm_shapefit": __version__} | {name: version(name) for name in others},
     }
+
+
+def sigma_of(placement: Placement) -> str:
+    """Say what the standard deviations of the cameras know of, and what they are relative to."""
+    if placement.adjusted_covariances is None:
+        return "matching noise only; relative to the centroid and scale of the cameras that are held"
+    held = ~placement.adjusted_covariances.any(axis=(1, 2))
+    relative = f"{int(held.sum())} fixed cameras" if held.any() else "the model's mean position and scale"
+    return f"adjusted: noise, rotations, calibration; relative to {relative}"
 
 
 def _number(value: float) -> float | None:

@@ -42,7 +42,8 @@ class CameraRow:
     agree with the solution, compared with what is usual in the scene, and lowered where it is loose; see
     `judgement.trust`."""
     sigma: tuple[float, ...] = ()
-    """Standard deviation of the solved center, in the output's units, with centroid and scale held fixed.
+    """Standard deviation of the center that is delivered, in the output's units, relative to the centroid and
+    scale of the model or to fixed cameras; `sigma_of` in locate.json says which, and what errors it knows of.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
 
 

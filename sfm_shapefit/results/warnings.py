@@ -7,6 +7,7 @@ import numpy as np
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
 from sfm_shapefit.solver.options import Status
@@ -63,7 +64,7 @@ def uncertain_cameras(placement: Placement) -> IntArray:
 
 def _largest_sigmas(placement: Placement) -> FloatArray:
     """Return the largest of each camera's standard deviations along the axes."""
-    return np.asarray(placement.assessment.sigmas[: len(placement.cameras)].max(axis=1))
+    return np.asarray(standard_deviations(placement.covariances).max(axis=1))
 
 
 def _uncertainty_warnings(placement: Placement) -> Iterator[str]:

@@ -5,13 +5,15 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
+from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_placement
-from sfm_shapefit.colmap.model import with_frame_rotations
+from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
@@ -60,7 +62,22 @@ def adjust_placed(
     locations = (centers - similarity.translation) / similarity.scale
     if not adjusted.weight.hold:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
-    return source, move_cameras(placement, locations, options), adjusted
+    moved = with_covariances(
+        move_cameras(placement, locations, options), model, adjusted.covariances, similarity.scale
+    )
+    return source, moved, adjusted
+
+
+def with_covariances(
+    placement: Placement, model: PosedModel, covariances: Mapping[int, FloatArray], scale: float
+) -> Placement:
+    """Return the placement with covariances of an adjustment, by image id, `scale` to the solver's unit."""
+    if not covariances:
+        return placement
+    unknown = np.full((3, 3), np.nan)
+    ids = model.image_ids[placement.cameras].tolist()
+    own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
+    return replace(placement, adjusted_covariances=own)
 
 
 def turned_deg(before: FloatArray, after: FloatArray) -> FloatArray:

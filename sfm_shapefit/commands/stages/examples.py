@@ -9,7 +9,14 @@ from pathlib import Path
 import numpy as np
 
 from sfm_shapefit import synthetic
-from sfm_shapefit.adjustment import AdjustmentProblem, Lens, adjust, estimate_covariances
+from sfm_shapefit.adjustment import (
+    AdjustmentOptions,
+    AdjustmentProblem,
+    Lens,
+    adjust,
+    estimate_covariances,
+)
+from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.baselines import FILTERS, LOCATORS
 from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
 from sfm_shapefit.colmap.model import read_model
@@ -242,3 +249,4 @@ def adjust_bundles(_folder: Path) -> None:
     for linear_solver in ("dense", "sparse"):
         adjusted = adjust(problem, linear_solver=linear_solver, loss_scale_px=1.0, threads=2)
     estimate_covariances(adjusted.problem)
+    estimate_center_errors(adjusted.problem, AdjustmentOptions())
