@@ -22,4 +22,5 @@ INDEX = {
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
     "start": "The first run of each command in a fresh environment, as a clone and from the wheel.",
     "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
+    "uncertainty": "Errors of delivered cameras over their standard deviations.",
 }

@@ -93,10 +93,10 @@ def estimate_center_errors(
     pulls = _Pulls(problem, options, system)
     freely = replace(problem, rotation_prior=None), replace(options, hold_rotations=False)
     evidence = _Pulls(*freely, ground_system(*freely)).test_lenses(noise2)
-    doubt = float(np.clip((evidence - _DOUBT) / (_CERTAIN - _DOUBT), 0.0, 1.0))
+    doubt = float(np.interp(evidence, [_DOUBT, _CERTAIN], [0.0, 1.0]))
     calibration_px = _CALIBRATION_OF_NOISE * float(np.sqrt(doubt * noise2))
     by_group, by_sample = pulls.draw(calibration_px, turn_sigma_rad)
-    _add_rotation_errors(by_sample, problem, options, system, kappa)
+    _add_errors_of_priors(by_sample, problem, options, system, kappa)
     groups = max(by_group.shape[2], 2)
     moved = np.concatenate(
         [
@@ -113,14 +113,14 @@ def estimate_center_errors(
     )
 
 
-def _add_rotation_errors(
+def _add_errors_of_priors(
     by_sample: FloatArray,
     problem: AdjustmentProblem,
     options: AdjustmentOptions,
     system: GroundedSystem,
     kappa: float,
 ) -> None:
-    """Add the pulls of priors on rotations and centers that are in error as they say, in units of K / kappa."""
+    """Add the pulls of priors that are in error as they say they are, in units of K / kappa."""
     rng = np.random.default_rng(1)
     layout = system.layout
     moves = layout.node_of_frame >= 0

@@ -1,0 +1,123 @@
+"""Standard deviations of adjusted centers: made scenes whose errors are known must have them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.adjustment import (
+    AdjustmentOptions,
+    RotationPrior,
+    adjust,
+    isotropic_information,
+    shared_errors,
+)
+from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
+from sfm_shapefit.geometry import fit_similarity_l1
+from tests.adjustment.made import ring_problem
+
+OPTIONS = AdjustmentOptions(loss_scale_px=1.0, noise_px=0.5, cost_tolerance=1e-8)
+
+
+def ratios(truth, options, *, start=None, turn_sigma_rad=0.0, align=True):
+    """Errors of the centers over their standard deviations, and what was said of them."""
+    adjusted = adjust(start or truth, options).problem
+    found = estimate_center_errors(adjusted, options, turn_sigma_rad)
+    centers = adjusted.centers
+    if align:
+        free = not options.hold_rotations and truth.rotation_prior is None
+        centers = fit_similarity_l1(centers, truth.centers, rotate=free).apply(centers)
+    squares = np.sum((centers - truth.centers) ** 2, axis=1)
+    moves = ~truth.is_fixed()
+    variances = np.einsum("naa->n", found.covariances)
+    return np.sqrt(squares[moves] / variances[moves]), found
+
+
+def rms(values):
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+# Over 5 draws of 12 cameras there are about 150 degrees of freedom: the rms scatters by 1 / sqrt(300) = 6 %,
+# the standard deviations, from 32 groups, by as much again. Bands are 1 within a quarter.
+@pytest.mark.parametrize("case", ["free", "held", "rig", "fixed", "weighted"])
+def test_errors_under_known_noise_are_as_large_as_stated(case):
+    found = []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        truth = ring_problem(rng, 12, 400, share=0.4, sensors=2 if case == "rig" else 0)
+        options, start = OPTIONS, None
+        if case in ("held", "fixed"):
+            options = replace(options, hold_rotations=case == "held")
+        if case == "fixed":
+            truth = replace(truth, fixed=np.arange(12) < 2)
+        if case == "weighted":
+            sigma = 2e-3
+            given = Rotation.from_rotvec(sigma * rng.standard_normal((12, 3))).as_matrix() @ truth.rotations
+            prior = RotationPrior(rotations=given, information=isotropic_information(np.full(12, sigma)))
+            start = replace(truth, rotations=given, rotation_prior=prior)
+            truth = replace(truth, rotation_prior=prior)
+        found.append(ratios(truth, options, start=start, align=case != "fixed")[0])
+    assert 0.75 < rms(np.concatenate(found)) < 1.25
+
+
+def test_errors_of_rotations_that_are_held_are_in_it():
+    found, without = [], []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        truth = ring_problem(rng, 12, 400, share=0.4)
+        sigma = 3e-3
+        turned = Rotation.from_rotvec(sigma * rng.standard_normal((12, 3))).as_matrix() @ truth.rotations
+        start = replace(truth, rotations=turned)
+        options = replace(OPTIONS, hold_rotations=True)
+        found.append(ratios(truth, options, start=start, turn_sigma_rad=sigma)[0])
+        without.append(ratios(truth, options, start=start)[0])
+    assert 0.75 < rms(np.concatenate(found)) < 1.25
+    assert rms(np.concatenate(without)) > 2.0
+
+
+def test_noise_that_neighbors_share_is_in_it(monkeypatch):
+    found, alone = [], []
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        truth = ring_problem(rng, 12, 800, share=0.4, noise_px=0.3)
+        # The points of one of 80 cells err together, in each camera by 0.3 px. It sees 4 of them, which
+        # multiplies the variance by 1 + 3 / 2, and the errors by 1.6.
+        cells = np.floor((truth.points + 1.0) * [2.5, 2.0, 2.0]).astype(int) @ [1, 5, 20]
+        shared = 0.3 * rng.standard_normal((truth.num_cameras, 80, 2))
+        truth = replace(truth, pixels=truth.pixels + shared[truth.cameras_seeing, cells[truth.points_seen]])
+        monkeypatch.setattr(shared_errors, "_CALIBRATION_OF_NOISE", 0.0)
+        found.append(ratios(truth, OPTIONS)[0])
+        with monkeypatch.context() as patch:
+            patch.setattr(shared_errors, "_group_neighbors", lambda points: np.arange(len(points)))
+            alone.append(ratios(truth, OPTIONS)[0])
+    # Groups of 12 or 13 points cut the cells: some of what these share is lost.
+    assert 0.75 < rms(np.concatenate(found)) < 1.5
+    assert rms(np.concatenate(alone)) > 1.15 * rms(np.concatenate(found))
+
+
+def test_a_lens_that_is_off_is_seen_and_one_that_is_right_is_not():
+    rng = np.random.default_rng(0)
+    truth = ring_problem(rng, 12, 800, share=0.5)
+    assert ratios(truth, OPTIONS)[1].calibration_px == 0.0
+    focal, cx, cy = truth.lenses[0].parameters
+    bent = (replace(truth.lenses[0], model="SIMPLE_RADIAL", parameters=(focal, cx, cy, 0.03)),)
+    errors, found = ratios(truth, OPTIONS, start=replace(truth, lenses=bent))
+    assert found.calibration_px > 0.2
+    assert rms(errors) < 1.5
+
+
+def test_fixed_frames_have_no_error_and_unseen_ones_none_that_is_known():
+    truth = ring_problem(np.random.default_rng(0), 8, 200)
+    seen = truth.cameras_seeing != 5
+    truth = replace(
+        truth,
+        fixed=np.arange(8) < 2,
+        cameras_seeing=truth.cameras_seeing[seen],
+        points_seen=truth.points_seen[seen],
+        pixels=truth.pixels[seen],
+    )
+    covariances = estimate_center_errors(adjust(truth, OPTIONS).problem, OPTIONS).covariances
+    assert (covariances[:2] == 0.0).all()
+    assert np.isnan(covariances[5]).all()
+    assert (np.linalg.eigvalsh(covariances[[2, 3, 4, 6, 7]])[:, 0] > 0.0).all()
