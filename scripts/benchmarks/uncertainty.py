@@ -184,8 +184,8 @@ def checks(one: Measured) -> list[Check]:
 
 def tables(measured: Mapping[str, Measured], _args: argparse.Namespace) -> Iterator[str]:
     yield (
-        f"To reach: rms {LEAST_RMS} to {MOST_RMS}, at most {MOST_BEYOND:.0%} of the cameras beyond three standard"
-        " deviations. On small sets one camera is more than that."
+        f"To reach: rms {LEAST_RMS} to {MOST_RMS}, at most {MOST_BEYOND:.0%} of the cameras beyond three"
+        " standard deviations. On small sets one camera is more than that."
     )
     yield table_of(
         list(measured.values()),

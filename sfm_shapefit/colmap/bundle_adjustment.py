@@ -184,7 +184,7 @@ def adjust_thinly(
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
-) -> pycolmap.Reconstruction:
+) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
 
     Args:
@@ -194,14 +194,17 @@ def adjust_thinly(
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
 
     Returns:
-        A new model of the adjusted poses, without points; its gauge is as from `bundle_adjust`.
+        The adjusted poses, all rotations free; their gauge is as from `bundle_adjust`.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
     run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames)
-    run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
-    return with_poses(copy_without_points(seed), run.start, run.frames)
+    adjusted = run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
+    poses = with_poses(copy_without_points(seed), run.start, run.frames)
+    return AdjustedPlacement(
+        reconstruction=poses, weight=_FREE, errors=None, covariances=run.covariances(adjusted)
+    )
 
 
 def adjust_placement(
@@ -270,15 +273,15 @@ class _Run:
         found = triangulate_tracks(tracks, poses, limits)
         return tracks, found
 
-    def adjust_thinly(self, tracks: ObservedTracks, found: TriangulatedPoints) -> None:
-        """Move the frames to where few of the points found want them."""
+    def adjust_thinly(self, tracks: ObservedTracks, found: TriangulatedPoints) -> AdjustmentProblem:
+        """Move the frames to where few of the points found want them, and return the problem of these."""
         refuse_without_points(len(found.points))
         thin = tracks.of_points(found.points_seen)
         images = self.frames.images[thin.cameras]
         chosen = choose_thin_tracks(thin.offsets, images, thin.pixels, len(self.frames.image_ids))
         seen = np.repeat(np.arange(len(chosen)), thin.lengths()[chosen])
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
-        self.solve(self.frames.problem(thin.subset(chosen), points), _THIN_SCALE, _THIN_FALL)
+        return self.solve(self.frames.problem(thin.subset(chosen), points), _THIN_SCALE, _THIN_FALL)
 
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""

@@ -3,7 +3,7 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
 from dataclasses import replace
@@ -36,6 +36,7 @@ from sfm_shapefit.commands.stages.seed import (
 )
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
@@ -115,6 +116,8 @@ class Locating(NamedTuple):
     centers: FloatArray | None = None
     """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for those it lacks.
     None if there was no adjustment."""
+    covariances: Mapping[int, FloatArray] | None = None
+    """(3, 3) of these centers by image id, in their squared units."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -131,7 +134,11 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
             centers = known.centers[placement.cameras]
-            placement = move_cameras(placement, bring_to_scale(placement, centers), options)
+            placed = bring_to_scale(placement, centers)
+            placement = move_cameras(placement, placed, options)
+            there = np.isfinite(centers).all(axis=1)
+            scale = median_spread(centers[there]) / median_spread(placed[there])
+            placement = with_covariances(placement, model, known.covariances or {}, scale)
         kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         rule = GaugeRule(model, rigid, options, known.priors)
         gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)

@@ -170,14 +170,14 @@ class _Run(NamedTuple):
         model = self._pose(image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
         with open_source(model, inputs, options) as averaged:
-            source, centers = averaged, None
+            source, centers, covariances = averaged, None, None
             if self.options.adjust:
                 with self.clock("first placement"):
-                    rotations, centers = adjust_first_placement(averaged, options, self.clock)
+                    rotations, centers, covariances = adjust_first_placement(averaged, options, self.clock)
                 source = averaged.turned(self._pose(image_ids, rotations))
             priors = read_priors(source.model, inputs, options, None)
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(inputs, rigid, priors, centers=centers)
+            locating = Locating(inputs, rigid, priors, centers=centers, covariances=covariances)
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()

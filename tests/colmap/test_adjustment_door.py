@@ -244,7 +244,7 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
         if frame_id not in fixed:
             start.frame(frame_id).rig_from_world = coarse.frame(frame_id).rig_from_world
     tracks = truth if source == "tracks" else graph_of(truth)
-    found = adjust_thinly(start, tracks, fixed_frames=fixed)
+    found = adjust_thinly(start, tracks, fixed_frames=fixed).reconstruction
     assert found.num_points3D() == 0
     true, before, after = centers_of(truth), centers_of(start), centers_of(found)
     errors = [np.linalg.norm(fit_similarity(x, true).apply(x) - true, axis=1).mean() for x in (before, after)]

@@ -5,6 +5,8 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
@@ -22,8 +24,8 @@ from sfm_shapefit.placement.place import place
 
 def adjust_first_placement(
     source: MatchSource, options: LocateOptions, clock: Clock
-) -> tuple[FloatArray, FloatArray]:
-    """Return rotations (n, 3, 3) cam_from_world and centers (n, 3) of the images, adjusted.
+) -> tuple[FloatArray, FloatArray, Mapping[int, FloatArray]]:
+    """Return rotations (n, 3, 3) cam_from_world, centers (n, 3) and their covariances by image id, adjusted.
 
     Images that the first placement lacks keep their averaged rotations, turned as the others were on average,
     and have NaN for a center.
@@ -37,11 +39,11 @@ def adjust_first_placement(
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     located = Located(placement, everyone, unit_gauge(placement.locations))
     adjusted = adjust_thinly(*seed_and_tracks(source, located, clock.advance), options)
-    rotations, posed = rotations_of(adjusted, model.image_ids.tolist())
+    rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
-        centers[k] = adjusted.image(int(model.image_ids[k])).projection_center()
-    return _turn_the_others(model.rotations, rotations, posed), centers
+        centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
+    return _turn_the_others(model.rotations, rotations, posed), centers, adjusted.covariances
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:
