@@ -15,12 +15,12 @@ noise        e are the residuals of one group of points, for each of up to 64 gr
              generalized linear models", 1986); the residuals' own size and tails are in it.
 rotations    e is what errors of given rotations do to the pixels, where these are held by estimate; where
              they are weighted, their errors enter through P.
-calibration  e is a smooth field for each image: ten polynomials in the plane for each axis, each 1.2 times
-             the noise. Smooth errors of a lens hide for the greatest part behind centers, rotations and
+calibration  e is a smooth field for each image: ten polynomials in the plane for each axis, each of 0.45 times
+             the median error. Smooth errors of a lens hide for the greatest part behind centers, rotations and
              points, so their size cannot be estimated from the part that is seen. But whether there are any
              can be tested: the visible part of one field for all images of a lens must explain more of the
-             residuals than independent noise does. The size is what two sets with truth call for: 1.3 times
-             the noise on castle-P30, 0.8 times on lego100.
+             residuals than independent noise does. The size is what two sets with truth call for: 0.57 times
+             the median error on castle-P30, 0.3 times on lego100.
 
 The gauge is that of the adjustment: relative to the centers' mean, and to their scale and axes as far as
 nothing holds these (`covariance`).
@@ -44,8 +44,8 @@ _MOST_GROUPS = 64
 _FEWEST_OF_A_GROUP = 8
 _DEGREE = 3
 _SAMPLES = 24
-# Each smooth field of a doubted lens, of the standard deviation that right observations come to.
-_CALIBRATION_OF_NOISE = 1.2
+# Each smooth field of a doubted lens, of the median error.
+_CALIBRATION_OF_ERROR = 0.45
 # A field is visible if this share of its energy is left in the residuals.
 _VISIBLE = 0.05
 # So many standard deviations beyond noise the visible part must be for calibration to be doubted at all, and
@@ -94,7 +94,7 @@ def estimate_center_errors(
     freely = replace(problem, rotation_prior=None), replace(options, hold_rotations=False)
     evidence = _Pulls(*freely, ground_system(*freely)).test_lenses(noise2)
     doubt = float(np.interp(evidence, [_DOUBT, _CERTAIN], [0.0, 1.0]))
-    calibration_px = _CALIBRATION_OF_NOISE * float(np.sqrt(doubt * noise2))
+    calibration_px = _CALIBRATION_OF_ERROR * float(np.median(errors) * np.sqrt(doubt))
     by_group, by_sample = pulls.draw(calibration_px, turn_sigma_rad)
     _add_errors_of_priors(by_sample, problem, options, system, kappa)
     groups = max(by_group.shape[2], 2)

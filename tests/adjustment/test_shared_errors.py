@@ -86,7 +86,7 @@ def test_noise_that_neighbors_share_is_in_it(monkeypatch):
         cells = np.floor((truth.points + 1.0) * [2.5, 2.0, 2.0]).astype(int) @ [1, 5, 20]
         shared = 0.3 * rng.standard_normal((truth.num_cameras, 80, 2))
         truth = replace(truth, pixels=truth.pixels + shared[truth.cameras_seeing, cells[truth.points_seen]])
-        monkeypatch.setattr(shared_errors, "_CALIBRATION_OF_NOISE", 0.0)
+        monkeypatch.setattr(shared_errors, "_CALIBRATION_OF_ERROR", 0.0)
         found.append(ratios(truth, OPTIONS)[0])
         with monkeypatch.context() as patch:
             patch.setattr(shared_errors, "_group_neighbors", lambda points: np.arange(len(points)))
