@@ -15,9 +15,9 @@ noise        e are the residuals of one group of points, for each of up to 64 gr
              generalized linear models", 1986); the residuals' own size and tails are in it.
 rotations    e is what errors of given rotations do to the pixels, where these are held by estimate; where
              they are weighted, their errors enter through P.
-calibration  e is a smooth field for each image: ten polynomials in the plane for each axis, each of 0.45 times
-             the median error. Smooth errors of a lens hide for the greatest part behind centers, rotations and
-             points, so their size cannot be estimated from the part that is seen. But whether there are any
+calibration  e is a smooth field for each image: ten polynomials in the plane for each axis, each of 0.45
+             times the median error. Smooth errors of a lens hide for the greatest part behind centers,
+             rotations and points: their size cannot be read off the part that is seen. Whether there are any
              can be tested: the visible part of one field for all images of a lens must explain more of the
              residuals than independent noise does. The size is what two sets with truth call for: 0.57 times
              the median error on castle-P30, 0.3 times on lego100.
