@@ -229,6 +229,8 @@ class _Run:
             ending = self.lower(normal, on_iteration)
             if ending is not None:
                 return ending
+            # The next equations would else be held beside these.
+            del normal
 
     def linearize(self) -> NormalEquations:
         """Return the normal equations at the best values, and note their gradient."""
