@@ -136,7 +136,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
     if known.centers is None and is_adjusted(options, len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            source, placement, adjustment = adjust_placed(source, located, options, clock)
+            after = adjust_placed(source, directions, located, options, clock)
+            source, directions, placement, adjustment = after
             kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
             given = GivenRotations(adjustment.weight, model.reconstruction)
