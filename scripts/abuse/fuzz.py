@@ -118,7 +118,7 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
     for command in (
         (*old, *database, *poses),
         (*old, "--bundle-adjust"),
-        (*old, *database, "--refine-rotations"),
+        (*old, *database, "--rotations", "free"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
         ("locate", str(base / "openmvg/sfm_data.json"), str(out), "--overwrite", "--threads", "1", "-q"),
         (*old, *database, "--priors", str(base / "priors.txt"), "--refine-with-priors"),

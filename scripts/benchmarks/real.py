@@ -114,7 +114,7 @@ def flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--averaged",
         action="store_true",
-        help="also run on rotations from averaging, as they are and with --refine-rotations, once each",
+        help="also run on rotations from averaging, without and with the adjustment, once each",
     )
 
 
@@ -170,24 +170,19 @@ def _locate(model: Path, **options: bool) -> ours.Timed:
 
 
 def _measure_averaged(scene: Scene, folder: Path) -> tuple[Averaged, ...]:
-    """Locate on rotations from averaging, as they are and refined."""
+    """Locate on rotations from averaging, without and with the adjustment."""
     from peers.colmap import average_rotations
     from sfm_shapefit import evaluate
 
     model, truth = average_rotations(folder / "database.db", folder / "sparse" / "0"), folder / scene.truth
     measured = []
-    for refine in (False, True):
-        run = ours.time_call(
-            lambda refine=refine: ours.locate(model, folder / "database.db", refine_rotations=refine)
-        )
+    for adjust in (False, True):
+        run = ours.time_call(lambda adjust=adjust: ours.locate(model, folder / "database.db", adjust=adjust))
         rotation = evaluate(run.found.reconstruction, truth).rotation_deg
-        turned = run.found.turned_deg
         measured.append(
             Averaged(
                 scene=scene,
-                rotations=f"refined, {0 if turned is None else (turned > 0.0).sum()} cameras"
-                if refine
-                else "kept",
+                rotations="adjusted" if adjust else "kept",
                 errors=compare(run.found.reconstruction, truth),
                 rotation_deg=(rotation.median, rotation.mean, rotation.max),
                 cpu_s=run.cpu_s,
@@ -303,8 +298,7 @@ _ADJUSTED_NOTE = (
 _AVERAGED_NOTE = (
     "Rotations by pycolmap's rotation averaging of the database's relative poses (pairs of 15 matches or"
     " more), intrinsics of sparse/0, no centers; position error median / mean / max and rotation error in"
-    " degrees, once with the rotations kept and once with `--refine-rotations`. The target is that of the"
-    " kept rotations."
+    " degrees, once with `--no-adjust` and once without. The target is that of the kept rotations."
 )
 _CAVEATS = (
     "Caveats: liberty* are judged against the model that gives their rotations, which flatters every method"

@@ -97,7 +97,7 @@ class Finish(TypedDict):
 
 
 class RotationRefinement(TypedDict):
-    """What --refine-rotations changed."""
+    """What the adjustment of the placement changed of the given rotations."""
 
     num_updated: Annotated[int, "Cameras that turned."]
     num_kept: Annotated[int, "Cameras that keep the rotation of the input."]
@@ -200,7 +200,7 @@ class LocateSummary(PlacementSummary):
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
-    rotation_refinement: Annotated[RotationRefinement | None, "Null if it was not asked for."]
+    rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
 
 

@@ -18,7 +18,7 @@ from tests.program import run
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
 PAIR = 2147483647
-FAST = {"points": "never", "refine_rotations": False}
+FAST = {"points": "never"}
 
 
 def changed(scene, folder, *statements):
