@@ -50,8 +50,8 @@ def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
     sigmas = np.sqrt(np.trace(covariances.rotations, axis1=1, axis2=2) / 3.0)
     # The median of 16 estimates of a standard deviation, of three numbers each that hang together.
     assert found.chance_rad == pytest.approx(np.median(sigmas), rel=0.5)
-    # Four numbers of each point's error go into the point: the median is a little low.
-    assert found.noise_px == pytest.approx(noise_px, rel=0.2)
+    # The loss lets the better half of the errors count more, which makes its median a little smaller.
+    assert found.noise_px == pytest.approx(noise_px, rel=0.15)
 
 
 @pytest.mark.parametrize("seed", range(4))
