@@ -26,6 +26,8 @@ FIX_SOLVED = "solved"
 
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
+# With more cameras, the adjustment would take longer than all the rest.
+_MOST_ADJUSTED_CAMERAS = 2_000
 
 
 @explained
@@ -148,6 +150,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def uses_points(self, num_cameras: int) -> bool:
         """Return whether 3D points join the view graph of so many cameras."""
         return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
+
+    def adjusts_cameras(self, num_cameras: int) -> bool:
+        """Return whether placed cameras are adjusted; the optimum as it is, or with priors, is not."""
+        as_found = self.objective not in ("auto", "lud") or not self.refine or self.refine_with_priors
+        return self.adjust and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
         """Say whether 3D points join the view graph of so many cameras, and why."""

@@ -13,6 +13,7 @@ from sfm_shapefit.cli import app
 
 COMMANDS = """
     locate data_synthetic/courtyard/sparse/0 {out}/located -q
+    locate data_synthetic/ring8/sparse/0 {out}/adjusted --bundle-adjust -q
     evaluate {out}/located data_synthetic/courtyard/truth
     inspect data_synthetic/courtyard/sparse/0
     solve data_synthetic/graph40.txt {out}/solved -q

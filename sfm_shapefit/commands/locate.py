@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.adjustment import adjust_placed, is_adjusted, turned_deg
+from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
@@ -127,7 +127,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
             kept = select_trusted(placement, options.min_trust)
     located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
-    if known.centers is None and is_adjusted(options, len(placement.cameras)):
+    if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
             after = adjust_placed(source, directions, located, options, clock)
             source, directions, placement, adjustment = after

@@ -26,15 +26,6 @@ from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.viewgraph import ViewGraph
 
-# With more cameras, the adjustment would take longer than all the rest.
-_MOST_CAMERAS = 2_000
-
-
-def is_adjusted(options: LocateOptions, num_cameras: int) -> bool:
-    """Return whether placed cameras are adjusted; the optimum as it is, and what priors pulled, are not."""
-    as_found = options.objective not in ("auto", "lud") or not options.refine or options.refine_with_priors
-    return options.adjust and not as_found and num_cameras <= _MOST_CAMERAS
-
 
 def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     """Return how given rotations are treated; None: as the matches say."""
