@@ -125,7 +125,10 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
         (*old, *database, "--fix", str(base / "fix.txt")),
         ("evaluate", str(base / "opensfm/reconstruction.json"), str(base / "truth")),
         ("inspect", str(base / "bundler/bundle.out")),
-        ("map", str(base / "database.db"), str(out), "--overwrite", "--threads", "1", "-q"),
+        *(
+            ("map", str(base / "database.db"), str(out), "--overwrite", "--threads", "1", "-q", *stages)
+            for stages in strangers.STAGES_OF_MAP
+        ),
     ):
         _command(*command)
     shutil.rmtree(out)
