@@ -84,12 +84,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         0.0,
         "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
     )
-    refine_rotations: bool = option(
-        False,
-        "Refine the given rotations on the matches before cameras are placed, camera by camera where "
-        "there is evidence. For rotations from averaging; those that went through bundle adjustment "
-        "are finer already.",
-    )
     bundle_adjust: bool = option(
         False, "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."
     )
@@ -118,8 +112,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self.check_range("max_memory_mb", 0)
         if self.adjuster != "own" and not self.bundle_adjust:
             raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
-        if self.refine_rotations and self.directions == "relative-poses":
-            raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if (

@@ -6,7 +6,6 @@ Each stage is one function from values to a new value; the input is never change
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,7 +21,6 @@ from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import Rigid, find_rigid_parts, place_cameras
-from sfm_shapefit.commands.stages.rotations import refine_model_rotations
 from sfm_shapefit.commands.stages.seed import (
     Located,
     build_seeded_model,
@@ -91,13 +89,8 @@ def locate(
         inputs = choose_inputs(reconstruction, database, options.directions)
         priors_known = read_priors(model, inputs, options, priors)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
-    turned_deg = None
-    if options.refine_rotations:
-        with clock("rotations"):
-            model, turned_deg = refine_model_rotations(model, inputs, options, clock)
     with open_source(model, inputs, options) as opened:
-        found = locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
-    return found if turned_deg is None else replace(found, turned_deg=turned_deg)
+        return locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
 
 
 class Locating(NamedTuple):
@@ -136,7 +129,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
     if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            source, placement, adjustment = adjust_placed(source, located, options, clock)
+            after = adjust_placed(source, directions, located, options, clock)
+            source, directions, placement, adjustment = after
             kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
             gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
             given = GivenRotations(adjustment.weight, model.reconstruction)

@@ -79,8 +79,8 @@ class LocateResult(Displayed):
     warnings: tuple[str, ...]
     """What the user should know, a sentence each."""
     turned_deg: FloatArray | None = None
-    """(n,) by how much each rotation of the input was refined, exactly 0 where it was kept; None if
-    rotations were not to be refined."""
+    """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
+    where it was kept; None if there was none."""
     further: "tuple[FurtherPiece, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
