@@ -38,7 +38,7 @@ _BLOCK = 9
 # Observations of points that are adjusted, for each match, where keypoints are more: .45 to .66 on real sets.
 _OBSERVATIONS_OF_A_MATCH = 0.7
 # Of an observation: its track, and its part of the normal equations.
-_OBSERVATION_BYTES = 720.0
+_OBSERVATION_BYTES = 620.0
 # Unknowns of an adjusted camera, and up to how many of them their system is dense.
 _UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
 
