@@ -43,7 +43,7 @@ LARGE_LIMITS = {"CPU, s": 10.0, "peak, MB": 1500.0}
 """Of a made street of 1,000 cameras and a million observations."""
 OBSERVATIONS_OF_A_CAMERA, VIEWS = 1000, 5
 FISHEYES = ("kerry-park",)
-SETS = (*SCENES, "kerry-park")
+SETS = (*dict.fromkeys(scene.name for scene in SCENES.values()), "kerry-park")
 
 
 class Compared(NamedTuple):
