@@ -15,6 +15,7 @@ from sfm_shapefit.settings import explained, option
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 Relative = Literal["matches", "stored"]
+Rotations = Literal["auto", "measured"]
 
 LEAST_MATCHES = 15
 """Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
@@ -66,6 +67,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Let the position priors that set the scale also pull the cameras, each by its standard "
         "deviation; priors that are far off have no part.",
     )
+    rotations: Rotations = option(
+        "auto",
+        'What is thought of the given rotations: "auto" asks the matches which cameras are turned; '
+        '"measured", as by instruments, are not doubted.',
+    )
     refine_rotations: bool = option(
         False,
         "Refine the given rotations on the matches before cameras are placed, camera by camera where "
@@ -94,6 +100,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self.check_range("max_memory_mb", 0)
         if self.refine_rotations and self.directions == "relative-poses":
             raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
+        if self.refine_rotations and self.rotations == "measured":
+            raise ValueError("rotations that were measured are not refined; leave out one of the two")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if (
@@ -165,6 +173,8 @@ class MapOptions(LocateOptions):
         super().__post_init__()
         if self.directions == "tracks":
             raise ValueError("a database has no tracks; directions must be auto, matches or relative-poses")
+        if self.rotations == "measured":
+            raise ValueError("map makes rotations from the matches; rotations=measured is for locate")
         if self.min_matches:
             self.check_range("min_matches", LEAST_MATCHES)
         self.check_range("min_model_size", 3)

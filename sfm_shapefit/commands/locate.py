@@ -14,6 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras
 from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -122,10 +123,13 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement = place_cameras(measured, options, clock)
         if known.centers is not None:
             placement = move_cameras(placement, known.centers[placement.cameras], options)
+        relative = ask_pairs(source, directions, options)
+        placement = doubt_cameras(placement, directions, relative, model, options)
         kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         gauge = choose_gauge(model, placement, kept, rigid, options, known.priors)
         if known.priors is not None and options.refine_with_priors:
             placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
+            placement = doubt_cameras(placement, directions, relative, model, options)
             kept = select_trusted(placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
