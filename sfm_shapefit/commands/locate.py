@@ -14,7 +14,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
-from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras
+from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import choose_gauge, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -33,7 +33,13 @@ from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import Inputs, LocateResult
-from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.results.warnings import (
+    ambiguity_warnings,
+    focal_warnings,
+    match_warnings,
+    quality_warnings,
+    trust_warnings,
+)
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -124,6 +130,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         if known.centers is not None:
             placement = move_cameras(placement, known.centers[placement.cameras], options)
         relative = ask_pairs(source, directions, options)
+        focal_doubts = question_focal_lengths(source, directions, options)
         placement = doubt_cameras(placement, directions, relative, model, options)
         kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         gauge = choose_gauge(model, placement, kept, rigid, options, known.priors)
@@ -135,7 +142,10 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         further = place_further_pieces(source, placement, options)
     located = Located(placement, kept, gauge, rigid.fixed)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
-    warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
+    warnings = (
+        *focal_warnings(model, focal_doubts),
+        *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
+    )
     return LocateResult(
         reconstruction=seeded.reconstruction,
         inputs=known.inputs,
@@ -152,6 +162,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         warnings=warnings,
         further=further,
         fixed=rigid.fixed,
+        focal_doubts=focal_doubts,
     )
 
 
@@ -162,6 +173,7 @@ def _collect_warnings(
     yield from match_warnings(directions)
     yield from quality_warnings(located.placement)
     yield from trust_warnings(located.placement, located.kept)
+    yield from ambiguity_warnings(located.placement)
     if located.gauge.warning:
         yield located.gauge.warning
     if source.economy.statement:

@@ -16,7 +16,8 @@ enough for a camera to lose nothing. What is astray is contrary up to half of wh
 twice of it: a camera that many pairs hold is not left out for repeated structure in others. Where rotations
 are not to be doubted, f = 1.
 
-hold' is half where the pairs leave 20 % of the scene open, twice what it takes without the rotations of the pairs: a standard deviation is drawn from residuals that wrong pairs widen, and these are known better here.
+hold' is half where the pairs leave 20 % of the scene open, twice what it takes without their rotations: a
+standard deviation is drawn from residuals that wrong pairs widen, and these are known better here.
 """
 
 from dataclasses import replace

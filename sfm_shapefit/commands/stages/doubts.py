@@ -11,9 +11,10 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.relative_rotations import concatenate, estimate_relative_rotations
 from sfm_shapefit.commands.stages.inputs import MatchSource
-from sfm_shapefit.directions.matches import MatchBatch, RayMatches
+from sfm_shapefit.directions.matches import MatchBatch, RayMatches, join_rays
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
+from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
 from sfm_shapefit.judgement.turns import find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import Placement
@@ -28,6 +29,12 @@ _DOUBTFUL_SHARE = 0.1
 # Pairs of each camera that are asked at most, those of most matches, and matches of a pair.
 _MOST_PAIRS = 40
 _MOST_MATCHES = 150
+# Of the focal lengths: cameras that are asked at most, their pairs in all, those of each two cameras at most,
+# and matches of a pair at least and at most.
+_MOST_CAMERAS = 200
+_FOCAL_PAIRS = 240
+_PAIRS_OF_TWO = 60
+_FOCAL_MATCHES = (20, 60)
 # Within this angle a direction agrees with the solution, whatever its standard deviation.
 _AGREEING_DEG = 3.0
 
@@ -45,7 +52,7 @@ def ask_pairs(
     parts = []
     for batch in source.batches():
         rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
-        rays = _thin(source.model, batch, rows)
+        rays = _thin(source.model, batch, rows, _MOST_MATCHES)
         parts.append(estimate_relative_rotations(rays, options.num_threads()))
     return concatenate(parts)
 
@@ -83,6 +90,50 @@ def doubt_cameras(
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
 
 
+def question_focal_lengths(
+    source: MatchSource, directions: PairDirections, options: LocateOptions
+) -> tuple[FocalDoubt, ...]:
+    """Return the cameras whose matches prefer another focal length; their labels are COLMAP's camera ids.
+
+    Only where several cameras took the images: a single one has nothing to be compared with.
+    """
+    model = source.model
+    images = [model.reconstruction.image(i) for i in model.image_ids.tolist()]
+    ids, labels = np.unique([image.camera_id for image in images], return_inverse=True)
+    if source.kind != "matches" or not 1 < len(ids) <= _MOST_CAMERAS:
+        return ()
+    kinds = [model.camera(k).model_name for k in range(model.num_images)]
+    lenses = Lenses(
+        labels.ravel().astype(np.int64),
+        model.focal_lengths_px,
+        np.array(["FISHEYE" in kind or "EQUIRECTANGULAR" in kind for kind in kinds]),
+    )
+    chosen = _pairs_of_cameras(directions, lenses.camera_of)
+    wanted = {tuple(pair) for pair in directions.pairs[chosen].tolist()}
+    parts = []
+    for batch in source.batches():
+        rows = np.flatnonzero([tuple(pair) in wanted for pair in batch.pairs.tolist()])
+        parts.append(_thin(model, batch, rows, _FOCAL_MATCHES[1]))
+    found = doubt_focal_lengths(join_rays(parts), model.rotations, lenses, options.num_threads())
+    return tuple(doubt._replace(camera=int(ids[doubt.camera])) for doubt in found)
+
+
+def _pairs_of_cameras(directions: PairDirections, camera_of: IntArray) -> IntArray:
+    """Return the pairs that are asked of focal lengths: of each two cameras those of most matches.
+
+    Pairs of images of one camera take part, too. They say less, but what they say does not hang on another.
+    """
+    cameras = np.sort(camera_of[directions.pairs], axis=1)
+    enough = np.flatnonzero(directions.num_matches >= _FOCAL_MATCHES[0])
+    key = cameras[enough, 0] * (int(camera_of.max(initial=0)) + 1) + cameras[enough, 1]
+    order = np.lexsort((-directions.num_matches[enough], key))
+    rank = np.arange(len(order)) - np.searchsorted(key[order], key[order])
+    # The best pair of each two cameras first, then the second, until there are enough.
+    ranked = order[np.lexsort((np.arange(len(order)), rank))]
+    count = min(int(np.sum(rank < _PAIRS_OF_TWO)), _FOCAL_PAIRS)
+    return np.asarray(enough[ranked[:count]])
+
+
 def _doubtful_pairs(directions: PairDirections, num_images: int) -> BoolArray:
     """Return which pairs are asked, (k,): those of doubtful cameras."""
     counts = directions.num_matches.astype(np.float64)
@@ -104,10 +155,10 @@ def _strongest(directions: PairDirections, num_images: int) -> BoolArray:
     return np.asarray((rank < _MOST_PAIRS).reshape(2, -1).any(axis=0))
 
 
-def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray) -> RayMatches:
+def _thin(model: PosedModel, batch: MatchBatch, rows: IntArray, most: int) -> RayMatches:
     """Return some pairs with at most so many matches, taken evenly, their rays in camera axes."""
     counts = np.diff(batch.offsets)[rows]
-    taken = np.minimum(counts, _MOST_MATCHES)
+    taken = np.minimum(counts, most)
     offsets = np.append(0, np.cumsum(taken))
     position = np.arange(offsets[-1]) - np.repeat(offsets[:-1], taken)
     chosen = np.repeat(batch.offsets[:-1][rows], taken) + position * np.repeat(counts, taken) // np.repeat(
