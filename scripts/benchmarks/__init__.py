@@ -8,6 +8,7 @@ INDEX = {
     "answers": "What every command answers: recorded, and compared with an earlier recording.",
     "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
     "directions": "Directions from matches: speed, memory and calibration.",
+    "doubt": "Turned cameras and wrong focal lengths on real and bundled scenes: found, and no others.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",
@@ -19,6 +20,5 @@ INDEX = {
     "scale": "Large graphs of four families: time, iterations, memory and rigid pieces as they grow.",
     "solver": "The Newton solver beside cvxpy and Clarabel on G(n, 1/2), and on real graphs.",
     "start": "The first run of each command in a fresh environment, as a clone and from the wheel.",
-    "doubt": "Turned cameras and wrong focal lengths on real and bundled scenes: found, and no others.",
     "trust": "Standard deviations and trust against errors; wrong rotations recognized.",
 }
