@@ -1,17 +1,18 @@
 """Doubt: are cameras with wrong rotations or focal lengths found, and right ones kept?
 
-Cameras of scenes are turned by 2, 5, 20 and 180 degrees about random axes: one by one, and where a scene has
-15 cameras or more, in groups of five that agree among themselves (a camera and those it shares most inlier
-matches with, all turned alike). A turned camera counts as kept if it is placed with a trust above 0.6. Each
-scene is also run as it is; there a camera is right if its rotation is within 5 degrees of the truth, after the
-best common rotation, and a right camera is blamed if it was placed and is left out for want of trust.
+Cameras of scenes are turned by 2, 5, 20 and 180 degrees about random axes: one by one, and where a scene
+has 15 cameras or more, in groups of five that agree among themselves (a camera and those it shares most
+inlier matches with, all turned alike). A turned camera counts as kept if it is placed with a trust above
+0.6. Each scene is also run as it is; there a camera is right if its rotation is within 5 degrees of the
+truth, after the best common rotation, and a right camera is blamed if it was placed and is left out for want
+of trust.
 
 Focal lengths: a third of the images of a scene, or those of one of its cameras, get a camera of their own
-whose focal length is off by 10, 30 or 140 %. It is named if it is the first that is doubted; any other that is
-named is named falsely. Each scene is asked without an error, too.
+whose focal length is off by 10, 30 or 140 %. It is named if it is the first that is doubted; any other that
+is named is named falsely. Each scene is asked without an error, too.
 
-The scenes at hand were used for choosing the constants of `judgement.turns` and `judgement.focal_lengths`; the
-drawn ones, of whose houses half look the same, were not.
+The scenes at hand were used for choosing the constants of `judgement.turns` and `judgement.focal_lengths`;
+the drawn ones, of whose houses half look the same, were not.
 """
 
 import argparse
@@ -261,7 +262,7 @@ def change_focal_lengths(scene: Scene) -> Focal:
 
 
 def change_camera(model: "PosedModel", images: "IntArray", factor: float) -> "tuple[PosedModel, int]":
-    """Return a model some of whose images have a camera of their own, its focal length changed, and its id."""
+    """Return a model some of whose images have a camera of their own, of another focal length, and its id."""
     from sfm_shapefit.colmap.model import from_posed_cameras, posed_cameras
 
     scene = posed_cameras(model)

@@ -8,11 +8,12 @@ which factor fits best (`rotations.two_view_poses`):
 
     gain(camera, factor) = mean over its pairs of W(factor) - W(1)
 
-A camera is named if the gain of the best factor is above 0.03 and above four of its standard errors over the
-pairs, and the factor differs from 1 by 5 % or more. One wrong camera makes others seem wrong, those that have
-pairs with it: the camera whose factor mends most pairs is named first, gets that focal length, and the others
-are asked again. Chosen on five scenes, of whose images a third, or those of one camera, got a focal length
-off by 10 to 140 %.
+A camera is named if over its pairs with other cameras the gain of the best factor is above 0.03 and above
+four of its standard errors, if over the pairs of its own images the loss is not above 0.01, and if the
+factor differs from 1 by 5 % or more. One wrong camera makes others seem wrong, those that have pairs with
+it: the camera whose factor gains most in all is named first, gets that focal length, and the others are asked
+again. Chosen on five scenes, of whose images a third, or those of one camera, got a focal length off by 10 to
+140 %.
 
 Residuals are in pixels of the image with the larger focal length: in those of the other, a shorter focal
 length would always fit better.
@@ -33,6 +34,7 @@ _COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
 _FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)
 _LEAST_GAIN, _LEAST_RATIO = 0.03, 4.0
 _LEAST_CHANGE = 0.05
+_MOST_LOSS = 0.01
 _FEWEST_PAIRS = 5
 _MOST_NAMED = 5
 
@@ -100,9 +102,9 @@ def _ask(asked: _Asked, factors: FloatArray, camera: int) -> FocalDoubt | None:
     """Return what the pairs of a camera prefer to its given focal length, if they do."""
     of_images = asked.lenses.camera_of[asked.rays.pairs]
     rows = np.flatnonzero((of_images == camera).any(axis=1))
-    if len(rows) < _FEWEST_PAIRS or not (of_images[rows] != camera).any():
+    if np.sum((of_images[rows] != camera).any(axis=1)) < _FEWEST_PAIRS:
         return None
-    part = _subset(asked.rays, rows)
+    part, is_mixed = _subset(asked.rays, rows), (of_images[rows] != camera).any(axis=1)
 
     def fit(factor: float) -> FloatArray:
         tried = factors.copy()
@@ -112,12 +114,13 @@ def _ask(asked: _Asked, factors: FloatArray, camera: int) -> FocalDoubt | None:
     given = fit(1.0)
     shares = {factor: fit(factor) for factor in _COARSE}
     best = max(shares, key=lambda factor: float(shares[factor].mean()))
-    if not _is_clear(shares[best] - given):
+    if not _is_clear((shares[best] - given)[is_mixed]):
         return None
     shares |= {best * step: fit(best * step) for step in _FINE_STEPS}
     best = max(shares, key=lambda factor: float(shares[factor].mean()))
     gain = shares[best] - given
-    if abs(best - 1.0) < _LEAST_CHANGE or not _is_clear(gain):
+    is_loss = bool((~is_mixed).any()) and float(gain[~is_mixed].mean()) < -_MOST_LOSS
+    if abs(best - 1.0) < _LEAST_CHANGE or is_loss or not _is_clear(gain[is_mixed]):
         return None
     return FocalDoubt(camera, best, float(gain.mean()), len(rows))
 

@@ -29,10 +29,10 @@ _DOUBTFUL_SHARE = 0.1
 # Pairs of each camera that are asked at most, those of most matches, and matches of a pair.
 _MOST_PAIRS = 40
 _MOST_MATCHES = 150
-# Of the focal lengths: cameras that are asked at most, their pairs in all, those of each two cameras at most,
-# and matches of a pair at least and at most.
+# Of the focal lengths: cameras that are asked at most, about their pairs in all, and those of each at least,
+# each two cameras at most, and matches of a pair at least and at most.
 _MOST_CAMERAS = 200
-_FOCAL_PAIRS = 240
+_FOCAL_PAIRS, _FEWEST_FOCAL_PAIRS = 300, 8
 _PAIRS_OF_TWO = 60
 _FOCAL_MATCHES = (20, 60)
 # Within this angle a direction agrees with the solution, whatever its standard deviation.
@@ -119,19 +119,27 @@ def question_focal_lengths(
 
 
 def _pairs_of_cameras(directions: PairDirections, camera_of: IntArray) -> IntArray:
-    """Return the pairs that are asked of focal lengths: of each two cameras those of most matches.
+    """Return the pairs that are asked of focal lengths, some of each camera, of most matches first.
 
     Pairs of images of one camera take part, too. They say less, but what they say does not hang on another.
     """
     cameras = np.sort(camera_of[directions.pairs], axis=1)
     enough = np.flatnonzero(directions.num_matches >= _FOCAL_MATCHES[0])
-    key = cameras[enough, 0] * (int(camera_of.max(initial=0)) + 1) + cameras[enough, 1]
-    order = np.lexsort((-directions.num_matches[enough], key))
-    rank = np.arange(len(order)) - np.searchsorted(key[order], key[order])
-    # The best pair of each two cameras first, then the second, until there are enough.
-    ranked = order[np.lexsort((np.arange(len(order)), rank))]
-    count = min(int(np.sum(rank < _PAIRS_OF_TWO)), _FOCAL_PAIRS)
-    return np.asarray(enough[ranked[:count]])
+    counts, cameras = directions.num_matches[enough], cameras[enough]
+    num_cameras = int(camera_of.max(initial=0)) + 1
+    rank = _rank_within(cameras[:, 0] * num_cameras + cameras[:, 1], -counts)
+    # The best pair of each two cameras first, then the second, until a camera has enough.
+    by_camera = _rank_within(cameras.T.ravel(), np.tile(rank, 2), np.tile(-counts, 2)).reshape(2, -1)
+    quota = max(_FOCAL_PAIRS // num_cameras, _FEWEST_FOCAL_PAIRS)
+    return np.asarray(enough[(rank < _PAIRS_OF_TWO) & (by_camera < quota).any(axis=0)])
+
+
+def _rank_within(labels: IntArray, *keys: IntArray) -> IntArray:
+    """Return the rank of each entry among those of its label, by the keys, the first one first."""
+    order = np.lexsort((*keys[::-1], labels))
+    ranks = np.empty(len(labels), dtype=np.int64)
+    ranks[order] = np.arange(len(order)) - np.searchsorted(labels[order], labels[order])
+    return ranks
 
 
 def _doubtful_pairs(directions: PairDirections, num_images: int) -> BoolArray:
@@ -142,16 +150,12 @@ def _doubtful_pairs(directions: PairDirections, num_images: int) -> BoolArray:
     total = np.bincount(ends, np.repeat(counts, 2), num_images)
     share = np.bincount(ends, np.repeat(counts * poor, 2), num_images) / np.maximum(total, 1.0)
     chosen = (share[directions.pairs] > _DOUBTFUL_SHARE).any(axis=1)
-    return np.asarray(chosen & (counts >= _LEAST_MATCHES) & _strongest(directions, num_images))
+    return np.asarray(chosen & (counts >= _LEAST_MATCHES) & _strongest(directions))
 
 
-def _strongest(directions: PairDirections, num_images: int) -> BoolArray:
+def _strongest(directions: PairDirections) -> BoolArray:
     """Return which pairs are among those of most matches of one of their cameras, (k,)."""
-    ends, counts = directions.pairs.T.ravel(), np.tile(directions.num_matches, 2)
-    order = np.lexsort((-counts, ends))
-    first = np.searchsorted(ends[order], np.arange(num_images))
-    rank: IntArray = np.empty(len(ends), dtype=np.int64)
-    rank[order] = np.arange(len(ends)) - first[ends[order]]
+    rank = _rank_within(directions.pairs.T.ravel(), np.tile(-directions.num_matches, 2))
     return np.asarray((rank < _MOST_PAIRS).reshape(2, -1).any(axis=0))
 
 
