@@ -8,12 +8,12 @@ which factor fits best (`rotations.two_view_poses`):
 
     gain(camera, factor) = mean over its pairs of W(factor) - W(1)
 
-A camera is named if over its pairs with other cameras the gain of the best factor is above 0.03 and above
-four of its standard errors, if over the pairs of its own images the loss is not above 0.01, and if the
-factor differs from 1 by 5 % or more. One wrong camera makes others seem wrong, those that have pairs with
-it: the camera whose factor gains most in all is named first, gets that focal length, and the others are asked
-again. Chosen on five scenes, of whose images a third, or those of one camera, got a focal length off by 10 to
-140 %.
+A camera is named if over its pairs with other cameras the gain of the best factor is above 0.03 and the
+pairs that gain 0.01 or more outnumber those that lose as much by three standard deviations of a fair coin, if
+the pairs of its own images do not lose as clearly, and if the factor differs from 1 by 5 % or more. One wrong
+camera makes others seem wrong, those that have pairs with it: the camera whose factor gains most in all is
+named first, gets that focal length, and those that were doubted with it are asked again. Chosen on five
+scenes, of whose images a third, or those of one camera, got a focal length off by 10 to 140 %.
 
 Residuals are in pixels of the image with the larger focal length: in those of the other, a shorter focal
 length would always fit better.
@@ -32,9 +32,8 @@ from sfm_shapefit.rotations.two_view_poses import refine_two_view_poses
 
 _COARSE = (0.42, 0.6, 0.77, 0.9, 1.1, 1.3, 1.7, 2.4)
 _FINE_STEPS = (0.85, 0.9, 0.95, 1.05, 1.1, 1.18)
-_LEAST_GAIN, _LEAST_RATIO = 0.03, 4.0
+_LEAST_GAIN, _NOTICED, _LEAST_SIGMAS = 0.03, 0.01, 3.0
 _LEAST_CHANGE = 0.05
-_MOST_LOSS = 0.01
 _FEWEST_PAIRS = 5
 _MOST_NAMED = 5
 
@@ -78,14 +77,16 @@ def doubt_focal_lengths(
     factors = np.ones(int(lenses.camera_of.max(initial=-1)) + 1)
     asked = _Asked(rays, rotations, lenses, threads)
     found: list[FocalDoubt] = []
-    while len(found) < min(_MOST_NAMED, len(factors) - 1):
-        doubts = [_ask(asked, factors, camera) for camera in range(len(factors)) if factors[camera] == 1.0]
-        named = [doubt for doubt in doubts if doubt is not None]
-        if not named:
+    open_questions = np.arange(len(factors))
+    while len(open_questions) and len(found) < min(_MOST_NAMED, len(factors) - 1):
+        # Only what was doubted at first is asked again: a right focal length makes no other one look wrong.
+        doubts = _ask(asked, factors, open_questions)
+        if not doubts:
             break
-        worst = max(named, key=lambda doubt: doubt.gain * doubt.num_pairs)
+        worst = max(doubts, key=lambda doubt: doubt.gain * doubt.num_pairs)
         factors[worst.camera] = worst.factor
         found.append(worst)
+        open_questions = np.array([doubt.camera for doubt in doubts if doubt.camera != worst.camera])
     return tuple(found)
 
 
@@ -98,51 +99,65 @@ class _Asked(NamedTuple):
     threads: int
 
 
-def _ask(asked: _Asked, factors: FloatArray, camera: int) -> FocalDoubt | None:
-    """Return what the pairs of a camera prefer to its given focal length, if they do."""
+def _ask(asked: _Asked, factors: FloatArray, cameras: IntArray) -> list[FocalDoubt]:
+    """Return what the pairs of some cameras prefer to the given focal lengths, where they do."""
     of_images = asked.lenses.camera_of[asked.rays.pairs]
-    rows = np.flatnonzero((of_images == camera).any(axis=1))
-    if np.sum((of_images[rows] != camera).any(axis=1)) < _FEWEST_PAIRS:
-        return None
-    part, is_mixed = _subset(asked.rays, rows), (of_images[rows] != camera).any(axis=1)
+    shared, rows = np.nonzero((of_images[None] == cameras[:, None, None]).any(axis=2))
+    asking = cameras[shared]
+    is_mixed = (of_images[rows] != asking[:, None]).any(axis=1)
+    enough = np.bincount(shared, is_mixed, len(cameras)) >= _FEWEST_PAIRS
+    rows, asking, is_mixed = (column[enough[shared]] for column in (rows, asking, is_mixed))
+    if len(rows) == 0:
+        return []
+    part = asked._replace(rays=_subset(asked.rays, rows))
+    own = of_images[rows] == asking[:, None]
 
-    def fit(factor: float) -> FloatArray:
-        tried = factors.copy()
-        tried[camera] = factor
-        return _weight_shares(asked._replace(rays=part), tried)
+    def fit(tried: FloatArray) -> FloatArray:
+        """Return the weight shares if the asking camera of each row has such a factor."""
+        return _weight_shares(part, np.where(own, tried[:, None], factors[of_images[rows]]))
 
-    given = fit(1.0)
-    shares = {factor: fit(factor) for factor in _COARSE}
-    best = max(shares, key=lambda factor: float(shares[factor].mean()))
-    if not _is_clear((shares[best] - given)[is_mixed]):
-        return None
-    shares |= {best * step: fit(best * step) for step in _FINE_STEPS}
-    best = max(shares, key=lambda factor: float(shares[factor].mean()))
-    gain = shares[best] - given
-    is_loss = bool((~is_mixed).any()) and float(gain[~is_mixed].mean()) < -_MOST_LOSS
-    if abs(best - 1.0) < _LEAST_CHANGE or is_loss or not _is_clear(gain[is_mixed]):
-        return None
-    return FocalDoubt(camera, best, float(gain.mean()), len(rows))
+    given = fit(np.ones(len(rows)))
+    gains = {factor: fit(np.full(len(rows), factor)) - given for factor in _COARSE}
+    best = dict.fromkeys(cameras[enough].tolist(), 1.0)
+    for camera in best:
+        best[camera] = max(gains, key=lambda factor: float(gains[factor][asking == camera].mean()))
+    clear = {
+        camera: factor
+        for camera, factor in best.items()
+        if _is_clear(gains[factor][(asking == camera) & is_mixed])
+    }
+    doubts = []
+    for camera, coarse in clear.items():
+        chosen = np.flatnonzero(asking == camera)
+        alone = part._replace(rays=_subset(part.rays, chosen))
+        finer = {coarse: gains[coarse][chosen]}
+        for step in _FINE_STEPS:
+            tried = np.where(own[chosen], coarse * step, factors[of_images[rows[chosen]]])
+            finer[coarse * step] = _weight_shares(alone, tried) - given[chosen]
+        factor = max(finer, key=lambda one: float(finer[one].mean()))
+        gain, mixed = finer[factor], is_mixed[chosen]
+        if abs(factor - 1.0) >= _LEAST_CHANGE and _is_clear(gain[mixed]) and not _is_clear(-gain[~mixed]):
+            doubts.append(FocalDoubt(camera, factor, float(gain.mean()), len(chosen)))
+    return doubts
 
 
 def _is_clear(gains: FloatArray) -> bool:
-    """Return whether the mean of the gains (k,) of pairs is large, and larger than chance makes it."""
-    mean = float(gains.mean())
-    return mean > _LEAST_GAIN and mean > _LEAST_RATIO * float(gains.std()) / np.sqrt(len(gains))
+    """Return whether the mean of the gains (k,) of pairs is large, and clearly more gain than lose."""
+    up, down = int(np.sum(gains > _NOTICED)), int(np.sum(gains < -_NOTICED))
+    large = up > 0 and float(gains.mean()) > _LEAST_GAIN
+    return large and up - down > _LEAST_SIGMAS * float(np.sqrt(up + down))
 
 
 def _weight_shares(asked: _Asked, factors: FloatArray) -> FloatArray:
-    """Return the weight share of each pair, (k,), if the focal lengths were these times the given ones."""
+    """Return the weight share of each pair, (k,), for focal lengths that are factors (k, 2) as large."""
     rays, lenses = asked.rays, asked.lenses
     counts = np.diff(rays.offsets)
-    scale = factors[lenses.camera_of]
     i, j = rays.pairs.T
     rays_i, rays_j = (
-        _spread(own, np.repeat(scale[side], counts), np.repeat(lenses.is_angular[side], counts))
-        for own, side in ((rays.rays_i, i), (rays.rays_j, j))
+        _spread(own, np.repeat(factor, counts), np.repeat(lenses.is_angular[side], counts))
+        for own, factor, side in ((rays.rays_i, factors[:, 0], i), (rays.rays_j, factors[:, 1], j))
     )
-    focal_lengths = scale * lenses.focal_lengths_px
-    pixel_angles = 1.0 / np.maximum(focal_lengths[i], focal_lengths[j])
+    pixel_angles = 1.0 / (factors * lenses.focal_lengths_px[rays.pairs]).max(axis=1)
     rotations = asked.rotations[j] @ asked.rotations[i].transpose(0, 2, 1)
     turned = np.einsum("kab,kb->ka", np.repeat(rotations, counts, axis=0), rays_i)
     columns = {"pairs": rays.pairs, "offsets": rays.offsets, "pixel_angles": pixel_angles}

@@ -29,8 +29,8 @@ _DOUBTFUL_SHARE = 0.1
 # Pairs of each camera that are asked at most, those of most matches, and matches of a pair.
 _MOST_PAIRS = 40
 _MOST_MATCHES = 150
-# Of the focal lengths: cameras that are asked at most, about their pairs in all, and those of each at least,
-# each two cameras at most, and matches of a pair at least and at most.
+# Of the focal lengths: cameras that are asked at most; pairs, about, and of each camera at least; pairs of
+# each two cameras at most; matches of a pair at least and at most.
 _MOST_CAMERAS = 200
 _FOCAL_PAIRS, _FEWEST_FOCAL_PAIRS = 300, 8
 _PAIRS_OF_TWO = 60
