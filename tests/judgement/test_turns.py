@@ -93,11 +93,21 @@ def test_the_cameras_of_a_frame_are_judged_together():
     assert [k for k, kind in enumerate(found.kinds) if kind is Doubt.TURNED] == [0, 6]
 
 
-def test_a_majority_is_not_turned_for_the_sake_of_a_few():
+def test_a_majority_is_not_turned_for_the_sake_of_a_few_even_if_these_share_no_pairs():
     turns = np.tile(np.eye(3), (10, 1, 1))
     turns[6:] = turn(np.array([1.0, 0.0, 0.0]), 30.0)
-    kinds = find_turned(measured_turns(turns, 7), np.arange(10)).kinds
+    pairs = [pair for pair in all_pairs(10) if min(pair) < 6]
+    kinds = find_turned(measured_turns(turns, 7, pairs), np.arange(10)).kinds
     assert kinds == (Doubt.RIGHT,) * 6 + (Doubt.TURNED,) * 4
+
+
+def test_who_sees_only_turned_cameras_is_right_once_these_are_turned_back():
+    turns = np.tile(np.eye(3), (12, 1, 1))
+    turns[[2, 3, 5, 7]] = turn(np.array([0.0, 0.6, 0.8]), 20.0)
+    pairs = [(i, j) for i, j in all_pairs(12) if j < 11 or i in (2, 3, 5, 7)]
+    kinds = find_turned(measured_turns(turns, 9, pairs), np.arange(12)).kinds
+    assert kinds[11] is Doubt.RIGHT
+    assert [k for k, kind in enumerate(kinds) if kind is Doubt.TURNED] == [2, 3, 5, 7]
 
 
 def test_pairs_are_weighed_by_rotation_fit_and_direction():
