@@ -105,7 +105,7 @@ def test_who_sees_only_turned_cameras_is_right_once_these_are_turned_back():
     turns = np.tile(np.eye(3), (12, 1, 1))
     turns[[2, 3, 5, 7]] = turn(np.array([0.0, 0.6, 0.8]), 20.0)
     # Cameras 0 and 11: one is the first of its pairs, one the second.
-    pairs = [(i, j) for i, j in all_pairs(12) if 0 < i and j < 11 or {i, j} & {2, 3, 5, 7}]
+    pairs = [(i, j) for i, j in all_pairs(12) if (i > 0 and j < 11) or {i, j} & {2, 3, 5, 7}]
     kinds = find_turned(measured_turns(turns, 9, pairs), np.arange(12)).kinds
     assert kinds[0] is kinds[11] is Doubt.RIGHT
     assert [k for k, kind in enumerate(kinds) if kind is Doubt.TURNED] == [2, 3, 5, 7]
