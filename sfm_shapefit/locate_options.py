@@ -77,8 +77,9 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     )
     rotations: Rotations = option(
         "auto",
-        'What to make of the given rotations in an adjustment: "measured" holds them, "free" forgets them; '
-        '"auto" estimates their standard deviation from the matches, and holds them where that is nothing.',
+        'What to make of the given rotations: "measured", as by instruments, are held and not doubted; '
+        '"free" are forgotten by the adjustment; "auto" asks the matches how far off they are, and which '
+        "cameras are turned.",
     )
     rotation_sigma_deg: float = option(
         0.0,
@@ -128,7 +129,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError(
                 f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
             )
-        said = self.rotation_sigma_deg or self.rotations != "auto"
+        said = self.rotation_sigma_deg or self.rotations == "free"
         if said and not (self.adjust or self.bundle_adjust):
             raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
 

@@ -16,6 +16,7 @@ from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
@@ -32,9 +33,16 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import Inputs, LocateResult
-from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.results.warnings import (
+    ambiguity_warnings,
+    focal_warnings,
+    match_warnings,
+    quality_warnings,
+    trust_warnings,
+)
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -120,26 +128,31 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         if known.centers is not None:
             centers = known.centers[placement.cameras]
             placement = move_cameras(placement, bring_to_scale(placement, centers), options)
-        kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         rule = GaugeRule(model, rigid, options, known.priors)
-        gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
-        if known.priors is not None and options.refine_with_priors:
-            placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
-            kept = select_trusted(placement, options.min_trust)
-    located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
+    adjustment, given = None, None
     if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            after = adjust_placed(source, directions, located, options, clock)
+            after = adjust_placed(source, directions, _choose(placement, rule), options, clock)
             source, directions, placement, adjustment = after
-            kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
             given = GivenRotations(adjustment.weight, model.reconstruction)
-            located = Located(placement, kept, gauge, rigid.fixed, rule, given)
+    with clock("trust"):
+        relative = ask_pairs(source, directions, options)
+        focal_doubts = question_focal_lengths(source, directions, options)
+        placement = doubt_cameras(placement, directions, relative, source.model, options)
+        located = _choose(placement, rule)._replace(given=given)
+        if known.priors is not None and options.refine_with_priors:
+            placement, gauge = pull_to_priors(placement, located.gauge, known.priors, options)
+            placement = doubt_cameras(placement, directions, relative, source.model, options)
+            kept = select_trusted(placement, options.min_trust)
+            located = Located(placement, kept, gauge, rigid.fixed, rule)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     located = located._replace(gauge=seeded.gauge)
-    warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
+    warnings = (
+        *focal_warnings(model, focal_doubts),
+        *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
+    )
     return LocateResult(
         reconstruction=seeded.reconstruction,
         inputs=known.inputs,
@@ -147,7 +160,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         model=source.model,
         directions=directions,
         placement=placement,
-        kept=kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
+        kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
         agreeing_observations=seeded.agreeing_observations,
         gauge=seeded.gauge,
@@ -158,7 +171,16 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         warnings=warnings,
         further=further,
         fixed=rigid.fixed,
+        focal_doubts=focal_doubts,
     )
+
+
+def _choose(placement: Placement, rule: GaugeRule) -> Located:
+    """Return which of the placed cameras are in the output, and in which gauge."""
+    fixed = rule.rigid.fixed
+    kept = select_trusted(placement, rule.options.min_trust) | fixed[placement.cameras]
+    gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
+    return Located(placement, kept, gauge, fixed, rule)
 
 
 def _collect_warnings(
@@ -168,6 +190,7 @@ def _collect_warnings(
     yield from match_warnings(directions)
     yield from quality_warnings(located.placement)
     yield from trust_warnings(located.placement, located.kept)
+    yield from ambiguity_warnings(located.placement)
     if located.gauge.warning:
         yield located.gauge.warning
     if source.economy.statement:
