@@ -57,9 +57,8 @@ def main(images: Path, out: Path, focal_length_px: float | None = None) -> pycol
     match(images, database, focal_length_px)
     rotations = average_rotations(database)
 
-    # Averaged rotations are a few tenths of a degree off: let the matches refine them first.
-    options = sfm_shapefit.LocateOptions(refine_rotations=True)
-    found = sfm_shapefit.locate(rotations, database, options=options)
+    # Averaged rotations are a few tenths of a degree off; the adjustment after placing finds that out itself.
+    found = sfm_shapefit.locate(rotations, database)
     sfm_shapefit.write_result(found, out / "located")
     for warning in found.warnings:
         print(f"warning: {warning}")

@@ -201,6 +201,38 @@ def _multiply_in_lanes(
     return types.void(panel, number, number, vectors, number, number, sums), generate
 
 
+def _subtract_block(_context: Any, spread: Any, rows: Any, _row: Any, blocks: Any, _block: Any) -> Any:
+    """Type `subtract_block` and generate its code."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        integer = context.get_value_type(types.int64)
+        number = context.get_value_type(types.float64)
+        lanes = ir.VectorType(number, 4)
+        left, right, out = (
+            context.make_array(signature.args[k])(context, builder, arguments[k]).data for k in (0, 1, 3)
+        )
+        right = builder.gep(right, [builder.mul(arguments[2], integer(18))])
+        out = builder.gep(out, [builder.mul(arguments[4], integer(36))])
+
+        def place(data: Any, at: int) -> Any:
+            return builder.bitcast(builder.gep(data, [integer(at)]), lanes.as_pointer())
+
+        factors = []
+        for k in range(3):
+            low, high = (builder.load(place(right, 6 * k + c), align=8) for c in (0, 2))
+            factors.append((low, builder.shuffle_vector(high, low, _indices((2, 3, 4, 5))), high))
+        for t in range(9):
+            total = None
+            for k in range(3):
+                product = builder.fmul(builder.load(place(left, 36 * k + 4 * t), align=8), factors[k][t % 3])
+                total = product if total is None else builder.fadd(total, product)
+            here = place(out, 4 * t)
+            builder.store(builder.fsub(builder.load(here, align=8), total), here, align=8)
+        return context.get_dummy_value()
+
+    return types.void(spread, rows, types.int64, blocks, types.int64), generate
+
+
 def _indices(numbers: Iterable[int]) -> ir.Constant:
     """Return the mask of a shuffle."""
     indices = list(numbers)
@@ -214,6 +246,15 @@ multiply_in_lanes = intrinsic(_multiply_in_lanes)
 count of panel[at + q leading + i] vectors[k, start + i]. A sum in the written order cannot use the vectors of
 a processor. These sums do, and have one order on all of them. `panel` (.,), `vectors` (3, .) and `sums` (3,
 4) are contiguous and of one type, float32 or float64.
+"""
+
+
+subtract_block = intrinsic(_subtract_block)
+"""In a kernel: subtract the product A^T B of two 3 x 6 matrices from a 6 x 6 block, in lanes.
+
+`subtract_block(spread, rows, k, blocks, q)` subtracts from `blocks[q]` the product whose B is `rows[k]`. Its
+entries are ((A_0a B_0c + A_1a B_1c) + A_2a B_2c), and `spread[k, 6 a + c]` is A_ka. `spread` (3, 36), `rows`
+(., 3, 6) and `blocks` (., 6, 6) are float64 and contiguous.
 """
 
 

@@ -26,6 +26,8 @@ FIX_SOLVED = "solved"
 
 # With more cameras, the points would multiply the time of the solve.
 _MAX_CAMERAS_WITH_POINTS = 5_000
+# With more cameras, the adjustment would take longer than all the rest.
+_MOST_ADJUSTED_CAMERAS = 2_000
 
 
 @explained
@@ -75,18 +77,13 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     )
     rotations: Rotations = option(
         "auto",
-        'What to make of the given rotations in an adjustment: "measured" holds them, "free" forgets them; '
-        '"auto" estimates their standard deviation from the matches, and holds them where that is nothing.',
+        'What to make of the given rotations: "measured", as by instruments, are held and not doubted; '
+        '"free" are forgotten by the adjustment; "auto" asks the matches how far off they are, and which '
+        "cameras are turned.",
     )
     rotation_sigma_deg: float = option(
         0.0,
         "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
-    )
-    refine_rotations: bool = option(
-        False,
-        "Refine the given rotations on the matches before cameras are placed, camera by camera where "
-        "there is evidence. For rotations from averaging; those that went through bundle adjustment "
-        "are finer already.",
     )
     bundle_adjust: bool = option(
         False, "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."
@@ -116,8 +113,6 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self.check_range("max_memory_mb", 0)
         if self.adjuster != "own" and not self.bundle_adjust:
             raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
-        if self.refine_rotations and self.directions == "relative-poses":
-            raise ValueError("refine_rotations works on matches; leave out directions=relative-poses")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):
             raise ValueError(f"refine_with_priors has no effect with the scale {self.scale}; leave out one")
         if (
@@ -134,7 +129,7 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
             raise ValueError(
                 f"rotation_sigma_deg has no effect with rotations={self.rotations}; leave out one"
             )
-        said = self.rotation_sigma_deg or self.rotations != "auto"
+        said = self.rotation_sigma_deg or self.rotations == "free"
         if said and not (self.adjust or self.bundle_adjust):
             raise ValueError("what rotations are worth matters only to an adjustment; leave out no-adjust")
 
@@ -156,6 +151,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def uses_points(self, num_cameras: int) -> bool:
         """Return whether 3D points join the view graph of so many cameras."""
         return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
+
+    def adjusts_cameras(self, num_cameras: int) -> bool:
+        """Return whether placed cameras are adjusted; the optimum as it is, or with priors, is not."""
+        as_found = self.objective not in ("auto", "lud") or not self.refine or self.refine_with_priors
+        return self.adjust and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:
         """Say whether 3D points join the view graph of so many cameras, and why."""

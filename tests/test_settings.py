@@ -32,7 +32,7 @@ def test_every_option_has_a_sentence_that_help_shows(settings):
 def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():
     names = [item.name for group in groups_of(MapOptions) for item in group.fields]
     assert sorted(names) == sorted(item.name for item in dataclasses.fields(MapOptions))
-    again = {"refine_rotations"}  # on by default for rotations that were averaged
+    again = {"adjust", "min_points_per_image"}  # for rotations that were averaged
     own = [name for one in ALL for name in inspect.get_annotations(one)]
     assert {name for name in own if own.count(name) > 1} == again
 
@@ -71,7 +71,10 @@ REFUSED = [
     (LocateOptions, {"filter": "mfas"}, "triangles"),
     (LocateOptions, {"max_rotation_error_deg": 5.0}, "belongs to directions=relative-poses"),
     (LocateOptions, {"adjuster": "ceres"}, "adjuster has no effect without bundle_adjust"),
-    (LocateOptions, {"refine_rotations": True, "directions": "relative-poses"}, "works on matches"),
+    (LocateOptions, {"rotations": "measured", "adjust": False}, "matters only to an adjustment"),
+    (LocateOptions, {"rotations": "free", "rotation_sigma_deg": 0.1}, "no effect with rotations=free"),
+    (LocateOptions, {"rotation_sigma_deg": -1.0}, "must lie in"),
+    (MapOptions, {"rotations": "measured"}, "map finds the rotations itself"),
     (LocateOptions, {"refine_with_priors": True, "scale": "unit"}, "no effect with the scale unit"),
     (LocateOptions, {"scale": "distance"}, "needs known_distance"),
     (LocateOptions, {"scale": "unit", "known_distance": ("a", "b", 1.0)}, "has no effect"),
@@ -138,7 +141,7 @@ def test_an_option_by_name_reaches_the_run_rows_are_made_once_and_errors_have_a_
 
 
 def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(located):
-    assert repr(located).startswith("<LocateResult: 8 of 8 images placed")
+    assert repr(located).startswith("<LocateResult: good: 8 of 8 images placed")
     problem = random_graph_problem(12, p=0.8, seed=1)
     solved = sfm_shapefit.solve(problem.view_graph, tol=1e-6)
     assert solved.converged

@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 from numpy.random import Generator
 
+from abuse import strangers
 from abuse.layouts import binary_fields, cut_records, read_field
 from abuse.verdicts import MODEL_FILES, read_cameras
 from harness.record import leave_out
@@ -47,8 +48,10 @@ def run(args: argparse.Namespace) -> int:
             different = list(differing_files(scene, work))
             adjusted = differing_files(scene, work / "adjusted", always=("--bundle-adjust",))
             different += [f"adjusted, {name}" for name in adjusted]
-            if (scene / "database.db").exists():
-                different += [f"map, {name}" for name in differing_files(scene, work / "map", command="map")]
+            for flags in strangers.STAGES_OF_MAP if (scene / "database.db").exists() else ():
+                mapped = differing_files(scene, work / "map", command="map", always=flags)
+                different += [f"map {' '.join(flags)}, {name}" for name in mapped]
+                shutil.rmtree(work / "map")
             worst = max(
                 (measure_reordering(scene, work, seed) for seed in range(args.seed, args.seed + args.orders)),
                 default=0.0,

@@ -118,14 +118,17 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
     for command in (
         (*old, *database, *poses),
         (*old, "--bundle-adjust"),
-        (*old, *database, "--refine-rotations"),
+        (*old, *database, "--rotations", "free"),
         ("solve", str(base / "graph.txt"), str(out), "--overwrite", "-q"),
         ("locate", str(base / "openmvg/sfm_data.json"), str(out), "--overwrite", "--threads", "1", "-q"),
         (*old, *database, "--priors", str(base / "priors.txt"), "--refine-with-priors"),
         (*old, *database, "--fix", str(base / "fix.txt")),
         ("evaluate", str(base / "opensfm/reconstruction.json"), str(base / "truth")),
         ("inspect", str(base / "bundler/bundle.out")),
-        ("map", str(base / "database.db"), str(out), "--overwrite", "--threads", "1", "-q"),
+        *(
+            ("map", str(base / "database.db"), str(out), "--overwrite", "--threads", "1", "-q", *stages)
+            for stages in strangers.STAGES_OF_MAP
+        ),
     ):
         _command(*command)
     shutil.rmtree(out)

@@ -27,6 +27,8 @@ _MODELS = {
 """Files of other programs, and what stands beside them."""
 _TABLES = {"priors.txt": "--priors", "fix.txt": "--fix", "options.toml": "--config"}
 _CAMERA_COLUMNS = ("camera_id", "model", "width", "height", "params", "prior_focal_length")
+STAGES_OF_MAP = ((), ("--bundle-adjust",), ("--averaging", "pycolmap"), ("--no-adjust",))
+"""Flags of `map` that choose among its stages."""
 
 
 def damage_stranger(base: Path, folder: Path, rng: Generator) -> Case:
@@ -57,7 +59,8 @@ def damage_database(base: Path, folder: Path, rng: Generator) -> Case:
     way = mutations.pick(rng, (*databases.WAYS, odd_cameras, odd_cameras, odd_cameras))
     way(folder / "database.db", rng)
     relative = ("--relative", "stored") if rng.random() < 0.3 else ()
-    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *relative, "--threads", "1"))
+    stages = mutations.pick(rng, STAGES_OF_MAP)
+    return Case(f"map: {way.__name__}", ("map", "database.db", "out", *relative, *stages, "--threads", "1"))
 
 
 def odd_cameras(path: Path, rng: Generator) -> bool:

@@ -10,6 +10,7 @@ INDEX = {
     "averaging": "Rotation averaging: made graphs against an oracle, real sets beside pycolmap's.",
     "coherent": "Graphs whose wrong pairs agree on one false configuration, up to the theoretical limit.",
     "directions": "Directions from matches: speed, memory and calibration.",
+    "doubt": "Turned cameras and wrong focal lengths on real and bundled scenes: found, and no others.",
     "endtoend": "synth and locate at thousands of images: time by stage, memory and its forecast, exponents.",
     "graphs": "Families of graphs against the oracle: expanders, areas, communities, long chains, streets.",
     "map": "From a database to an adjusted model: map beside pycolmap's global and incremental mapping.",

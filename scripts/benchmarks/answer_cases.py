@@ -51,7 +51,9 @@ _PLACEMENT = {
 _LOCATE = {
     **_PLACEMENT,
     **_name_flags("--min-trust 0", "--points never", "--points always", "--threads 1", "--scene"),
-    **_name_flags("--scale unit", "--scale input", "--scale prior", "--refine-rotations", "--bundle-adjust"),
+    **_name_flags(
+        "--scale unit", "--scale input", "--scale prior", "--rotations free", "--no-adjust", "--bundle-adjust"
+    ),
     **_name_flags("--directions tracks", "--directions relative-poses", "--fix solved"),
     "known-distance": "--known-distance 0001.jpg 0003.jpg 2.5",
     "config": "--config known.toml",
@@ -76,20 +78,20 @@ _LOCATED = {
     "ring8": "directions-tracks directions-relative-poses points-never known-distance priors fix-names "
     "fix-solved objective-shapefit objective-linf bundle-adjust",
     "facade9": "directions-tracks points-never objective-least-squares priors fix-solved",
-    "photographed": "bundle-adjust refine-rotations points-never fix-names priors-refine "
+    "photographed": "bundle-adjust rotations-free no-adjust points-never fix-names priors-refine "
     "objective-shapefit filter-triangles no-refine thresholds",
     "kerry-park": "points-never fix-names fix-solved bundle-adjust objective-shapefit "
     "objective-least-squares priors-refine directions-tracks factor-memory-1",
     "rig": "objective-shapefit objective-lud objective-linf solver-admm fix-names priors priors-refine "
     "bundle-adjust directions-relative-poses points-always no-refine filter-1dsfm scale-unit "
-    "refine-rotations scale-prior",
+    "rotations-free scale-prior",
     "ring8-hinged": "points-never priors",
     "ring8-pendant": "points-never",
     "ring8-cycle": "points-never",
     "courtyard-new": "fix-names fix-names-bundle-adjust fix-solved fix-solved-bundle-adjust "
     "fix-solved-shapefit priors-refine directions-tracks scale-input",
     "photographed-new": "fix-solved fix-solved-bundle-adjust",
-    "castle-P30": "bundle-adjust objective-shapefit refine-rotations",
+    "castle-P30": "bundle-adjust objective-shapefit rotations-free no-adjust",
     "Herz-Jesus-P8": "directions-relative-poses filter-triangles",
     "lego100": "points-never objective-shapefit",
     "brighton-beach": "scale-prior gps gps-refine",
@@ -99,7 +101,7 @@ _LOCATED = {
 _MAP = {
     "default": "--json",
     **_name_flags("--bundle-adjust", "--min-trust 0", "--relative stored", "--min-matches 30"),
-    **_name_flags("--min-model-size 20", "--no-refine-rotations", "--points never"),
+    **_name_flags("--min-model-size 20", "--no-adjust", "--points never"),
     "shapefit": "--objective shapefit",
 }
 _MAPPED = {

@@ -34,6 +34,8 @@ _FEWEST_POINTS = 10
 _FEWEST_FRAMES = 3
 # The halves end at this relative fall of the cost: what is left is far below the spread between them.
 _FALL = 1e-4
+# What unknowns leave of the errors, at least; points of two views leave a quarter.
+_LEAST_REDUNDANCY = 0.1
 # Of a normal error in the plane, the median length over the standard deviation per axis.
 _MEDIAN_LENGTH = 1.1774
 # Of a normal error in space, the median square over the mean.
@@ -97,7 +99,9 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     known = (seen >= _FEWEST_POINTS) & ~problem.is_fixed()
     first, second = (_turns(bare, end.rotations)[known] for end in ends)
     errors_px = np.concatenate([reprojection_errors_px(end) for end in ends])
-    noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH
+    unknowns = 3 * problem.num_points + 2 * 6 * problem.num_frames
+    redundancy = max(1.0 - unknowns / max(2 * problem.num_observations, 1), _LEAST_REDUNDANCY)
+    noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH / np.sqrt(redundancy)
     if len(first) < _FEWEST_FRAMES:
         return RotationErrors(
             sigma_rad=0.0, chance_rad=0.0, open_rad=0.0, noise_px=noise_px, num_frames=len(first)

@@ -8,6 +8,9 @@ the 2 x 2 weight M of the loss (see `adjustment`), a pass over the points writes
     U_i += J_i^T M J_i        b_i += J_i^T w r          for each node
     U_q += J_f^T M J_l                                  for each link of a frame with a lens.
 
+A frame's Jacobian by its center is that of the point with the other sign. So its part of W_e is -J_p^T M J_p,
+which is also what the point and the center's corner of U_i receive, and little else is left to multiply.
+
 Points are cut into the same chunks whatever the number of threads, and the sums of the chunks are added in
 order: the same bits always.
 """
@@ -28,6 +31,13 @@ CHUNKS = 4
 """Into which the points are cut; each has sums of all nodes of its own."""
 
 _LEAST_DEPTH = 1e-8  # of the distance from the camera: less is behind it
+
+# A row of a camera has its rotation, its frame's center, the shift and rotation of the sensor, and the lens.
+_CENTER, _SHIFT, _SENSOR, _LENS = 9, 12, 15, 24
+
+# Below, log(1 + s) is a series of six terms; above, part of a product, whose logarithm is taken when it is
+# large. The error of either is rounding.
+_SMALL, _LARGE = 1e-3, 1e150
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,18 +97,20 @@ def linearize(
     entries = np.empty((len(layout.entry_node), 3, SLOTS))
     given = _inputs(layout, values, loss_scale_px)
     structure = (
-        layout.lens_slots, layout.turns, layout.node_of_frame, layout.node_of_lens, layout.frame_entry,
-        layout.lens_entry, layout.link_of_camera, layout.first_entry, least_curvature,
+        layout.lens_of_camera, layout.lens_slots, layout.turns, layout.frame_of_camera, layout.node_of_frame,
+        layout.node_of_lens, layout.frame_entry, layout.lens_entry, layout.link_of_camera, layout.first_entry,
+        least_curvature,
     )  # fmt: skip
     by_point_sums = (points, point_gradients, entries)
 
     def job(k: int, begin: int, end: int) -> Callable[[], None]:
         sums = (nodes[k], gradients[k], links[k])
-        return lambda: _linearise(begin, end, given, structure, sums, by_point_sums)
+        return lambda: _linearize(begin, end, given, structure, sums, by_point_sums)
 
     workers.run([job(k, *chunk) for k, chunk in enumerate(_chunks(layout))])
+    upper = nodes.sum(axis=0)
     return NormalEquations(
-        nodes=nodes.sum(axis=0),
+        nodes=upper + np.triu(upper, 1).transpose(0, 2, 1),
         node_gradients=gradients.sum(axis=0),
         links=links.sum(axis=0),
         points=points,
@@ -130,11 +142,19 @@ def reprojection_residuals(layout: Layout, values: Values) -> FloatArray:
 
 def _inputs(layout: Layout, values: Values, loss_scale_px: float | None) -> tuple[Any, ...]:
     """Return what every kernel here reads."""
-    return (
-        layout.first_observation, layout.camera, layout.pixels, layout.frame_of_camera, layout.lens_of_camera,
-        layout.sensor_rotations, layout.sensor_translations, values.rotations, values.centers, values.points,
-        values.lenses, np.inf if loss_scale_px is None else loss_scale_px**2,
-    )  # fmt: skip
+    turned = layout.sensor_rotations @ values.rotations[layout.frame_of_camera]
+    views = np.concatenate(
+        [
+            turned.reshape(-1, 9),
+            values.centers[layout.frame_of_camera],
+            layout.sensor_translations,
+            layout.sensor_rotations.reshape(-1, 9),
+            values.lenses[layout.lens_of_camera],
+        ],
+        axis=1,
+    )
+    scale = np.inf if loss_scale_px is None else loss_scale_px**2
+    return layout.first_observation, layout.camera, layout.pixels, views, values.points, scale
 
 
 def _chunks(layout: Layout) -> list[tuple[int, int]]:
@@ -145,225 +165,304 @@ def _chunks(layout: Layout) -> list[tuple[int, int]]:
 
 
 @inner_kernel
-def _look(
-    rotation: Any,
-    center: Any,
-    sensor_rotation: Any,
-    sensor_translation: Any,
-    point: Any,
-    body: Any,
-    seen: Any,
-) -> bool:
-    """Write the point in axes of the frame and of the camera; return whether it is in front."""
-    x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
-    for a in range(3):
-        body[a] = rotation[a, 0] * x + rotation[a, 1] * y + rotation[a, 2] * z
-    x, y, z = body[0], body[1], body[2]
-    for a in range(3):
-        turned = sensor_rotation[a, 0] * x + sensor_rotation[a, 1] * y + sensor_rotation[a, 2] * z
-        seen[a] = turned + sensor_translation[a]
-    distance = np.sqrt(seen[0] ** 2 + seen[1] ** 2 + seen[2] ** 2)
-    return bool(seen[2] > _LEAST_DEPTH * distance)
+def _look(views: Any, camera: int, points: Any, p: int) -> tuple[float, float, float]:
+    """Return a point less the frame's center, in axes of the camera."""
+    x = points[p, 0] - views[camera, _CENTER]
+    y = points[p, 1] - views[camera, _CENTER + 1]
+    z = points[p, 2] - views[camera, _CENTER + 2]
+    return (
+        views[camera, 0] * x + views[camera, 1] * y + views[camera, 2] * z,
+        views[camera, 3] * x + views[camera, 4] * y + views[camera, 5] * z,
+        views[camera, 6] * x + views[camera, 7] * y + views[camera, 8] * z,
+    )
 
 
 @inner_kernel
-def _miss(seen: Any, lens: Any, observed: Any, residual: Any) -> None:
-    """Write the pixel of a point in front of the camera, less the observed one."""
-    u, v = seen[0] / seen[2], seen[1] / seen[2]
-    s = u * u + v * v
-    radial = 1.0 + s * (lens[4] + s * lens[5])
-    p1, p2 = lens[6], lens[7]
-    x = lens[0] * (u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)) + lens[2]
-    y = lens[1] * (v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)) + lens[3]
-    residual[0], residual[1] = x - observed[0], y - observed[1]
+def _is_ahead(x: float, y: float, z: float) -> bool:
+    """Return whether a point, in axes of the camera, is in front of it."""
+    return bool(z > 0.0 and z * z > _LEAST_DEPTH * _LEAST_DEPTH * (x * x + y * y + z * z))
 
 
 @inner_kernel
-def _differentiate(
-    seen: Any, body: Any, lens: Any, rotation: Any, sensor: Any, turns: bool, by_point: Any, by_frame: Any
-) -> None:
-    """Write the derivatives of the pixel by the point (2, 3) and by its frame (2, 6)."""
-    inverse = 1.0 / seen[2]
-    u, v = seen[0] * inverse, seen[1] * inverse
+def _miss(views: Any, camera: int, u: float, v: float, observed: Any, k: int) -> tuple[float, float]:
+    """Return the pixel of the ray (u, v, 1), less the k-th that was observed."""
+    f, g = views[camera, _LENS], views[camera, _LENS + 1]
+    k1, k2 = views[camera, _LENS + 4], views[camera, _LENS + 5]
+    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
+    s, product = u * u + v * v, 2.0 * u * v
+    radial = 1.0 + s * (k1 + s * k2)
+    x = f * (u * radial + p1 * product + p2 * (s + 2.0 * u * u)) + views[camera, _LENS + 2]
+    y = g * (v * radial + p2 * product + p1 * (s + 2.0 * v * v)) + views[camera, _LENS + 3]
+    return x - observed[k, 0], y - observed[k, 1]
+
+
+@inner_kernel
+def _differentiate(views: Any, camera: int, u: float, v: float) -> tuple[float, float, float, float]:
+    """Return the derivatives of the pixel by u and v: x by both, then y by both."""
+    f, g = views[camera, _LENS], views[camera, _LENS + 1]
+    k1, k2 = views[camera, _LENS + 4], views[camera, _LENS + 5]
+    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
     s = u * u + v * v
-    radial = 1.0 + s * (lens[4] + s * lens[5])
-    slope = 2.0 * (lens[4] + 2.0 * s * lens[5])  # of the radial factor, by s, times 2
-    p1, p2 = lens[6], lens[7]
+    radial = 1.0 + s * (k1 + s * k2)
+    # Twice the slope of the radial factor by s.
+    slope = 2.0 * (k1 + 2.0 * s * k2)
     mixed = slope * u * v + 2.0 * (p1 * u + p2 * v)
-    for row in range(2):
-        # by u and v, then by the point in axes of the camera, then in those of the frame
-        if row == 0:
-            by_u, by_v = lens[0] * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u), lens[0] * mixed
-        else:
-            by_u, by_v = lens[1] * mixed, lens[1] * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v)
-        x, y, z = by_u * inverse, by_v * inverse, -(by_u * u + by_v * v) * inverse
-        g0 = x * sensor[0, 0] + y * sensor[1, 0] + z * sensor[2, 0]
-        g1 = x * sensor[0, 1] + y * sensor[1, 1] + z * sensor[2, 1]
-        g2 = x * sensor[0, 2] + y * sensor[1, 2] + z * sensor[2, 2]
-        for a in range(3):
-            by_point[row, a] = g0 * rotation[0, a] + g1 * rotation[1, a] + g2 * rotation[2, a]
-            by_frame[row, a] = -by_point[row, a]
-        if turns:
-            by_frame[row, 3] = body[1] * g2 - body[2] * g1
-            by_frame[row, 4] = body[2] * g0 - body[0] * g2
-            by_frame[row, 5] = body[0] * g1 - body[1] * g0
+    return (
+        f * (radial + slope * u * u + 2.0 * p1 * v + 6.0 * p2 * u),
+        f * mixed,
+        g * mixed,
+        g * (radial + slope * v * v + 2.0 * p2 * u + 6.0 * p1 * v),
+    )
 
 
 @inner_kernel
-def _differentiate_by_lens(seen: Any, lens: Any, slots: Any, by_values: Any, by_lens: Any) -> None:
+def _differentiate_by_lens(
+    views: Any, camera: int, u: float, v: float, slots: Any, lens: int, by_values: Any, by_lens: Any
+) -> None:
     """Write the derivatives of the pixel by the unknowns of a lens (2, 6).
 
     Each of these is the sum over the OPENCV parameters that it stands for, see `by_values` (2, 8).
     """
-    inverse = 1.0 / seen[2]
-    u, v = seen[0] * inverse, seen[1] * inverse
+    f, g = views[camera, _LENS], views[camera, _LENS + 1]
+    p1, p2 = views[camera, _LENS + 6], views[camera, _LENS + 7]
     s = u * u + v * v
-    radial = 1.0 + s * (lens[4] + s * lens[5])
-    p1, p2 = lens[6], lens[7]
+    radial = 1.0 + s * (views[camera, _LENS + 4] + s * views[camera, _LENS + 5])
     by_values[0, 0] = u * radial + 2.0 * p1 * u * v + p2 * (s + 2.0 * u * u)
     by_values[1, 1] = v * radial + 2.0 * p2 * u * v + p1 * (s + 2.0 * v * v)
-    by_values[0, 4], by_values[1, 4] = lens[0] * u * s, lens[1] * v * s
-    by_values[0, 5], by_values[1, 5] = lens[0] * u * s * s, lens[1] * v * s * s
-    by_values[0, 6], by_values[1, 6] = lens[0] * 2.0 * u * v, lens[1] * (s + 2.0 * v * v)
-    by_values[0, 7], by_values[1, 7] = lens[0] * (s + 2.0 * u * u), lens[1] * 2.0 * u * v
-    by_lens[:] = 0.0
+    by_values[0, 4], by_values[1, 4] = f * u * s, g * v * s
+    by_values[0, 5], by_values[1, 5] = f * u * s * s, g * v * s * s
+    by_values[0, 6], by_values[1, 6] = f * 2.0 * u * v, g * (s + 2.0 * v * v)
+    by_values[0, 7], by_values[1, 7] = f * (s + 2.0 * u * u), g * 2.0 * u * v
+    for q in range(SLOTS):
+        by_lens[0, q] = by_lens[1, q] = 0.0
     for q in range(NUM_VALUES):
-        if slots[q] >= 0:
-            by_lens[0, slots[q]] += by_values[0, q]
-            by_lens[1, slots[q]] += by_values[1, q]
+        if slots[lens, q] >= 0:
+            by_lens[0, slots[lens, q]] += by_values[0, q]
+            by_lens[1, slots[lens, q]] += by_values[1, q]
 
 
 @kernel
 def _sum_losses(begin: int, end: int, given: Any, total: Any) -> None:
-    """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length."""
-    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
-    sensor_rotations, sensor_translations, rotations, centers, points, lenses, scale = given[5:]
-    body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
+    """Add 1/2 rho(|r|^2) of the points begin..end-1; behind its camera, one misses by the focal length.
+
+    The logarithms of the loss are that of a product, but for small residuals, whose series is exact.
+    """
+    first, cameras, pixels, views, points, scale = given
     plain = scale == np.inf
+    inverse_scale = 0.0 if plain else 1.0 / scale
+    sum_of_small, product = 0.0, 1.0
     for p in range(begin, end):
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
-            frame, lens = frame_of_camera[camera], lenses[lens_of_camera[camera]]
-            sensor, shift = sensor_rotations[camera], sensor_translations[camera]
-            square = lens[0] * lens[0]
-            if _look(rotations[frame], centers[frame], sensor, shift, points[p], body, seen):
-                _miss(seen, lens, pixels[k], residual)
-                square = residual[0] * residual[0] + residual[1] * residual[1]
-            total[0] += 0.5 * square if plain else 0.5 * scale * np.log1p(square / scale)
+            x, y, z = _look(views, camera, points, p)
+            x, y, z = x + views[camera, _SHIFT], y + views[camera, _SHIFT + 1], z + views[camera, _SHIFT + 2]
+            square = views[camera, _LENS] * views[camera, _LENS]
+            if _is_ahead(x, y, z):
+                inverse = 1.0 / z
+                miss_x, miss_y = _miss(views, camera, x * inverse, y * inverse, pixels, k)
+                square = miss_x * miss_x + miss_y * miss_y
+            s = square * inverse_scale
+            if plain:
+                sum_of_small += square
+            elif s < _SMALL:
+                sum_of_small += s * (1.0 - s * (1 / 2 - s * (1 / 3 - s * (1 / 4 - s * (1 / 5 - s / 6)))))
+            else:
+                product *= 1.0 + s
+                if product > _LARGE:
+                    sum_of_small += np.log(product)
+                    product = 1.0
+    total[0] += 0.5 * sum_of_small if plain else 0.5 * scale * (sum_of_small + np.log(product))
 
 
 @kernel
 def _write_residuals(given: Any, out: Any) -> None:
     """Write the residuals in the order of the points; NaN behind the camera."""
-    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
-    sensor_rotations, sensor_translations, rotations, centers, points, lenses, _ = given[5:]
-    body, seen = np.empty(3), np.empty(3)
+    first, cameras, pixels, views, points, _ = given
     for p in range(len(first) - 1):
         for k in range(first[p], first[p + 1]):
-            out[k] = np.nan
             camera = cameras[k]
-            frame, lens = frame_of_camera[camera], lenses[lens_of_camera[camera]]
-            sensor, shift = sensor_rotations[camera], sensor_translations[camera]
-            if _look(rotations[frame], centers[frame], sensor, shift, points[p], body, seen):
-                _miss(seen, lens, pixels[k], out[k])
+            x, y, z = _look(views, camera, points, p)
+            x, y, z = x + views[camera, _SHIFT], y + views[camera, _SHIFT + 1], z + views[camera, _SHIFT + 2]
+            out[k, 0] = out[k, 1] = np.nan
+            if _is_ahead(x, y, z):
+                out[k, 0], out[k, 1] = _miss(views, camera, x / z, y / z, pixels, k)
 
 
 @kernel
-def _linearise(begin: int, end: int, given: Any, structure: Any, sums: Any, by_point_sums: Any) -> None:
-    """Add the observations of the points begin..end-1 to the normal equations."""
-    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
-    sensor_rotations, sensor_translations, rotations, centers, points, lenses, scale = given[5:]
-    lens_slots, turns, node_of_frame, node_of_lens, frame_entry, lens_entry = structure[:6]
-    link_of_camera, first_entry, least_curvature = structure[6:]
+def _linearize(begin: int, end: int, given: Any, structure: Any, sums: Any, by_point_sums: Any) -> None:
+    """Add the observations of the points begin..end-1, to nodes in their upper triangles only."""
+    first, cameras, pixels, views, points, scale = given
+    lens_of_camera, lens_slots, turns, frame_of_camera, node_of_frame, node_of_lens = structure[:6]
+    frame_entry, lens_entry, link_of_camera, first_entry, least_curvature = structure[6:]
     nodes, gradients, links = sums
     blocks, point_gradients, entries = by_point_sums
-    body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
     by_point, by_values = np.empty((2, 3)), np.zeros((2, NUM_VALUES))
-    by_frame, by_lens, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS)), np.empty((2, SLOTS))
+    by_lens, weighted = np.zeros((2, SLOTS)), np.zeros((2, SLOTS))
     for p in range(begin, end):
-        blocks[p] = 0.0
-        point_gradients[p] = 0.0
-        entries[first_entry[p] : first_entry[p + 1]] = 0.0
+        for e in range(first_entry[p], first_entry[p + 1]):
+            for a in range(3):
+                for c in range(SLOTS):
+                    entries[e, a, c] = 0.0
+        v00, v01, v02, v11, v12, v22, g0, g1, g2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(first[p], first[p + 1]):
             camera = cameras[k]
-            frame, lens = frame_of_camera[camera], lens_of_camera[camera]
-            rotation, sensor, shift = rotations[frame], sensor_rotations[camera], sensor_translations[camera]
-            if not _look(rotation, centers[frame], sensor, shift, points[p], body, seen):
+            bx, by, bz = _look(views, camera, points, p)
+            x, y = bx + views[camera, _SHIFT], by + views[camera, _SHIFT + 1]
+            z = bz + views[camera, _SHIFT + 2]
+            if not _is_ahead(x, y, z):
                 continue
-            _miss(seen, lenses[lens], pixels[k], residual)
-            _differentiate(seen, body, lenses[lens], rotation, sensor, turns, by_point, by_frame)
-            weights = _weigh(residual, scale, least_curvature)
-            _add_point(by_point, weights, residual, blocks[p], point_gradients[p])
-            if frame_entry[k] >= 0:
-                node = node_of_frame[frame]
-                entry = entries[frame_entry[k]]
-                _add_node(
-                    by_frame, by_point, weights, residual, weighted, nodes[node], gradients[node], entry
-                )
+            inverse = 1.0 / z
+            u, v = x * inverse, y * inverse
+            rx, ry = _miss(views, camera, u, v, pixels, k)
+            x_by_u, x_by_v, y_by_u, y_by_v = _differentiate(views, camera, u, v)
+            w, m00, m01, m11 = _weigh(rx, ry, scale, least_curvature)
+            # By the point in axes of the camera, then in those of the world.
+            a0, a1, a2 = x_by_u * inverse, x_by_v * inverse, -(x_by_u * u + x_by_v * v) * inverse
+            b0, b1, b2 = y_by_u * inverse, y_by_v * inverse, -(y_by_u * u + y_by_v * v) * inverse
+            p0 = a0 * views[camera, 0] + a1 * views[camera, 3] + a2 * views[camera, 6]
+            p1 = a0 * views[camera, 1] + a1 * views[camera, 4] + a2 * views[camera, 7]
+            p2 = a0 * views[camera, 2] + a1 * views[camera, 5] + a2 * views[camera, 8]
+            q0 = b0 * views[camera, 0] + b1 * views[camera, 3] + b2 * views[camera, 6]
+            q1 = b0 * views[camera, 1] + b1 * views[camera, 4] + b2 * views[camera, 7]
+            q2 = b0 * views[camera, 2] + b1 * views[camera, 5] + b2 * views[camera, 8]
+            wx, wy = w * rx, w * ry
+            t0, t1, t2 = p0 * wx + q0 * wy, p1 * wx + q1 * wy, p2 * wx + q2 * wy
+            # J_p^T M, and with J_p the block of the point.
+            s0, s1, s2 = m00 * p0 + m01 * q0, m00 * p1 + m01 * q1, m00 * p2 + m01 * q2
+            r0, r1, r2 = m01 * p0 + m11 * q0, m01 * p1 + m11 * q1, m01 * p2 + m11 * q2
+            h00, h01, h02 = s0 * p0 + r0 * q0, s0 * p1 + r0 * q1, s0 * p2 + r0 * q2
+            h11, h12, h22 = s1 * p1 + r1 * q1, s1 * p2 + r1 * q2, s2 * p2 + r2 * q2
+            v00, v01, v02, v11, v12, v22 = v00 + h00, v01 + h01, v02 + h02, v11 + h11, v12 + h12, v22 + h22
+            g0, g1, g2 = g0 + t0, g1 + t1, g2 + t2
+            # By the rotation vector, in axes of the camera, then in those of the frame.
+            c0, c1, c2 = _turn(views, camera, by * a2 - bz * a1, bz * a0 - bx * a2, bx * a1 - by * a0)
+            d0, d1, d2 = _turn(views, camera, by * b2 - bz * b1, bz * b0 - bx * b2, bx * b1 - by * b0)
+            if not turns:
+                c0, c1, c2, d0, d1, d2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            e = frame_entry[k]
+            if e >= 0:
+                i = node_of_frame[frame_of_camera[camera]]
+                # J_p^T M J by the rotation.
+                k00, k01, k02 = s0 * c0 + r0 * d0, s0 * c1 + r0 * d1, s0 * c2 + r0 * d2
+                k10, k11, k12 = s1 * c0 + r1 * d0, s1 * c1 + r1 * d1, s1 * c2 + r1 * d2
+                k20, k21, k22 = s2 * c0 + r2 * d0, s2 * c1 + r2 * d1, s2 * c2 + r2 * d2
+                entries[e, 0, 0] -= h00
+                entries[e, 0, 1] -= h01
+                entries[e, 0, 2] -= h02
+                entries[e, 1, 0] -= h01
+                entries[e, 1, 1] -= h11
+                entries[e, 1, 2] -= h12
+                entries[e, 2, 0] -= h02
+                entries[e, 2, 1] -= h12
+                entries[e, 2, 2] -= h22
+                entries[e, 0, 3] += k00
+                entries[e, 0, 4] += k01
+                entries[e, 0, 5] += k02
+                entries[e, 1, 3] += k10
+                entries[e, 1, 4] += k11
+                entries[e, 1, 5] += k12
+                entries[e, 2, 3] += k20
+                entries[e, 2, 4] += k21
+                entries[e, 2, 5] += k22
+                nodes[i, 0, 0] += h00
+                nodes[i, 0, 1] += h01
+                nodes[i, 0, 2] += h02
+                nodes[i, 1, 1] += h11
+                nodes[i, 1, 2] += h12
+                nodes[i, 2, 2] += h22
+                nodes[i, 0, 3] -= k00
+                nodes[i, 0, 4] -= k01
+                nodes[i, 0, 5] -= k02
+                nodes[i, 1, 3] -= k10
+                nodes[i, 1, 4] -= k11
+                nodes[i, 1, 5] -= k12
+                nodes[i, 2, 3] -= k20
+                nodes[i, 2, 4] -= k21
+                nodes[i, 2, 5] -= k22
+                s0, s1, s2 = m00 * c0 + m01 * d0, m00 * c1 + m01 * d1, m00 * c2 + m01 * d2
+                r0, r1, r2 = m01 * c0 + m11 * d0, m01 * c1 + m11 * d1, m01 * c2 + m11 * d2
+                nodes[i, 3, 3] += s0 * c0 + r0 * d0
+                nodes[i, 3, 4] += s0 * c1 + r0 * d1
+                nodes[i, 3, 5] += s0 * c2 + r0 * d2
+                nodes[i, 4, 4] += s1 * c1 + r1 * d1
+                nodes[i, 4, 5] += s1 * c2 + r1 * d2
+                nodes[i, 5, 5] += s2 * c2 + r2 * d2
+                gradients[i, 0] -= t0
+                gradients[i, 1] -= t1
+                gradients[i, 2] -= t2
+                gradients[i, 3] += c0 * wx + d0 * wy
+                gradients[i, 4] += c1 * wx + d1 * wy
+                gradients[i, 5] += c2 * wx + d2 * wy
             if lens_entry[k] >= 0:
-                node = node_of_lens[lens]
-                entry = entries[lens_entry[k]]
-                _differentiate_by_lens(seen, lenses[lens], lens_slots[lens], by_values, by_lens)
-                _add_node(by_lens, by_point, weights, residual, weighted, nodes[node], gradients[node], entry)
-                if link_of_camera[camera] >= 0:
-                    link = links[link_of_camera[camera]]
-                    for a in range(SLOTS):
-                        for c in range(SLOTS):
-                            link[a, c] += by_frame[0, a] * weighted[0, c] + by_frame[1, a] * weighted[1, c]
+                lens = lens_of_camera[camera]
+                by_point[0, 0], by_point[0, 1], by_point[0, 2] = p0, p1, p2
+                by_point[1, 0], by_point[1, 1], by_point[1, 2] = q0, q1, q2
+                _differentiate_by_lens(views, camera, u, v, lens_slots, lens, by_values, by_lens)
+                for q in range(SLOTS):
+                    weighted[0, q] = m00 * by_lens[0, q] + m01 * by_lens[1, q]
+                    weighted[1, q] = m01 * by_lens[0, q] + m11 * by_lens[1, q]
+                _add_lens(
+                    by_point, by_lens, weighted, wx, wy, node_of_lens[lens], lens_entry[k],
+                    nodes, gradients, entries,
+                )  # fmt: skip
+                by_turn = (c0, c1, c2, d0, d1, d2)
+                _add_link(by_point, by_turn, weighted, links, link_of_camera[camera])
+        blocks[p, 0], blocks[p, 1], blocks[p, 2] = v00, v01, v02
+        blocks[p, 3], blocks[p, 4], blocks[p, 5] = v11, v12, v22
+        point_gradients[p, 0], point_gradients[p, 1], point_gradients[p, 2] = g0, g1, g2
 
 
 @inner_kernel
-def _weigh(residual: Any, scale: float, least: float) -> tuple[float, float, float, float]:
+def _turn(views: Any, camera: int, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return a vector in axes of the camera in those of its frame."""
+    s = _SENSOR
+    return (
+        x * views[camera, s] + y * views[camera, s + 3] + z * views[camera, s + 6],
+        x * views[camera, s + 1] + y * views[camera, s + 4] + z * views[camera, s + 7],
+        x * views[camera, s + 2] + y * views[camera, s + 5] + z * views[camera, s + 8],
+    )
+
+
+@inner_kernel
+def _weigh(x: float, y: float, scale: float, least: float) -> tuple[float, float, float, float]:
     """Return the weight of a residual in the gradient, and its 2 x 2 weight in the curvature.
 
     The curvature along the residual is at least the share `least` of that across it.
     """
     if scale == np.inf:
         return 1.0, 1.0, 0.0, 1.0
-    x, y = residual[0], residual[1]
-    square = x * x + y * y
-    w = 1.0 / (1.0 + square / scale)
-    bend = min(2.0 * w / scale, (1.0 - least) / max(square, 1e-300))
+    square, inverse_scale = x * x + y * y, 1.0 / scale
+    w = 1.0 / (1.0 + square * inverse_scale)
+    if least == 1.0:
+        return w, w, 0.0, w
+    bend = 2.0 * w * inverse_scale
+    if bend * square > 1.0 - least:
+        bend = (1.0 - least) / square
     return w, w * (1.0 - bend * x * x), -w * bend * x * y, w * (1.0 - bend * y * y)
 
 
 @inner_kernel
-def _add_point(by_point: Any, weights: Any, residual: Any, block: Any, gradient: Any) -> None:
-    """Add J^T M J, packed, and J^T w r to a point."""
-    w, m00, m01, m11 = weights
-    at = 0
-    for a in range(3):
-        x, y = by_point[0, a], by_point[1, a]
-        gradient[a] += w * (x * residual[0] + y * residual[1])
-        mx, my = m00 * x + m01 * y, m01 * x + m11 * y
-        for c in range(a, 3):
-            block[at] += mx * by_point[0, c] + my * by_point[1, c]
-            at += 1
+def _add_lens(
+    by_point: Any, by_lens: Any, weighted: Any, wx: float, wy: float, node: int, e: int,
+    nodes: Any, gradients: Any, entries: Any,
+) -> None:  # fmt: skip
+    """Add an observation to the node and the entry of its lens; `weighted` is M J."""
+    for c in range(SLOTS):
+        gradients[node, c] += by_lens[0, c] * wx + by_lens[1, c] * wy
+        for a in range(c + 1):
+            nodes[node, a, c] += by_lens[0, a] * weighted[0, c] + by_lens[1, a] * weighted[1, c]
+        for a in range(3):
+            entries[e, a, c] += by_point[0, a] * weighted[0, c] + by_point[1, a] * weighted[1, c]
 
 
 @inner_kernel
-def _add_node(
-    by_node: Any,
-    by_point: Any,
-    weights: Any,
-    residual: Any,
-    weighted: Any,
-    block: Any,
-    gradient: Any,
-    entry: Any,
-) -> None:
-    """Add J^T M J and J^T w r to a node and J_p^T M J to its entry; leave M J in `weighted`."""
-    w, m00, m01, m11 = weights
-    for c in range(SLOTS):
-        x, y = by_node[0, c], by_node[1, c]
-        gradient[c] += w * (x * residual[0] + y * residual[1])
-        weighted[0, c] = m00 * x + m01 * y
-        weighted[1, c] = m01 * x + m11 * y
-    for a in range(SLOTS):
-        x, y = by_node[0, a], by_node[1, a]
-        for c in range(SLOTS):
-            block[a, c] += x * weighted[0, c] + y * weighted[1, c]
-    for a in range(3):
-        x, y = by_point[0, a], by_point[1, a]
-        for c in range(SLOTS):
-            entry[a, c] += x * weighted[0, c] + y * weighted[1, c]
+def _add_link(by_point: Any, by_turn: Any, weighted: Any, links: Any, link: int) -> None:
+    """Add an observation to the link of its frame with its lens, if that is not -1."""
+    c0, c1, c2, d0, d1, d2 = by_turn
+    for q in range(SLOTS if link >= 0 else 0):
+        x, y = weighted[0, q], weighted[1, q]
+        for a in range(3):
+            links[link, a, q] -= by_point[0, a] * x + by_point[1, a] * y
+        links[link, 3, q] += c0 * x + d0 * y
+        links[link, 4, q] += c1 * x + d1 * y
+        links[link, 5, q] += c2 * x + d2 * y

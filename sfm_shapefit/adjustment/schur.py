@@ -18,7 +18,7 @@ import numpy as np
 from sfm_shapefit.adjustment.layout import SLOTS, Layout
 from sfm_shapefit.adjustment.residuals import NormalEquations
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.jit import kernel
+from sfm_shapefit.jit import kernel, subtract_block
 from sfm_shapefit.laplacian.operators import Workers
 
 _JOBS = 16  # ranges of nodes or points; a row is summed by one of them, so that their number does not matter
@@ -109,7 +109,7 @@ def _reduce(
 ) -> None:  # fmt: skip
     """Subtract what the points explain from the rows begin..end-1."""
     place = np.empty(len(first_of_node) - 1, np.int64)
-    solved = np.empty((3, SLOTS))
+    spread = np.empty((3, SLOTS * SLOTS))
     for i in range(begin, end):
         for s in range(first_pair[i], first_pair[i + 1]):
             place[pair_nodes[s, 1]] = s
@@ -124,20 +124,12 @@ def _reduce(
                 x = v00 * w0 + v01 * w1 + v02 * w2
                 y = v01 * w0 + v11 * w1 + v12 * w2
                 z = v02 * w0 + v12 * w1 + v22 * w2
-                solved[0, a], solved[1, a], solved[2, a] = x, y, z
+                for c in range(SLOTS * a, SLOTS * a + SLOTS):
+                    spread[0, c], spread[1, c], spread[2, c] = x, y, z
                 right[i, a] += x * g0 + y * g1 + z * g2
-            for a in range(SLOTS):
-                x, y, z = solved[0, a], solved[1, a], solved[2, a]
-                for c in range(SLOTS):
-                    diagonal[i, a, c] -= x * entries[e, 0, c] + y * entries[e, 1, c] + z * entries[e, 2, c]
+            subtract_block(spread, entries, e, diagonal, i)
             for other in range(e + 1, first_entry[p + 1]):
-                s = place[entry_node[other]]
-                for a in range(SLOTS):
-                    x, y, z = solved[0, a], solved[1, a], solved[2, a]
-                    for c in range(SLOTS):
-                        pairs[s, a, c] -= (
-                            x * entries[other, 0, c] + y * entries[other, 1, c] + z * entries[other, 2, c]
-                        )
+                subtract_block(spread, entries, other, pairs, place[entry_node[other]])
 
 
 @kernel

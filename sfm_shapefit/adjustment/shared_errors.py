@@ -35,7 +35,15 @@ from sfm_shapefit.adjustment.covariance import GroundedSystem, ground_system
 from sfm_shapefit.adjustment.layout import SLOTS
 from sfm_shapefit.adjustment.options import AdjustmentOptions
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.residuals import _differentiate, _inputs, _look, _miss
+from sfm_shapefit.adjustment.residuals import (
+    _SHIFT,
+    _differentiate,
+    _inputs,
+    _is_ahead,
+    _look,
+    _miss,
+    _turn,
+)
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.jit import kernel
@@ -168,7 +176,8 @@ class _Pulls:
         by_field = np.zeros((layout.num_nodes, SLOTS, count))
         squares = np.zeros((square, square))
         _pull(
-            self.given, layout.node_of_frame, self.system.inverses, self.groups, self.windows, fields, turns,
+            self.given, layout.frame_of_camera, layout.node_of_frame,
+            self.system.inverses, self.groups, self.windows, fields, turns,
             by_group, by_field, squares, 6 if layout.turns else 3,
         )  # fmt: skip
         return by_field, squares
@@ -234,7 +243,8 @@ def _group_neighbors(points: FloatArray) -> IntArray:
 
 @kernel
 def _pull(
-    given: Any, node_of_frame: Any, inverses: Any, groups: Any, windows: Any, fields: Any, turns: Any,
+    given: Any, frame_of_camera: Any, node_of_frame: Any,
+    inverses: Any, groups: Any, windows: Any, fields: Any, turns: Any,
     by_group: Any, by_field: Any, squares: Any, slots: int,
 ) -> None:  # fmt: skip
     """Add what fields, turns and residuals pull at the nodes, the points following.
@@ -242,14 +252,13 @@ def _pull(
     Column s of `fields` and `turns` goes to column s of `by_field`, the residuals of a point to the column of
     its group in `by_group`, if there is any; residuals are the last row and column of `squares`.
     """
-    first, cameras, pixels, frame_of_camera, lens_of_camera = given[:5]
-    sensor_rotations, sensor_translations, rotations, centers, points, lenses, scale = given[5:]
+    first, cameras, pixels, views, points, scale = given
     count, num_fields = fields.shape[3], fields.shape[2]
     has_groups, has_squares = by_group.shape[2] > 0, len(squares) > 0
     longest = 0
     for p in range(len(first) - 1):
         longest = max(longest, first[p + 1] - first[p])
-    body, seen, residual = np.empty(3), np.empty(3), np.empty(2)
+    residual, by_pixel = np.empty(2), np.empty(3)
     by_points, by_frames = np.empty((longest, 2, 3)), np.zeros((longest, 2, 6))
     errors, weights = np.empty((longest, 2, count + 1)), np.empty(longest)
     basis, p_x, p_y = np.empty(num_fields), np.ones(8), np.ones(8)
@@ -261,13 +270,31 @@ def _pull(
         sums[:] = 0.0
         for k in range(first[p], first[p + 1]):
             at, camera = k - first[p], cameras[k]
-            frame, lens = frame_of_camera[camera], lenses[lens_of_camera[camera]]
-            rotation, sensor, shift = rotations[frame], sensor_rotations[camera], sensor_translations[camera]
+            frame = frame_of_camera[camera]
             weights[at] = 0.0
-            if not _look(rotation, centers[frame], sensor, shift, points[p], body, seen):
+            bx, by, bz = _look(views, camera, points, p)
+            x = bx + views[camera, _SHIFT]
+            y = by + views[camera, _SHIFT + 1]
+            z = bz + views[camera, _SHIFT + 2]
+            if not _is_ahead(x, y, z):
                 continue
-            _miss(seen, lens, pixels[k], residual)
-            _differentiate(seen, body, lens, rotation, sensor, True, by_points[at], by_frames[at])
+            u, v = x / z, y / z
+            residual[0], residual[1] = _miss(views, camera, u, v, pixels, k)
+            slopes = _differentiate(views, camera, u, v)
+            b0, b1, b2 = _turn(views, camera, bx, by, bz)
+            for axis in range(2):
+                by_u, by_v = slopes[2 * axis], slopes[2 * axis + 1]
+                by_pixel[0], by_pixel[1], by_pixel[2] = by_u / z, by_v / z, -(by_u * u + by_v * v) / z
+                for a in range(3):
+                    slope = 0.0
+                    for c in range(3):
+                        slope += by_pixel[c] * views[camera, 3 * c + a]
+                    by_points[at, axis, a] = slope
+                    by_frames[at, axis, a] = -slope
+                g0, g1, g2 = _turn(views, camera, by_pixel[0], by_pixel[1], by_pixel[2])
+                by_frames[at, axis, 3] = b1 * g2 - b2 * g1
+                by_frames[at, axis, 4] = b2 * g0 - b0 * g2
+                by_frames[at, axis, 5] = b0 * g1 - b1 * g0
             square = residual[0] * residual[0] + residual[1] * residual[1]
             weights[at] = 1.0 / (1.0 + square / scale)
             x = (pixels[k, 0] - windows[camera, 0]) / windows[camera, 2]

@@ -229,6 +229,8 @@ class _Run:
             ending = self.lower(normal, on_iteration)
             if ending is not None:
                 return ending
+            # The next equations would else be held beside these.
+            del normal
 
     def linearize(self) -> NormalEquations:
         """Return the normal equations at the best values, and note their gradient."""
@@ -317,12 +319,13 @@ def move(layout: Layout, values: Values, steps: FloatArray, point_steps: FloatAr
 
 def _gradient_norm(normal: NormalEquations, cost: float) -> float:
     """Return max_k |g_k| / sqrt(H_kk 2 cost) over all parameters (More 1978, the MINPACK test)."""
-    diagonal = np.concatenate(
-        [np.einsum("naa->na", normal.nodes).ravel(), normal.points[:, [0, 3, 5]].ravel()]
-    )
-    gradient = np.concatenate([normal.node_gradients.ravel(), normal.point_gradients.ravel()])
-    matters = diagonal > 0.0
-    if not matters.any() or cost == 0.0:
+    if cost == 0.0:
         return 0.0
-    cosines = np.abs(gradient[matters]) / np.sqrt(diagonal[matters] * 2.0 * cost)
-    return float(cosines.max())
+    largest = 0.0
+    for diagonal, gradient in (
+        (np.einsum("naa->na", normal.nodes), normal.node_gradients),
+        (normal.points[:, [0, 3, 5]], normal.point_gradients),
+    ):
+        squares = np.divide(gradient**2, diagonal, out=np.zeros_like(gradient), where=diagonal > 0.0)
+        largest = max(largest, float(squares.max(initial=0.0)))
+    return math.sqrt(largest / (2.0 * cost))

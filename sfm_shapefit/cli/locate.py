@@ -101,6 +101,7 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
         ("pairs", _describe_pairs(facts)),
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
         ("centers", found.placement.refined.statement()),
+        *([("adjustment", found.adjustment.statement)] if found.adjustment else []),
         ("scale", found.gauge.statement),
         ("points", points),
         *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),

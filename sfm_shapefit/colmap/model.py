@@ -153,28 +153,6 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
         raise InputError(f"{label} is not a sound COLMAP model: {_first_line(error)}") from error
 
 
-def with_turned_cameras(model: PosedModel, turns: FloatArray) -> PosedModel:
-    """Return the model with cameras that turn about their centers; the input is not touched.
-
-    Args:
-        model: the posed images.
-        turns: (n, 3, 3) rotations of the cameras in world axes: cam_from_world becomes R turn^T. Where one is
-            exactly the identity the rotation keeps its bits.
-
-    Raises:
-        InputError: if frames have several images, which cannot turn one by one.
-    """
-    if model.has_rigs:
-        raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
-    copy = pycolmap.Reconstruction(model.reconstruction)
-    for index in np.flatnonzero((turns != np.eye(3)).any(axis=(1, 2))).tolist():
-        image = copy.image(int(model.image_ids[index]))
-        rotation = pycolmap.Rotation3d(model.rotations[index] @ turns[index].T)
-        pose = pycolmap.Rigid3d(rotation, -(rotation.matrix() @ model.centers[index]))
-        copy.frame(image.frame_id).set_cam_from_world(image.camera_id, pose)
-    return read_model(copy)
-
-
 def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
     """Return the model with the frames' rotations of another, about their own centers; no input is touched.
 

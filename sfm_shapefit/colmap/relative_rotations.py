@@ -32,7 +32,7 @@ import pycolmap
 from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.database import MatchDatabase
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.directions.matches import MatchBatch, RayMatches
+from sfm_shapefit.directions.matches import RayMatches
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.two_view_poses import refine_two_view_poses
@@ -50,7 +50,7 @@ _STORED_NOISE_PX = 20.0
 
 
 def estimate_relative_rotations(
-    batch: MatchBatch, threads: int = 1, advance: Callable[[int], None] | None = None
+    batch: RayMatches, threads: int = 1, advance: Callable[[int], None] | None = None
 ) -> RelativeRotations:
     """Return the relative rotation of every pair that has one, in the order of pairs.
 
@@ -116,7 +116,7 @@ def concatenate(parts: Sequence[RelativeRotations]) -> RelativeRotations:
     return RelativeRotations(**columns)
 
 
-def _estimate_slice(batch: MatchBatch, first: int) -> RelativeRotations:
+def _estimate_slice(batch: RayMatches, first: int) -> RelativeRotations:
     """Return the relative rotations of the pairs from `first` on, as many as make a slice."""
     offsets = batch.offsets[first : first + _PAIRS_PER_SLICE + 1]
     rows, pairs = slice(offsets[0], offsets[-1]), slice(first, first + _PAIRS_PER_SLICE)

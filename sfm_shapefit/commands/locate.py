@@ -6,7 +6,6 @@ Each stage is one function from values to a new value; the input is never change
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,19 +14,14 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.adjustment import (
-    adjust_placed,
-    is_adjusted,
-    turned_deg,
-    with_covariances,
-)
+from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg, with_covariances
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import Rigid, find_rigid_parts, place_cameras
-from sfm_shapefit.commands.stages.rotations import refine_model_rotations
 from sfm_shapefit.commands.stages.seed import (
     Located,
     build_seeded_model,
@@ -40,9 +34,16 @@ from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
+from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import Inputs, LocateResult
-from sfm_shapefit.results.warnings import match_warnings, quality_warnings, trust_warnings
+from sfm_shapefit.results.warnings import (
+    ambiguity_warnings,
+    focal_warnings,
+    match_warnings,
+    quality_warnings,
+    trust_warnings,
+)
 from sfm_shapefit.settings import merge_options
 
 if TYPE_CHECKING:
@@ -97,13 +98,8 @@ def locate(
         inputs = choose_inputs(reconstruction, database, options.directions)
         priors_known = read_priors(model, inputs, options, priors)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
-    turned_deg = None
-    if options.refine_rotations:
-        with clock("rotations"):
-            model, turned_deg = refine_model_rotations(model, inputs, options, clock)
     with open_source(model, inputs, options) as opened:
-        found = locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
-    return found if turned_deg is None else replace(found, turned_deg=turned_deg)
+        return locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
 
 
 class Locating(NamedTuple):
@@ -139,20 +135,23 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             there = np.isfinite(centers).all(axis=1)
             scale = median_spread(centers[there]) / median_spread(placed[there])
             placement = with_covariances(placement, model, known.covariances or {}, scale)
-        kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
         rule = GaugeRule(model, rigid, options, known.priors)
-        gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
-        if known.priors is not None and options.refine_with_priors:
-            placement, gauge = pull_to_priors(placement, gauge, known.priors, options)
-            kept = select_trusted(placement, options.min_trust)
-    located, adjustment = Located(placement, kept, gauge, rigid.fixed, rule), None
-    if known.centers is None and is_adjusted(options, len(placement.cameras)):
+    adjustment, given = None, None
+    if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            source, placement, adjustment = adjust_placed(source, located, options, clock)
-            kept = select_trusted(placement, options.min_trust) | rigid.fixed[placement.cameras]
-            gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
+            after = adjust_placed(source, directions, _choose(placement, rule), options, clock)
+            source, directions, placement, adjustment = after
             given = GivenRotations(adjustment.weight, model.reconstruction)
-            located = Located(placement, kept, gauge, rigid.fixed, rule, given)
+    with clock("trust"):
+        relative = ask_pairs(source, directions, options)
+        focal_doubts = question_focal_lengths(source, directions, options)
+        placement = doubt_cameras(placement, directions, relative, source.model, options)
+        located = _choose(placement, rule)._replace(given=given)
+        if known.priors is not None and options.refine_with_priors:
+            placement, gauge = pull_to_priors(placement, located.gauge, known.priors, options)
+            placement = doubt_cameras(placement, directions, relative, source.model, options)
+            kept = select_trusted(placement, options.min_trust)
+            located = Located(placement, kept, gauge, rigid.fixed, rule)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
@@ -160,7 +159,10 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         scale = located.gauge.similarity.scale
         placement = with_covariances(placement, model, seeded.adjusted.covariances, scale)
     located = located._replace(placement=placement, gauge=seeded.gauge)
-    warnings = tuple(_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()))
+    warnings = (
+        *focal_warnings(model, focal_doubts),
+        *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
+    )
     return LocateResult(
         reconstruction=seeded.reconstruction,
         inputs=known.inputs,
@@ -168,7 +170,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         model=source.model,
         directions=directions,
         placement=placement,
-        kept=kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
+        kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
         agreeing_observations=seeded.agreeing_observations,
         gauge=seeded.gauge,
@@ -179,7 +181,16 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         warnings=warnings,
         further=further,
         fixed=rigid.fixed,
+        focal_doubts=focal_doubts,
     )
+
+
+def _choose(placement: Placement, rule: GaugeRule) -> Located:
+    """Return which of the placed cameras are in the output, and in which gauge."""
+    fixed = rule.rigid.fixed
+    kept = select_trusted(placement, rule.options.min_trust) | fixed[placement.cameras]
+    gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
+    return Located(placement, kept, gauge, fixed, rule)
 
 
 def _collect_warnings(
@@ -189,6 +200,7 @@ def _collect_warnings(
     yield from match_warnings(directions)
     yield from quality_warnings(located.placement)
     yield from trust_warnings(located.placement, located.kept)
+    yield from ambiguity_warnings(located.placement)
     if located.gauge.warning:
         yield located.gauge.warning
     if source.economy.statement:

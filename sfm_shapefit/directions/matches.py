@@ -4,7 +4,10 @@ A match of images i and j is a pair of keypoints that see the same point. With k
 matters of a keypoint is the unit ray of its pixel in world axes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 
@@ -23,6 +26,18 @@ class RayMatches:
     """(M, 3) unit rays of image j."""
     pixel_angles: FloatArray
     """(k,) angle of one pixel in radians, 1 / the smaller focal length in px."""
+
+
+def join_rays(parts: Sequence[RayMatches]) -> RayMatches:
+    """Return the pairs of all parts, in order; there may be no parts."""
+    counts = np.concatenate([np.zeros(0, dtype=np.int64), *(np.diff(part.offsets) for part in parts)])
+    return RayMatches(
+        pairs=np.concatenate([np.zeros((0, 2), dtype=np.int64), *(part.pairs for part in parts)]),
+        offsets=np.append(0, np.cumsum(counts)),
+        rays_i=np.concatenate([np.zeros((0, 3)), *(part.rays_i for part in parts)]),
+        rays_j=np.concatenate([np.zeros((0, 3)), *(part.rays_j for part in parts)]),
+        pixel_angles=np.concatenate([np.zeros(0), *(part.pixel_angles for part in parts)]),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -32,7 +32,6 @@ Where repeated structure produces false pairs everywhere, contradictions say lit
 together they count at most half as much as all agreements.
 """
 
-import heapq
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -40,6 +39,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.conditioning import FEW_PAIRS, Conditioning, Looseness
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.viewgraph import ViewGraph
@@ -62,8 +62,10 @@ _UNKNOWN_SUPPORT = 50.0
 _USUAL_SHARE = 0.75
 # The standard deviation tau that halves trust, as a share of the cameras' spread.
 _HOLD_SHARE = 0.1
-# Trust below which reasons are given.
-_LOW = 0.75
+LOW_TRUST = 0.75
+"""Trust below which reasons are given."""
+SOMEWHAT_LOOSE = "its pairs leave it somewhat loose"
+_CONTRADICTED = "more of its matches contradict it than usual here: its rotation may be wrong"
 
 
 class PairFit(NamedTuple):
@@ -88,8 +90,12 @@ class CameraTrust:
     """(k,) the first factor."""
     consensus: BoolArray
     """(k,) the consensus of cameras, whose pairs count."""
+    hold: FloatArray
+    """(k,) the second factor."""
     reasons: tuple[str, ...]
     """k sentences, empty where the trust is not low."""
+    loose_reasons: tuple[str, ...]
+    """k sentences that say what the pairs leave open; empty where they hold the camera."""
 
 
 def judge_cameras(
@@ -118,7 +124,7 @@ def judge_cameras(
     consensus: BoolArray = np.ones(int(labels.max()) + 1, dtype=np.bool_)
     if len(votes.pairs) <= _MAX_CLUSTERED_PAIRS:
         signed = np.where(votes.agrees, votes.weights, -votes.weights)
-        consensus = find_consensus(len(consensus), votes.pairs, signed)
+        consensus = find_bodies(len(consensus), votes.pairs, signed) == 0
     agreement = _shares(checked.of_groups(labels), consensus, int(labels[:num_cameras].max()) + 1)[
         labels[:num_cameras]
     ]
@@ -129,11 +135,19 @@ def judge_cameras(
     relative = agreement / usual if usual > 0.0 else (agreement > 0.0).astype(np.float64)
     trust = np.minimum(relative, 1.0) * hold
     few = conditioning.num_pairs <= FEW_PAIRS
+    loose = [_loose_reason(cause, is_few) for cause, is_few in zip(conditioning.causes, few, strict=True)]
     reasons = [""] * num_cameras
-    for k in np.flatnonzero(trust < _LOW).tolist():
-        reasons[k] = _reason(float(agreement[k]), usual, conditioning.causes[k], bool(few[k]))
+    for k in np.flatnonzero(trust < LOW_TRUST).tolist():
+        contradicted = agreement[k] < usual and conditioning.causes[k] is not Looseness.DISTANCE
+        found = [_CONTRADICTED] if contradicted else []
+        reasons[k] = "; ".join([*found, *filter(None, [loose[k]])]) or SOMEWHAT_LOOSE
     return CameraTrust(
-        trust=trust, agreement=agreement, consensus=consensus[:num_cameras], reasons=tuple(reasons)
+        trust=trust,
+        agreement=agreement,
+        consensus=consensus[:num_cameras],
+        hold=hold,
+        reasons=tuple(reasons),
+        loose_reasons=tuple(loose),
     )
 
 
@@ -193,50 +207,6 @@ def _shares(votes: _Votes, consensus: BoolArray, num_cameras: int) -> FloatArray
     return np.asarray((good + 0.5 * median**2 * _PRIOR) / (total + _PRIOR))
 
 
-def find_consensus(num_nodes: int, pairs: IntArray, weights: FloatArray) -> BoolArray:
-    """Return the largest set of nodes that greedy additive edge contraction finds, (n,).
-
-    Args:
-        num_nodes: n.
-        pairs: (m, 2) node indices; repeated pairs add up.
-        weights: (m,) positive where the two nodes belong together, negative where they do not.
-    """
-    ties: list[dict[int, float]] = [{} for _ in range(num_nodes)]
-    for (i, j), weight in zip(pairs.tolist(), weights.tolist(), strict=True):
-        ties[i][j] = ties[j][i] = ties[i].get(j, 0.0) + weight
-    queue = [(-w, i, j) for i, tie in enumerate(ties) for j, w in tie.items() if i < j and w > 0.0]
-    heapq.heapify(queue)
-    members = [[node] for node in range(num_nodes)]
-    while queue:
-        weight, i, j = heapq.heappop(queue)
-        if ties[i].get(j) != -weight:
-            continue  # one of the two has changed since, or is part of another
-        kept, gone = (i, j) if len(ties[i]) >= len(ties[j]) else (j, i)
-        members[kept] += members[gone]
-        members[gone] = []
-        _contract(ties, kept, gone, queue)
-    largest = max(members, key=lambda member: (len(member), -min(member, default=0)))
-    chosen: BoolArray = np.zeros(num_nodes, dtype=np.bool_)
-    chosen[largest] = True
-    return chosen
-
-
-def _contract(
-    ties: list[dict[int, float]], kept: int, gone: int, queue: list[tuple[float, int, int]]
-) -> None:
-    """Hand the ties of one node to another and queue those that became positive."""
-    del ties[kept][gone]
-    for other, weight in ties[gone].items():
-        if other == kept:
-            continue
-        del ties[other][gone]
-        total = ties[kept].get(other, 0.0) + weight
-        ties[kept][other] = ties[other][kept] = total
-        if total > 0.0:
-            heapq.heappush(queue, (-total, min(kept, other), max(kept, other)))
-    ties[gone] = {}
-
-
 def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
     """Return tau^2 / (tau^2 + sigma^2) of each camera, 1 where sigma is not known."""
     tau = _HOLD_SHARE * median_spread(centers)
@@ -245,15 +215,8 @@ def _hold(centers: FloatArray, largest_sigmas: FloatArray) -> FloatArray:
     return np.asarray(1.0 / (1.0 + (np.nan_to_num(largest_sigmas, nan=0.0, posinf=np.inf) / tau) ** 2))
 
 
-def _reason(agreement: float, usual: float, cause: Looseness | None, few: bool) -> str:
-    """Say why a camera's trust is low."""
-    if cause is Looseness.DISTANCE:
-        return str(cause.value)  # where it stands is arbitrary, and so is what agrees with it there
-    found = []
-    if agreement < usual:
-        found.append("more of its matches contradict it than usual here: its rotation may be wrong")
+def _loose_reason(cause: Looseness | None, few: bool) -> str:
+    """Say what leaves a camera loose, or nothing."""
     if cause is not None:
-        found.append(cause.value)
-    elif few:
-        found.append(Looseness.FEW_PAIRS.value)
-    return "; ".join(found) or "its pairs leave it somewhat loose"
+        return str(cause.value)
+    return str(Looseness.FEW_PAIRS.value) if few else ""

@@ -30,6 +30,7 @@ from sfm_shapefit.geometry import angle_between_deg, distances_in_spreads, norma
 from sfm_shapefit.judgement.conditioning import LooseGroup, condition
 from sfm_shapefit.judgement.group_uncertainty import GroupGauge, propagate_groups
 from sfm_shapefit.judgement.trust import PairFit, judge_cameras
+from sfm_shapefit.judgement.turns import Doubts
 from sfm_shapefit.judgement.uncertainty import propagate, standard_deviations
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.measured import MeasuredGraph
@@ -93,12 +94,18 @@ class Assessment:
     """(k,) of each camera, in [0, 1], see `trust.judge_cameras`."""
     reasons: tuple[str, ...]
     """k sentences that say why a trust is low; empty where it is not."""
+    hold: FloatArray
+    """(k,) the factor of trust that says how well the pairs hold each camera."""
+    loose_reasons: tuple[str, ...]
+    """k sentences that say what the pairs leave open; empty where they hold the camera."""
     loose_groups: tuple[LooseGroup, ...]
     """Cameras that the agreeing pairs leave loose at the solution although the graph is rigid, and why."""
     covariances: FloatArray
     """(n, d, d) covariance of each location in the units of `locations`, with centroid and scale of the
     cameras held fixed; of infinite diagonal for nodes outside the largest rigid piece of the inlier pairs;
     NaN, all of them, where the graph is too large for its factor."""
+    doubts: Doubts | None = None
+    """What the pairs' own rotations say of those given; None if they were not asked."""
 
     @property
     def sigmas(self) -> FloatArray:
@@ -170,6 +177,8 @@ def assess(
         excess_deg=float(np.degrees(excess)),
         trust=judged.trust,
         reasons=judged.reasons,
+        hold=judged.hold,
+        loose_reasons=judged.loose_reasons,
         loose_groups=conditioning.groups,
         covariances=covariances,
     )

@@ -96,8 +96,21 @@ class Finish(TypedDict):
     lud: Annotated[Lud | None, "The second start; null if it was not solved."]
 
 
+class PlacementAdjustment(TypedDict):
+    """How placed cameras were adjusted to the pixels, and their given rotations treated."""
+
+    statement: Annotated[str, "What was chosen and why, in words."]
+    rotations: Annotated[Literal["held", "weighted", "free"], "How the given rotations were treated."]
+    rotation_sigma_deg: Annotated[
+        float | None, "Standard deviation per axis by which they were weighted; null if they were not."
+    ]
+    chance_deg: Annotated[
+        float | None, "By how much chance would turn them per axis; null if the matches were not asked."
+    ]
+
+
 class RotationRefinement(TypedDict):
-    """What --refine-rotations changed."""
+    """What the adjustment of the placement changed of the given rotations."""
 
     num_updated: Annotated[int, "Cameras that turned."]
     num_kept: Annotated[int, "Cameras that keep the rotation of the input."]
@@ -205,7 +218,8 @@ class LocateSummary(PlacementSummary):
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
-    rotation_refinement: Annotated[RotationRefinement | None, "Null if it was not asked for."]
+    adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
+    rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
 
 

@@ -12,6 +12,7 @@ placed but are not in the output. Look also, though no camera can be named, if
 
     the matches of many pairs agree on two directions each, as before a repeated facade
     many rejected pairs agree on a second configuration
+    the matches of a camera prefer another focal length than the given one
     fewer than three quarters of the observations see a 3D point
 
 Otherwise the model is good. On thirteen real scenes with good rotations 62 to 99.8 % of the observations see
@@ -89,7 +90,11 @@ def judge_model(found: "LocateResult") -> ModelVerdict:
     kept = float(np.mean(found.kept))
     shares = _Shares(found.agreeing_observations, found.agreeing_pairs, kept)
     outside = [found.model.names[c] for c in found.placement.cameras[~found.kept].tolist()]
-    return _judge(found.placement, shares, outside, tuple(match_warnings(found.directions)))
+    repeats = tuple(match_warnings(found.directions))[:1]
+    lenses = tuple(
+        f"the matches of camera {d.camera} prefer another focal length" for d in found.focal_doubts
+    )
+    return _judge(found.placement, shares, outside, lenses + repeats)
 
 
 def judge_graph(found: "GraphResult") -> ModelVerdict:
@@ -100,7 +105,7 @@ def judge_graph(found: "GraphResult") -> ModelVerdict:
 
 
 def _judge(
-    placement: Placement, shares: _Shares, outside: list[str], repeats: tuple[str, ...]
+    placement: Placement, shares: _Shares, outside: list[str], suspicions: tuple[str, ...]
 ) -> ModelVerdict:
     """Apply the rules of the module's header."""
     bad = tuple(_reasons_against(placement, shares))
@@ -112,7 +117,7 @@ def _judge(
     rows = np.flatnonzero(doubtful)
     names = [placement.graph.name_of(int(cameras[k])) for k in rows[np.argsort(trust[rows], kind="stable")]]
     named = tuple(dict.fromkeys([*outside, *names]))
-    unnamed = list(repeats[:1])
+    unnamed = list(suspicions)
     if placement.second_configuration is not None:
         unnamed.append("many rejected pairs agree on a second configuration")
     if shares.observations < _FEW_OBSERVATIONS:

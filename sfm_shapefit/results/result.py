@@ -14,6 +14,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
+from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
@@ -79,8 +80,8 @@ class LocateResult(Displayed):
     warnings: tuple[str, ...]
     """What the user should know, a sentence each."""
     turned_deg: FloatArray | None = None
-    """(n,) by how much each rotation of the input was refined, exactly 0 where it was kept; None if
-    rotations were not to be refined."""
+    """(n,) by how much each rotation of the input was turned by the adjustment of the placement, exactly 0
+    where it was kept; None if there was none."""
     further: "tuple[FurtherPiece, ...]" = ()
     """The further rigid pieces of three cameras or more, each with a scale of its own."""
     fixed: BoolArray | None = None
@@ -92,6 +93,8 @@ class LocateResult(Displayed):
     agreeing_observations: float = math.nan
     """Of the keypoints of images in the output that are matched in two or more of the others, the share that
     sees a 3D point; NaN where there is no database."""
+    focal_doubts: tuple[FocalDoubt, ...] = ()
+    """Cameras whose matches prefer another focal length than the given one, by their id."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""

@@ -16,6 +16,7 @@ from sfm_shapefit.results.json_types import (
     GraphSummary,
     LocateSummary,
     Lud,
+    PlacementAdjustment,
     PlacementSummary,
     RigidGroups,
     RotationRefinement,
@@ -67,6 +68,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
         "rigid_groups": _summarize_groups(found),
+        "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),
     }
@@ -177,6 +179,19 @@ def _summarize_groups(found: "LocateResult") -> RigidGroups | None:
         "num_placed": len(np.unique(cameras[placement.cameras[found.kept]])),
         "num_fixed": 0 if found.fixed is None else int(np.sum(found.fixed)),
         "num_inner_pairs": int(np.sum(~placement.groups.joins(pairs))),
+    }
+
+
+def _summarize_adjustment(found: "LocateResult") -> PlacementAdjustment | None:
+    """Return how the placement was adjusted; None if it stayed as it was found."""
+    if found.adjustment is None:
+        return None
+    weight, errors = found.adjustment.weight, found.adjustment.errors
+    return {
+        "statement": found.adjustment.statement,
+        "rotations": "held" if weight.hold else "free" if weight.sigma_rad is None else "weighted",
+        "rotation_sigma_deg": None if weight.sigma_rad is None else math.degrees(weight.sigma_rad),
+        "chance_deg": None if errors is None else math.degrees(errors.chance_rad),
     }
 
 

@@ -5,8 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.geometry import median_spread
+from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
@@ -27,6 +30,7 @@ drawn courtyards, which are placed well, and 0.31 before drawn facades of one ho
 half of the cameras were shifted by a house without a contradiction."""
 # Fewer pairs on two directions prove nothing.
 _FEWEST_TWOFOLD = 3
+_NAMED = 3
 
 
 def quality_warnings(placement: Placement) -> Iterator[str]:
@@ -112,6 +116,33 @@ def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
         yield (
             f"{len(lost)} cameras are left out because they are not trusted, above all "
             f"{_least_trusted(placement, lost)}; --min-trust 0 keeps them"
+        )
+
+
+def ambiguity_warnings(placement: Placement) -> Iterator[str]:
+    """Yield which cameras stand as well turned as they do as placed."""
+    doubts = placement.assessment.doubts
+    if doubts is None:
+        return
+    ambiguous = [camera for camera, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
+    for body in np.unique(doubts.bodies[ambiguous]).tolist():
+        members = np.flatnonzero(doubts.bodies == body)
+        names = [placement.graph.name_of(int(placement.cameras[k])) for k in members[:_NAMED].tolist()]
+        more = f" and {len(members) - _NAMED} more" if len(members) > _NAMED else ""
+        yield (
+            f"the scene seems to repeat itself: as many matches say that {', '.join(names)}{more} should be "
+            f"turned by {doubts.angles_deg[members[0]]:.0f} degrees as say that they are right"
+        )
+
+
+def focal_warnings(model: PosedModel, doubts: tuple[FocalDoubt, ...]) -> Iterator[str]:
+    """Yield which cameras' matches prefer another focal length."""
+    for doubt in doubts:
+        focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())
+        yield (
+            f"the matches of camera {doubt.camera} prefer a focal length of about "
+            f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
+            "asked); its images stand wrong if that is so"
         )
 
 

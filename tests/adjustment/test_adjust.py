@@ -1,5 +1,8 @@
 """The adjustment's answers: what is held stays, what is weighted is between, and the gauge is the start's."""
 
+import signal
+import threading
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -422,3 +425,28 @@ def test_the_sparse_system_is_chosen_for_many_cameras_and_agrees_with_the_dense_
     dense = adjust(start, options, linear_solver="dense").problem
     np.testing.assert_allclose(auto.centers, dense.centers, atol=1e-9 * 8.0)
     assert not np.array_equal(auto.centers, dense.centers)  # rounding tells that two ways were gone
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_an_interrupt_ends_an_adjustment_after_the_slices_at_hand(threads):
+    _, start = make_start(num_cameras=60, num_points=4000)
+    endless = replace(TIGHT, threads=threads, max_iterations=10_000, loss_scale_px=0.01, cost_tolerance=0.0)
+    adjust(start, endless, max_iterations=1)  # loads the kernels
+    began = []
+
+    def press():
+        began.append(time.monotonic())
+        signal.raise_signal(signal.SIGINT)
+
+    def adjust_forever():
+        while True:
+            adjust(start, endless)
+
+    # The signal comes while kernels run without the GIL; Python hears of it between two of them.
+    timer = threading.Timer(0.2, press)
+    timer.start()
+    with pytest.raises(KeyboardInterrupt):
+        adjust_forever()
+    # A step takes a tenth of a second here.
+    assert time.monotonic() - began[0] < 5.0
+    timer.join()

@@ -259,6 +259,21 @@ def test_an_interrupt_once_the_output_stands_says_that_it_is_complete(tmp_path, 
     assert "the output" not in said  # what stands there is the earlier one
 
 
+@pytest.mark.parametrize("extra", [(), ("--bundle-adjust", "--no-adjust")])
+def test_an_interrupt_in_an_adjustment_leaves_nothing(tmp_path, monkeypatch, extra):
+    calls = []
+
+    def interrupted(*_arguments, **_how):
+        calls.append(1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("sfm_shapefit.adjustment.solve.eliminate_points", interrupted)
+    said = run_refused("locate", RING_MODEL, tmp_path / "out", "--no-report", *extra, code=130)
+    assert calls
+    assert "interrupted; nothing was written" in said
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_solve_writes_the_further_pieces_of_a_bare_graph(tmp_path):
     t = np.random.default_rng(0).standard_normal((8, 3))
     graph = exact_graph(t, [*all_pairs(5), *all_pairs((5, 6, 7))])

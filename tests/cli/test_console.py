@@ -41,6 +41,7 @@ def test_locate_counts_pairs_and_images():
         "read",
         "directions",
         "solve",
+        "adjustment",
         "further pieces",
         "structure",
         "triangulation",

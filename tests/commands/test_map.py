@@ -8,17 +8,21 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
+from abuse import determinism
+from abuse.verdicts import read_cameras
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
-from tests.program import run
+from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.synthetic.workspace import write_workspace
+from tests.program import run, run_python
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
 
 PAIR = 2147483647
-FAST = {"points": "never", "refine_rotations": False}
+FAST = {"points": "never"}
 
 
 def changed(scene, folder, *statements):
@@ -57,6 +61,112 @@ def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(
     run("map", database, tmp_path / "mine", "--overwrite", code=3)
     run("map", tmp_path / "missing.db", tmp_path / "o", code=3)
     assert not (tmp_path / "o").exists()
+
+
+@pytest.mark.parametrize("shape", ["ring", "facade"])
+def test_the_adjusted_first_placement_is_as_good_as_the_matches_allow(tmp_path, shape):
+    """All tracks of so few images are adjusted, as in bundle adjustment: the likeliest answer, but for the
+    loss. Averaged rotations are that of pairs, each of which sees its own matches only: every track of k
+    images is cut into pairs, and no two of them need agree on a point."""
+    size = {"num_images": 10, "num_points": 400, "max_pairs_per_image": 6, "max_keypoints_per_image": 200}
+    write_workspace(make_scene(SceneOptions(shape=shape, seed=2, **size)), tmp_path / "made")
+
+    def errors(**options):
+        found = sfm_shapefit.map_database(tmp_path / "made" / "database.db", min_trust=0.0, **options)
+        compared = sfm_shapefit.evaluate(
+            found.models[0].located.reconstruction, tmp_path / "made" / "sparse" / "0"
+        )
+        assert len(compared.names) == 10
+        return compared.position.rms, compared.rotation_deg.rms
+
+    coarse, adjusted, likeliest = errors(adjust=False), errors(), errors(bundle_adjust=True)
+    for k in range(2):
+        assert adjusted[k] < 1.1 * likeliest[k]
+        assert adjusted[k] < coarse[k] / 1.5
+
+
+def test_images_that_see_few_points_are_left_out_with_the_reason(tmp_path):
+    everyone = sfm_shapefit.map_database(RING / "database.db", min_points_per_image=0).models[0].located
+    model = everyone.reconstruction
+    counts = {image.name: image.num_points3D for image in model.images.values()}
+    assert everyone.kept.all()
+    assert everyone.few_points == {}
+    poorest = min(counts, key=counts.get)
+    limit = counts[poorest] + 1
+    out = tmp_path / "out"
+    told = run("map", RING / "database.db", out, "--min-points-per-image", limit, "--json", code=0).stdout
+    # The others have enough without the observations that the poorest takes along.
+    assert json.loads(told)["models"][0]["located"]["few_points"] == {poorest: limit - 1}
+    written = read_model(out / "0").reconstruction
+    kept = {written.image(k).name: written.image(k).num_points3D for k in written.reg_image_ids()}
+    assert kept == {name: count for name, count in counts.items() if name != poorest}
+    reasons = {row["name"]: row["reason"] for row in read_cameras(out / "0")}
+    assert [name for name, reason in reasons.items() if reason] == [poorest]
+    assert f"{limit - 1} points" in reasons[poorest]
+
+
+@pytest.mark.parametrize("flags", [("--bundle-adjust",), ("--averaging", "pycolmap")])
+def test_threads_repetition_and_hashes_change_no_byte(tmp_path, flags):
+    assert list(determinism.differing_files(RING, tmp_path, command="map", always=flags)) == []
+
+
+STAGES = ("relative rotations", "rotation averaging", "first placement", "locate")
+INTERRUPTED = """
+import os, signal, sys
+from contextlib import contextmanager
+from sfm_shapefit.cli import main
+from sfm_shapefit.commands.stages.clock import Clock
+
+stage, sys.argv = sys.argv[1], ["sfm-shapefit", *sys.argv[2:]]
+timed = Clock.__call__
+
+def begin(clock, name):
+    if name == stage:
+        os.kill(os.getpid(), signal.SIGINT)
+    return timed(clock, name)
+
+Clock.__call__ = begin
+main()
+"""
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_an_interrupt_in_any_stage_leaves_nothing(tmp_path, stage):
+    done = run_python("-c", INTERRUPTED, stage, "map", RING / "database.db", tmp_path / "out", "-q")
+    assert (done.returncode, done.stderr) == (130, "sfm-shapefit: interrupted; nothing was written\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_whoever_watches_the_progress_can_cancel_in_any_stage(stage):
+    seen = []
+
+    def cancel(name, _done, _total):
+        seen.append(name)
+        if name == stage:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sfm_shapefit.map_database(RING / "database.db", progress=cancel)
+    assert seen[-1] == stage
+
+
+@pytest.mark.parametrize(
+    ("flags", "words"),
+    [
+        (["--averaging", "ceres"], "'ceres' is not one of 'own', 'pycolmap'"),
+        (["--rotations", "measured"], "map finds the rotations itself"),
+        (["--rotation-sigma-deg", "0.1"], "map finds the rotations itself"),
+        (["--rotations", "exact"], "'exact' is not one of"),
+        (["--adjuster", "ceres"], "adjuster has no effect without bundle_adjust"),
+        (["--min-points-per-image", "-1"], "min_points_per_image must be"),
+    ],
+)
+def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, words):
+    said = run("map", RING / "database.db", tmp_path / "out", *flags, code=2).stderr
+    assert words in said
+    assert "Traceback" not in said
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):

@@ -34,6 +34,7 @@ WORK = Workload(
     num_sampled=120_000,
     has_points=True,
     factor_entries=5_000_000,
+    adjusts=True,
 )
 BARE = replace(WORK, num_edges=100_000, num_nodes=1000, has_points=False, factor_entries=2_000_000)
 
@@ -43,7 +44,14 @@ def test_neither_a_cheaper_economy_nor_less_work_needs_more_memory(name):
     peaks = [forecast(WORK, economy).peak_mb for economy in ECONOMIES]
     assert peaks == sorted(peaks, reverse=True)
     assert peaks[0] > 2.0 * peaks[-1]
-    more = replace(WORK, **{name: {"has_points": True}.get(name, 2 * getattr(WORK, name))})
+    more = replace(
+        WORK,
+        **{
+            name: {"has_points": True, "adjusts": True, "adjusts_bundle": True}.get(
+                name, 2 * getattr(WORK, name)
+            )
+        },
+    )
     for economy, peak in zip(ECONOMIES, peaks, strict=True):
         assert forecast(more, economy).peak_mb >= peak
 
@@ -109,6 +117,27 @@ def test_points_that_are_given_up_are_in_the_graph_no_more():
     assert keep_within_memory(work, measured, LocateOptions(), ECONOMIES[0])[1] is measured
 
 
+def test_an_adjustment_is_forecast_and_given_up_but_not_the_one_that_was_asked_for():
+    crowded = replace(WORK, num_matches=20_000_000, num_keypoints=20_000_000)
+    peaks = {economy.adjustment: forecast(crowded, economy).peak_mb for economy in ECONOMIES}
+    assert set(forecast(crowded).memory_mb) - set(forecast(replace(crowded, adjusts=False)).memory_mb) == {
+        "adjusting"
+    }
+    # Each of 14 million observations has an entry of 144 bytes at least, among much else.
+    assert peaks[True] > peaks[False] + 14 * 144
+    asked = replace(crowded, adjusts_bundle=True)
+    assert forecast(asked, ECONOMIES[-1]).peak_mb > 14 * 144
+    measured = MeasuredGraph(loop_graph())
+    last = [economy for economy in ECONOMIES if economy.adjustment][-1]
+    needed = forecast(describe_work(crowded, measured, LocateOptions()), last).peak_mb
+    options = LocateOptions(max_memory_mb=int(needed) - 1)
+    economy, _, changed = keep_within_memory(crowded, measured, options, ECONOMIES[0])
+    assert "not adjusted" in economy.statement
+    assert not changed.adjust
+    plenty = replace(options, max_memory_mb=10**6)
+    assert keep_within_memory(crowded, measured, plenty, ECONOMIES[0])[2].adjust
+
+
 @pytest.fixture(scope="module")
 def workspaces(tmp_path_factory):
     """Models with a database: plain, and of rigs."""
@@ -146,6 +175,7 @@ def test_what_is_given_up_is_what_the_warning_says(workspaces, kind):
         statement = next(text for text in found.warnings if text.startswith("to stay below max_memory_mb"))
         evidence = found.placement.measured.evidence
         assert ("count as independent" in statement) == (evidence.errors is None)
+        assert ("not adjusted" in statement) == (found.adjustment is None)
         assert ("neither refined" in statement) == (not found.placement.refined.is_refined)
     else:
         pytest.fail("no limit was refused")

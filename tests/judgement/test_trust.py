@@ -6,8 +6,9 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.judgement.bodies import find_bodies
 from sfm_shapefit.judgement.conditioning import condition
-from sfm_shapefit.judgement.trust import PairFit, find_consensus, judge_cameras
+from sfm_shapefit.judgement.trust import PairFit, judge_cameras
 from sfm_shapefit.judgement.verdicts import assess
 from sfm_shapefit.measured import Evidence, MeasuredGraph
 from sfm_shapefit.solver.program import differences
@@ -121,8 +122,8 @@ def test_evidence_follows_its_cameras_and_pairs():
 
 def test_bodies_join_while_more_speaks_for_it_than_against():
     pairs = np.array([(0, 1), (1, 2), (3, 4), (2, 3), (0, 4)])
-    for last, joined in ((-2.0, [True] * 5), (-4.0, [True] * 3 + [False] * 2)):
-        assert find_consensus(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, last])).tolist() == joined
+    for last, joined in ((-2.0, [0] * 5), (-4.0, [0] * 3 + [1] * 2)):
+        assert find_bodies(5, pairs, np.array([9.0, 8.0, 7.0, 3.0, last])).tolist() == joined
 
 
 def test_turned_cameras_of_a_scene_are_left_out_named_and_can_be_kept():

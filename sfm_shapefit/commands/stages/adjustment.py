@@ -7,6 +7,7 @@ once, and rotations that the matches know better than whoever gave them.
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,20 +17,15 @@ from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_plac
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
+from sfm_shapefit.commands.stages.measure import measure_directions
 from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
-from sfm_shapefit.geometry import rotation_angles_deg
+from sfm_shapefit.directions.pair_directions import PairDirections
+from sfm_shapefit.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
-
-# With more cameras, the adjustment would take longer than all the rest.
-_MOST_CAMERAS = 2_000
-
-
-def is_adjusted(options: LocateOptions, num_cameras: int) -> bool:
-    """Return whether placed cameras are adjusted; the optimum as it is, and what priors pulled, are not."""
-    as_found = options.objective not in ("auto", "lud") or not options.refine or options.refine_with_priors
-    return options.adjust and not as_found and num_cameras <= _MOST_CAMERAS
+from sfm_shapefit.viewgraph import ViewGraph
 
 
 def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
@@ -39,14 +35,27 @@ def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     return {"auto": None, "measured": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
 
 
-def adjust_placed(
-    source: MatchSource, located: Located, options: LocateOptions, clock: Clock
-) -> tuple[MatchSource, Placement, AdjustedPlacement]:
-    """Adjust all placed cameras, in the gauge that was chosen.
+class AfterAdjustment(NamedTuple):
+    """What an adjustment makes of the placement that it started from."""
 
-    Returns:
-        The source at the adjusted rotations, the placement moved to the adjusted centers and judged there,
-        and how it went.
+    source: MatchSource
+    """At the adjusted rotations."""
+    directions: PairDirections
+    """Measured anew at these, as far as they are usable there too."""
+    placement: Placement
+    """Moved to the adjusted centers and judged there, by those directions."""
+    adjusted: AdjustedPlacement
+    """How it went."""
+
+
+def adjust_placed(
+    source: MatchSource,
+    directions: PairDirections,
+    located: Located,
+    options: LocateOptions,
+    clock: Clock,
+) -> AfterAdjustment:
+    """Adjust all placed cameras, in the gauge that was chosen.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
@@ -62,10 +71,13 @@ def adjust_placed(
     locations = (centers - similarity.translation) / similarity.scale
     if not adjusted.weight.hold:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
+        directions = _measure_again(source, directions, options, clock)
+        turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
+        placement = replace(placement, measured=_turn(placement.measured, directions, turns))
     moved = with_covariances(
         move_cameras(placement, locations, options), model, adjusted.covariances, similarity.scale
     )
-    return source, moved, adjusted
+    return AfterAdjustment(source, directions, moved, adjusted)
 
 
 def with_covariances(
@@ -78,6 +90,39 @@ def with_covariances(
     ids = model.image_ids[placement.cameras].tolist()
     own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
     return replace(placement, adjusted_covariances=own)
+
+
+def _measure_again(
+    source: MatchSource, before: PairDirections, options: LocateOptions, clock: Clock
+) -> PairDirections:
+    """Return the usable directions as they are at other rotations; the others, and what is said, stay."""
+    if source.kind == "relative-poses":
+        return before
+    again = measure_directions(source, options, clock)
+    both = np.intersect1d(before.usable(), again.usable())
+    directions = before.directions.copy()
+    directions[both] = again.directions[both]
+    return replace(before, directions=directions)
+
+
+def _turn(measured: MeasuredGraph, directions: PairDirections, turns: FloatArray) -> MeasuredGraph:
+    """Return the measured graph with other directions; rays to points turn with their cameras (n, 3, 3).
+
+    Covariances and samples of errors are those of before, in the bases of the new directions.
+    """
+    graph = measured.graph
+    rays = np.flatnonzero(~measured.is_pair)
+    new = graph.directions.copy()
+    new[measured.pairs] = directions.directions[directions.usable()]
+    new[rays] = np.einsum("kab,kb->ka", turns[graph.edges[rays, 0]], graph.directions[rays])
+    bases = tangent_bases(new).transpose(0, 2, 1) @ tangent_bases(graph.directions)
+    covariance, evidence = measured.covariance, measured.evidence
+    if covariance is not None:
+        covariance = bases @ covariance @ bases.transpose(0, 2, 1)
+    if evidence is not None and evidence.errors is not None:
+        evidence = replace(evidence, errors=evidence.errors @ bases.transpose(0, 2, 1))
+    turned = ViewGraph(graph.num_nodes, graph.edges, normalized(new), graph.weights, graph.names)
+    return replace(measured, graph=turned, covariance=covariance, evidence=evidence)
 
 
 def turned_deg(before: FloatArray, after: FloatArray) -> FloatArray:

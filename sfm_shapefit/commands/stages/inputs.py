@@ -92,7 +92,11 @@ def open_source(
     with open_database(inputs.database, model) as database:
         source = MatchSource(model=model, kind=inputs.source, database=database)
         if options is not None and options.max_memory_mb:
-            bare = source.workload()
+            bare = replace(
+                source.workload(),
+                adjusts=options.adjusts_cameras(model.num_images),
+                adjusts_bundle=options.bundle_adjust,
+            )
             work = replace(bare, has_points=options.uses_points(model.num_images))
             source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
         yield source

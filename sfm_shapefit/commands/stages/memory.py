@@ -35,6 +35,12 @@ _KERNELS_BYTES = 110e6
 _SAMPLES = 96
 # Entries of a block of the factor.
 _BLOCK = 9
+# Observations of points that are adjusted, for each match, where keypoints are more: .45 to .66 on real sets.
+_OBSERVATIONS_OF_A_MATCH = 0.7
+# Of an observation: its track, and its part of the normal equations.
+_OBSERVATION_BYTES = 620.0
+# Unknowns of an adjusted camera, and up to how many of them their system is dense.
+_UNKNOWNS, _DENSE_UNKNOWNS = 6, 3000
 
 BATCH = 2_000_000
 """Matches that are read at a time where memory is no concern."""
@@ -62,6 +68,10 @@ class Workload:
     """Whether 3D points join the graph."""
     factor_entries: int = 0
     """Blocks of the factor, its stack included; 0 where there is none."""
+    adjusts: bool = False
+    """Whether placed cameras are adjusted by their matches."""
+    adjusts_bundle: bool = False
+    """Whether the seed goes through bundle adjustment, which cannot be given up."""
     needs_factor: bool = False
     """Whether the factor cannot be given up, since the solve itself, or priors that pull, work with it."""
 
@@ -80,6 +90,8 @@ class Economy:
     """Whether the errors of directions are sampled together where keypoints are shared."""
     points: bool = True
     """Whether 3D points may join the graph."""
+    adjustment: bool = True
+    """Whether placed cameras may be adjusted by their matches."""
     factor: bool = True
     """Whether there is a factor for the refinement and the standard deviations."""
 
@@ -93,6 +105,7 @@ def _list_economies() -> Iterator[Economy]:
         ("matches are read in small batches", {"batch": _SMALL_BATCH, "rays_bytes": _FEW_RAYS_BYTES}),
         ("directions count as independent in standard deviations", {"samples": False}),
         ("no 3D points join the view graph", {"points": False}),
+        ("cameras are not adjusted by their matches", {"adjustment": False}),
         ("locations are neither refined nor have they standard deviations", {"factor": False}),
     ):
         given_up.append(what)
@@ -168,6 +181,8 @@ def keep_within_memory(
     )
     if not economy.factor:
         options = replace(options, factor_memory_mb=NO_FACTOR, refine=False)
+    if not economy.adjustment:
+        options = replace(options, adjust=False)
     return economy, measured if economy.points else bare, options
 
 
@@ -187,6 +202,8 @@ def describe_work(work: Workload, measured: MeasuredGraph, options: LocateOption
         num_nodes=graph.num_nodes,
         num_sampled=graph.num_edges if work.num_sampled else 0,
         has_points=measured.num_points > 0,
+        adjusts=options.adjusts_cameras(work.num_images),
+        adjusts_bundle=options.bundle_adjust,
         factor_entries=entries,
         needs_factor=needs_factor,
     )
@@ -227,5 +244,21 @@ def _peaks(work: Workload, economy: Economy) -> dict[str, float]:
     peaks["placing"] = throughout + kept + solving + 2.5 * samples + moved + factor
     seeds = 66.0 * work.num_keypoints
     matches = 46.0 * work.num_matches
+    if work.adjusts_bundle or (work.adjusts and economy.adjustment):
+        observations = min(work.num_keypoints, _OBSERVATIONS_OF_A_MATCH * work.num_matches)
+        adjusting = _OBSERVATION_BYTES * observations + _adjusted_cameras_bytes(work)
+        peaks["adjusting"] = throughout + kept + 300.0 * work.num_edges + seeds + matches + adjusting
     peaks["triangulating"] = throughout + kept + 300.0 * work.num_edges + seeds + matches + 0.5 * batch
     return peaks
+
+
+def _adjusted_cameras_bytes(work: Workload) -> float:
+    """Return the bytes of the system of the cameras in an adjustment: blocks of pairs, and a factor.
+
+    Beyond the size that is dense, its graph is about that of the pairs, and its factor that of the placement
+    with blocks of another size.
+    """
+    unknowns = _UNKNOWNS * work.num_images
+    blocks = 3.0 * 8.0 * _UNKNOWNS**2 * (work.num_pairs + work.num_images)
+    entries = unknowns**2 if unknowns <= _DENSE_UNKNOWNS else 1.2 * _UNKNOWNS**2 * work.factor_entries
+    return blocks + 8.0 * entries

@@ -57,10 +57,6 @@ def find_rigid_parts(model: PosedModel, options: LocateOptions, *, has_priors: b
     count = int(np.sum(fixed))
     if options.scale == "rig" and not model.has_rigs:
         raise InputError("the model has no rig of several cameras to take the scale from; use another scale")
-    if options.refine_rotations and model.has_rigs:
-        raise InputError("the cameras of a frame turn as one, not one by one; leave out refine_rotations")
-    if options.refine_rotations and count:
-        raise InputError("fixed cameras keep their rotations; leave out refine_rotations")
     if count and has_priors:
         raise InputError(
             "fixed cameras stay in the axes of the input, priors turn them; leave out one of these"

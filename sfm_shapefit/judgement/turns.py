@@ -1,0 +1,399 @@
+"""Which cameras are turned: two explanations of the matches of a camera with the rest, weighed.
+
+The relative rotation of a pair from its own matches, against the given rotations R, leaves a turn in world
+axes,
+
+    E = R_j^T R_ij R_i = T_j^T T_i,    T the turn that takes the rays of a camera to where they belong,
+
+so that a pair with cameras that are right says of a camera i what its turn would be: E, or E^T where i is
+the second of the pair. If the camera stands as placed the turns are 0. If its rotation is wrong, all its
+pairs say the same T, for a camera has one rotation only. Pairs of repeated structure say one thing and
+another, or what the symmetry of the scene makes of a right camera. So for a camera, and for each body of
+cameras that agree among themselves:
+
+    placed    the weight of the pairs that fit the given rotations and the solution
+    turned    the weight of the pairs that agree on one turn T instead, the T of most weight
+
+A pair that both explain counts for neither. With the share s = placed / (placed + turned):
+
+    right         s >= 0.6
+    ambiguous     s >= 0.3: both explain many pairs, as in a symmetric scene; which is true is not said
+    turned        s < 0.3, and two pairs or more agree on T
+    unsupported   a single camera with which no pair agrees as placed, nor do two on a turn
+    unknown       no pair says how the camera, or its body, stands to the others
+
+Bodies are found by contraction (`bodies`) from pairs that agree and pairs that contradict. What turns whom is
+relative: of all bodies the one whose turn mends most is turned first, the smallest of equals, and none that
+has more than half of all cameras; its pairs then agree, and bodies are found anew.
+
+How exact a turn is. The matches of a pair are no independent witnesses of its rotation: errors of calibration
+and of neighboring keypoints are common to them. So their information counts as that of 20 at most, 0.1
+degrees are added for the given rotations, and where the quarter of pairs that agrees best has larger errors
+than that, all standard deviations are as much larger. Chosen on fourteen scenes of good rotations: 4 to 12 %
+of their sound pairs seem turned, and 98 % of those of cameras that were turned by 2 degrees.
+
+How well the matches of a pair fit the given rotations, with the best direction, against how well they fit the
+best rotation: the ratio of the mean robust weights, of which the former is estimated from share and median
+residual of the inliers. It is 1 or more for all but 5 % of the right pairs.
+"""
+
+import enum
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.directions.pair_directions import PairDirections, is_usable
+from sfm_shapefit.judgement.bodies import find_bodies
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.rotations.two_view_poses import LAST_WIDTH_PX
+
+# Matches of a pair that count as independent, for its turn and for its vote.
+_INDEPENDENT_MATCHES = 20.0
+_MOST_WEIGHT = 200.0
+_FLOOR_RAD = np.radians(0.1)
+# Turns that are below both count as none; in standard deviations of the least certain axis.
+_LEAST_TURN_RAD = np.radians(1.0)
+_AGREEING_SIGMAS = 3.5
+# By so many standard deviations a pair has to fit one explanation better than the other, to prefer it.
+_PREFERENCE = 0.5
+# An agreement says nothing where the turn could as well be larger than this.
+_LARGEST_SIGMA_RAD = np.radians(3.0)
+# The level of errors is taken from pairs with smaller turns: the quantile, and what it is of normal errors.
+_NEAR_RAD = np.radians(10.0)
+_LEVEL_QUANTILE, _NORMAL_QUANTILE = 0.25, 1.1
+# Ratio of robust weights from which matches do not fit the given rotations, and from which they fully do.
+_UNEXPLAINED, _EXPLAINED = 0.7, 0.95
+# Median residual of a robust fit over that of all of its matches.
+_MEAN_OF_MEDIAN = 0.8
+# Support of a pair whose direction agrees while its own rotation does not.
+_DIRECTION_ALONE = 0.5
+RIGHT_SHARE, TURNED_SHARE = 0.6, 0.3
+"""Shares s from which a camera is right, and below which it is turned."""
+# Turns of a body that are compared with one another; those of most weight.
+_MOST_VOTES = 300
+_MOST_TURNED = 50
+_AVERAGING_STEPS = 4
+
+
+class Doubt(enum.Enum):
+    """What the pairs of a camera say of its rotation."""
+
+    RIGHT = "right"
+    AMBIGUOUS = "ambiguous"
+    TURNED = "turned"
+    UNSUPPORTED = "unsupported"
+    UNKNOWN = "unknown"
+
+
+class PairTurns(NamedTuple):
+    """What k pairs say of the rotations of their cameras."""
+
+    pairs: IntArray
+    """(k, 2) cameras."""
+    turns: FloatArray
+    """(k, 3, 3) E in world axes; the identity where it is not known."""
+    sigmas_rad: FloatArray
+    """(k,) standard deviation of the turn along its least certain axis; infinite where it is not known."""
+    weights: FloatArray
+    """(k,) what the pair counts: its matches, up to a limit."""
+    placed: FloatArray
+    """(k,) in [0, 1], how well the matches fit the given rotations and the solved baseline."""
+    astray: FloatArray
+    """(k,) 1 where the rotation agrees and yet the direction is another than the solved baseline's."""
+
+    def subset(self, rows: IntArray | BoolArray) -> "PairTurns":
+        """Return the given pairs, in that order."""
+        return PairTurns(
+            self.pairs[rows],
+            self.turns[rows],
+            self.sigmas_rad[rows],
+            self.weights[rows],
+            self.placed[rows],
+            self.astray[rows],
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Doubts:
+    """What the pairs say of the rotations of n cameras."""
+
+    kinds: tuple[Doubt, ...]
+    """n verdicts."""
+    placed: FloatArray
+    """(n,) weight of the pairs that agree with the camera, or its body, as placed."""
+    turned: FloatArray
+    """(n,) weight of the pairs that agree on a turn instead."""
+    num_turned: IntArray
+    """(n,) the number of these pairs."""
+    angles_deg: FloatArray
+    """(n,) that turn; NaN where there is none."""
+    astray: FloatArray
+    """(n,) weight of the pairs that agree with the rotation, and whose direction is off the solution."""
+    bodies: IntArray
+    """(n,) label of the body with which the camera was judged; cameras judged alone have one of their own."""
+
+    def members(self, camera: int) -> IntArray:
+        """Return the cameras of a camera's body, ascending."""
+        return np.flatnonzero(self.bodies == self.bodies[camera])
+
+
+def fit_as_placed(directions: PairDirections) -> FloatArray:
+    """Return about the mean robust weight of the matches of k pairs under the given rotations, (k,)."""
+    inlier_share = directions.num_inliers / np.maximum(directions.num_matches, 1)
+    residual = _MEAN_OF_MEDIAN * np.nan_to_num(directions.median_residual_px) / LAST_WIDTH_PX
+    return np.asarray(inlier_share / (1.0 + residual**2) ** 2)
+
+
+def weigh_pairs(
+    directions: PairDirections, agreements: FloatArray, relative: RelativeRotations, rotations: FloatArray
+) -> PairTurns:
+    """Return what pairs say of rotations, from their directions and from their own relative rotations.
+
+    Args:
+        directions: of k pairs.
+        agreements: (k,) 1 where the direction agrees with the solved baseline, 0 where it does not; NaN where
+            that is not known.
+        relative: of some of these pairs, in any order; a pair without is taken as its direction says.
+        rotations: (n, 3, 3) the given ones, cam_from_world.
+    """
+    k, n = len(directions.pairs), len(rotations)
+    codes = directions.pairs[:, 0] * n + directions.pairs[:, 1]
+    order = np.argsort(codes, kind="stable")
+    own = relative.pairs[:, 0] * n + relative.pairs[:, 1]
+    row = order[np.minimum(np.searchsorted(codes[order], own), k - 1)] if k else np.zeros(0, dtype=np.int64)
+    found = codes[row] == own if k else np.zeros(0, dtype=np.bool_)
+    relative, row = relative.subset(found), row[found]
+
+    i, j = relative.pairs.T
+    turns, sigmas = np.tile(np.eye(3), (k, 1, 1)), np.full(k, np.inf)
+    turns[row] = rotations[j].transpose(0, 2, 1) @ relative.rotations @ rotations[i]
+    counts = relative.num_matches * relative.weight_shares
+    variances = 1.0 / np.maximum(np.linalg.eigvalsh(relative.information)[:, 0], 1e-12)
+    variances *= np.maximum(1.0, counts / _INDEPENDENT_MATCHES)
+    sound = relative.are_sound()
+    sigmas[row[sound]] = np.sqrt(variances + _FLOOR_RAD**2)[sound]
+
+    fit_best = np.ones(k)
+    fit_best[row] = np.maximum(relative.weight_shares, 1e-9)
+    explained = np.clip(
+        (fit_as_placed(directions) / fit_best - _UNEXPLAINED) / (_EXPLAINED - _UNEXPLAINED), 0.0, 1.0
+    )
+    usable = is_usable(directions.status)
+    small = _angles(turns) <= np.maximum(_AGREEING_SIGMAS * sigmas, _LEAST_TURN_RAD)
+    known = np.isfinite(sigmas)
+    judged = usable & np.isfinite(agreements)
+    support = np.where(judged, np.nan_to_num(agreements) * explained, 0.0)
+    asked = np.zeros(k, dtype=np.bool_)
+    asked[row] = True
+    support = np.where(asked & ~(known & small), _DIRECTION_ALONE * support, support)
+    # A pair without a direction that could be compared speaks for the rotation all the same.
+    support = np.where(~judged & known & small & (sigmas <= _LARGEST_SIGMA_RAD), explained, support)
+    astray = judged & (np.nan_to_num(agreements) < 0.5) & (~asked | (known & small))
+    weights = np.minimum(directions.num_matches.astype(np.float64), _MOST_WEIGHT)
+    weights[row] = np.minimum(counts, _MOST_WEIGHT)
+    return PairTurns(directions.pairs, turns, sigmas, weights, support, astray.astype(np.float64))
+
+
+def find_turned(pairs: PairTurns, labels: IntArray) -> Doubts:
+    """Return what the pairs say of the rotation of each camera.
+
+    Args:
+        pairs: between cameras.
+        labels: (n,) the rigid group, such as the frame, of each camera; cameras of a group turn as one.
+    """
+    group, count = labels, int(labels.max(initial=-1)) + 1
+    ends = group[pairs.pairs]
+    kept = ends[:, 0] != ends[:, 1]
+    case = pairs.subset(kept)._replace(pairs=ends[kept])
+    inflation = _inflation(case)
+    case = case._replace(sigmas_rad=case.sigmas_rad * inflation)
+    least_rad = _LEAST_TURN_RAD * max(1.0, inflation / 2.0)
+    judged = [_Judged() for _ in range(count)]
+    body_of = np.arange(count)
+    done: BoolArray = np.zeros(count, dtype=np.bool_)
+    for _ in range(_MOST_TURNED):
+        bodies = _find_bodies(case, count)
+        worst = _worst_body(case, bodies, done, least_rad)
+        if worst is None:
+            break
+        body, found = worst
+        members = np.flatnonzero(body)
+        for member in members.tolist():
+            judged[member] = found
+        body_of[members] = members[0]
+        done |= body
+        case = _mend(case, body, found.turn)
+    bodies = _find_bodies(case, count)
+    largest = bodies == 0
+    for label in range(int(bodies.max(initial=-1)) + 1):
+        inside = (bodies == label) & ~done
+        parts = [np.arange(count) == u for u in np.flatnonzero(inside)] if label == 0 else [inside]
+        for part in parts:
+            members = np.flatnonzero(part)
+            if len(members) == 0:
+                continue
+            found = _judge(case, part, largest & ~part, least_rad)
+            for member in members.tolist():
+                judged[member] = found
+            body_of[members] = members[0]
+    return Doubts(
+        kinds=tuple(judged[g].kind for g in group.tolist()),
+        placed=np.array([judged[g].placed for g in group.tolist()]),
+        turned=np.array([judged[g].turned for g in group.tolist()]),
+        num_turned=np.array([judged[g].num_turned for g in group.tolist()], dtype=np.int64),
+        angles_deg=np.array([judged[g].angle_deg for g in group.tolist()]),
+        astray=np.array([judged[g].astray for g in group.tolist()]),
+        bodies=body_of[group],
+    )
+
+
+class _Judged(NamedTuple):
+    """The two explanations of a body's pairs with others, weighed."""
+
+    placed: float = 0.0
+    turned: float = 0.0
+    num_turned: int = 0
+    astray: float = 0.0
+    num_pairs: int = 0
+    is_alone: bool = True
+    """Whether the body is a single camera."""
+    turn: FloatArray = np.eye(3)
+
+    @property
+    def angle_deg(self) -> float:
+        """The angle of the turn, NaN without."""
+        return float(np.degrees(_angles(self.turn[None])[0])) if self.num_turned else np.nan
+
+    @property
+    def kind(self) -> Doubt:
+        """The verdict."""
+        share = self.placed / max(self.placed + self.turned, 1e-300)
+        if share < TURNED_SHARE and self.num_turned > 1:
+            return Doubt.TURNED
+        if self.placed <= 0.0:
+            return Doubt.UNSUPPORTED if self.is_alone and self.num_pairs else Doubt.UNKNOWN
+        return Doubt.RIGHT if share >= RIGHT_SHARE else Doubt.AMBIGUOUS
+
+
+def _angles(rotations: FloatArray) -> FloatArray:
+    """Return the angles (k,) of rotations (k, 3, 3), radians in [0, pi]; exact for small ones too."""
+    half = np.linalg.norm(rotations - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return np.asarray(2.0 * np.arcsin(np.minimum(half, 1.0)))
+
+
+def _inflation(pairs: PairTurns) -> float:
+    """Return by what the turns near 0 are larger than their standard deviations say, at least 1."""
+    angles = _angles(pairs.turns)
+    near = np.isfinite(pairs.sigmas_rad) & (angles < _NEAR_RAD)
+    if not near.any():
+        return 1.0
+    quantile = float(np.quantile(angles[near] / pairs.sigmas_rad[near], _LEVEL_QUANTILE))
+    return max(1.0, quantile / _NORMAL_QUANTILE)
+
+
+def _contradicts(pairs: PairTurns) -> BoolArray:
+    """Return which pairs say that one of their cameras is turned, (k,)."""
+    known = np.isfinite(pairs.sigmas_rad)
+    limits = np.maximum(_AGREEING_SIGMAS * np.where(known, pairs.sigmas_rad, 0.0), _LEAST_TURN_RAD)
+    return np.asarray(known & (_angles(pairs.turns) > limits))
+
+
+def _find_bodies(pairs: PairTurns, count: int) -> IntArray:
+    """Return the body of each of the groups, (count,); 0 is the largest."""
+    signed = np.where(_contradicts(pairs), pairs.placed - 1.0, pairs.placed)
+    return find_bodies(count, pairs.pairs, pairs.weights * signed)
+
+
+def _worst_body(
+    pairs: PairTurns, bodies: IntArray, done: BoolArray, least_rad: float
+) -> tuple[BoolArray, _Judged] | None:
+    """Return the body whose turn mends most, the smallest of equals, and what is said of it."""
+    found = []
+    for label in range(int(bodies.max(initial=-1)) + 1):
+        body = (bodies == label) & ~done
+        if not body.any() or 2 * body.sum() > len(body):
+            continue
+        judged = _judge(pairs, body, ~body, least_rad)
+        if judged.kind is Doubt.TURNED:
+            found.append((body, judged))
+    if not found:
+        return None
+    most = max(judged.turned - judged.placed for _, judged in found)
+    equal = [one for one in found if one[1].turned - one[1].placed >= 0.9 * most]
+    return min(equal, key=lambda one: int(one[0].sum()))
+
+
+def _judge(pairs: PairTurns, body: BoolArray, others: BoolArray, least_rad: float) -> _Judged:
+    """Weigh the two explanations of the pairs of a body (count,) with others (count,)."""
+    is_first = body[pairs.pairs[:, 0]] & others[pairs.pairs[:, 1]]
+    is_second = body[pairs.pairs[:, 1]] & others[pairs.pairs[:, 0]]
+    rows = np.flatnonzero(is_first | is_second)
+    weights, support, sigmas = pairs.weights[rows], pairs.placed[rows], pairs.sigmas_rad[rows]
+    contradict = _contradicts(pairs)[rows]
+    placed, against = float(weights @ support), float(weights[contradict].sum())
+    astray = float(weights @ pairs.astray[rows])
+    judged = _Judged(placed=placed, astray=astray, num_pairs=len(rows), is_alone=bool(body.sum() == 1))
+    if against <= placed * (1.0 - RIGHT_SHARE) / RIGHT_SHARE:
+        return judged
+    votes = np.where(is_first[rows, None, None], pairs.turns[rows], pairs.turns[rows].transpose(0, 2, 1))
+    turn = _common_turn(votes, sigmas, weights * (1.0 - support), contradict)
+    if turn is None or _angles(turn[None])[0] <= least_rad:
+        return judged
+    known = np.isfinite(sigmas)
+    scale = np.where(known, sigmas, 1.0)
+    off_turned = np.where(known, _angles(votes @ turn.T) / scale, np.inf)
+    off_placed = np.where(known, _angles(votes) / scale, np.inf)
+    turned = (off_turned <= _AGREEING_SIGMAS) & (off_turned + _PREFERENCE < off_placed)
+    # What fits as placed, within the accuracy of its own rotation, is no evidence for the turn.
+    fit_both = np.where(off_placed <= _AGREEING_SIGMAS, support, 0.0)
+    return judged._replace(
+        placed=float((weights * support)[~turned].sum()),
+        turned=float((weights * (1.0 - fit_both))[turned].sum()),
+        num_turned=int(turned.sum()),
+        turn=turn,
+    )
+
+
+def _common_turn(
+    votes: FloatArray, sigmas: FloatArray, weights: FloatArray, candidates: BoolArray
+) -> FloatArray | None:
+    """Return the turn that votes of most weight agree on, averaged over those; None without
+    candidates.
+
+    Args:
+        votes: (k, 3, 3) turns.
+        sigmas: (k,) their standard deviations, radians.
+        weights: (k,) what they count.
+        candidates: (k,) the votes that may be the turn.
+    """
+    voting = np.flatnonzero(np.isfinite(sigmas))
+    voting = voting[np.argsort(-weights[voting], kind="stable")][:_MOST_VOTES]
+    chosen = voting[candidates[voting]]
+    if len(chosen) == 0:
+        return None
+    flat = votes.reshape(-1, 9)
+    cosines = np.clip((flat[chosen] @ flat[voting].T - 1.0) / 2.0, -1.0, 1.0)
+    limits = _AGREEING_SIGMAS * np.hypot(sigmas[chosen, None], sigmas[None, voting])
+    totals = (np.arccos(cosines) <= limits) @ weights[voting]
+    turn = votes[chosen[int(np.argmax(totals))]]
+    for _ in range(_AVERAGING_STEPS):
+        off = _angles(votes[voting] @ turn.T) / sigmas[voting]
+        shares = weights[voting] / sigmas[voting] ** 2 / (1.0 + (off / _AGREEING_SIGMAS) ** 2) ** 2
+        left, _, right = np.linalg.svd(np.einsum("k,kab->ab", shares, votes[voting]))
+        turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return np.asarray(turn)
+
+
+def _mend(pairs: PairTurns, body: BoolArray, turn: FloatArray) -> PairTurns:
+    """Return the pairs as they are once a body is turned: E becomes T_j E T_i^T."""
+    turns = pairs.turns.copy()
+    first, second = body[pairs.pairs[:, 0]], body[pairs.pairs[:, 1]]
+    turns[first] = turns[first] @ turn.T
+    turns[second] = turn @ turns[second]
+    mended = pairs._replace(turns=turns)
+    crossing = first != second
+    agrees = np.isfinite(pairs.sigmas_rad) & ~_contradicts(mended)
+    placed = np.where(crossing, np.where(agrees, 1.0, 0.0), pairs.placed)
+    return mended._replace(placed=placed)

@@ -1,0 +1,102 @@
+"""How exact given rotations are, as far as the matches tell."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from sfm_shapefit.adjustment import AdjustmentOptions, AdjustmentProblem, Lens, adjust, estimate_covariances
+from sfm_shapefit.adjustment.given_rotations import RotationWeight, estimate_rotation_errors
+
+FOCAL_PX = 1000.0
+OPTIONS = AdjustmentOptions(loss_scale_px=2.0)
+
+
+def ring_problem(sigma_deg, noise_px, num_frames=16, num_points=400, seed=0):
+    """Cameras on a ring that look at a cloud; rotations are off by sigma per axis. Returns the truth, too."""
+    rng = np.random.default_rng(seed)
+    angles = np.linspace(0.0, 2.0 * np.pi, num_frames, endpoint=False)
+    centers = np.stack([6.0 * np.cos(angles), 6.0 * np.sin(angles), np.zeros(num_frames)], axis=1)
+    forward = -centers / 6.0
+    down = np.tile([0.0, 0.0, -1.0], (num_frames, 1))
+    rotations = np.stack([np.cross(down, forward), down, forward], axis=1)
+    points = rng.uniform(-1.0, 1.0, (num_points, 3))
+    cameras, seen = (a.ravel() for a in np.meshgrid(np.arange(num_frames), np.arange(num_points)))
+    shown = rng.random(len(cameras)) < 0.4
+    cameras, seen = cameras[shown], seen[shown]
+    x = np.einsum("kab,kb->ka", rotations[cameras], points[seen] - centers[cameras])
+    pixels = FOCAL_PX * x[:, :2] / x[:, 2:] + noise_px * rng.standard_normal((len(x), 2))
+    errors = Rotation.from_rotvec(np.radians(sigma_deg) * rng.standard_normal((num_frames, 3))).as_matrix()
+    problem = AdjustmentProblem(
+        rotations=errors @ rotations,
+        centers=centers,
+        points=points,
+        cameras_seeing=cameras,
+        points_seen=seen,
+        pixels=pixels,
+        lenses=[Lens("SIMPLE_PINHOLE", (FOCAL_PX, 0.0, 0.0))],
+        lens_of_camera=np.zeros(num_frames, dtype=np.int64),
+    )
+    return problem, rotations
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("noise_px", [0.2, 1.0])
+def test_exact_rotations_are_held_and_chance_is_told(noise_px, seed):
+    problem, _ = ring_problem(0.0, noise_px, seed=seed)
+    found = estimate_rotation_errors(problem, OPTIONS)
+    assert found.weight().hold
+    assert found.num_frames == 16
+    covariances = estimate_covariances(adjust(problem, OPTIONS).problem, OPTIONS, noise_px=noise_px)
+    sigmas = np.sqrt(np.trace(covariances.rotations, axis1=1, axis2=2) / 3.0)
+    # The median of 16 estimates of a standard deviation, of three numbers each that hang together.
+    assert found.chance_rad == pytest.approx(np.median(sigmas), rel=0.5)
+    # The loss lets the better half of the errors count more, which makes its median a little smaller.
+    assert found.noise_px == pytest.approx(noise_px, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sigma_deg", [0.05, 0.3])
+def test_the_standard_deviation_of_wrong_rotations_is_found(sigma_deg, seed):
+    found = estimate_rotation_errors(ring_problem(sigma_deg, 0.3, seed=seed)[0], OPTIONS)
+    weight = found.weight()
+    assert not weight.hold
+    # The root mean square of 16 x 3 normal numbers is within 4 / sqrt(96) = 41 % of sigma.
+    assert np.degrees(weight.sigma_rad) == pytest.approx(sigma_deg, rel=0.41)
+
+
+def test_a_common_turn_of_all_is_no_error():
+    problem, _ = ring_problem(0.0, 0.2)
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    turned = problem.with_values(
+        problem.rotations @ turn.T, problem.centers @ turn.T, problem.points @ turn.T, problem.lenses
+    )
+    assert estimate_rotation_errors(turned, OPTIONS).weight().hold
+
+
+def test_few_frames_that_see_enough_say_nothing():
+    problem, _ = ring_problem(0.5, 0.2)
+    few = problem.of_points(np.arange(problem.num_points) < 12)
+    found = estimate_rotation_errors(few, OPTIONS)
+    assert found.num_frames < 3
+    assert found.weight().hold
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_weighted_rotations_end_nearer_to_the_truth_than_held_and_free_ones(seed):
+    """Few noisy points say less than rotations that are off by 0.05 degrees, and both together more."""
+    problem, truth = ring_problem(0.05, 2.0, num_points=40, seed=seed)
+    given = problem.rotations
+    off = {}
+    for name, weight in {
+        "held": RotationWeight(hold=True),
+        "free": RotationWeight(),
+        "weighted": RotationWeight(sigma_rad=np.radians(0.05), noise_px=2.0),
+    }.items():
+        options = AdjustmentOptions(loss_scale_px=None, hold_rotations=weight.hold, noise_px=weight.noise_px)
+        ended = adjust(weight.apply(problem, given), options).problem.rotations
+        apart = Rotation.from_matrix(ended @ truth.transpose(0, 2, 1)).as_rotvec()
+        apart -= np.einsum(
+            "nab,nb->na", truth, np.tile(np.einsum("nba,nb->na", truth, apart).mean(0), (16, 1))
+        )
+        off[name] = np.sqrt(np.mean(apart**2))
+    assert off["weighted"] < min(off["held"], off["free"])

@@ -1,0 +1,84 @@
+"""Trust by what the pairs say of rotations, on real matches of a bundled scene."""
+
+from functools import cache
+
+import numpy as np
+import pycolmap
+import pytest
+
+import sfm_shapefit
+from sfm_shapefit.judgement.turns import Doubt
+from tests.scenes import BUNDLED, COURTYARD, real_scene
+
+PHOTOGRAPHED = BUNDLED / "photographed"
+
+
+@cache
+def located(scene, **options):
+    return sfm_shapefit.locate(scene / "sparse" / "0", scene / "database.db", **options)
+
+
+def turned(scene, chosen, angle_deg):
+    """A model some of whose cameras, by their rank, are turned about one axis of the world."""
+    model = pycolmap.Reconstruction(scene / "sparse" / "0")
+    names = sorted(model.images[i].name for i in model.reg_image_ids())
+    axis = np.array([0.36, 0.48, 0.8])
+    turn = pycolmap.Rotation3d(
+        np.append(np.sin(np.radians(angle_deg) / 2.0) * axis, np.cos(np.radians(angle_deg) / 2.0))
+    )
+    for image in list(model.images.values()):
+        if image.name in {names[k] for k in chosen}:
+            pose = image.cam_from_world()
+            model.frame(image.frame_id).rig_from_world = pycolmap.Rigid3d(
+                pose.rotation * turn.inverse(), pose.translation
+            )
+    return model, {names[k] for k in chosen}
+
+
+def test_right_cameras_of_a_symmetric_scene_are_kept_and_the_group_is_named():
+    found = located(PHOTOGRAPHED)
+    assert found.kept.all()
+    doubts = found.placement.assessment.doubts
+    ambiguous = [k for k, kind in enumerate(doubts.kinds) if kind is Doubt.AMBIGUOUS]
+    assert [found.model.names[k] for k in ambiguous] == ["0003.jpg", "0004.jpg", "0005.jpg"]
+    assert any("0003.jpg, 0004.jpg, 0005.jpg should be turned by 90 degrees" in w for w in found.warnings)
+    assert found.verdict.cameras[:1] != ()
+
+
+def test_every_camera_of_a_clean_scene_is_trusted():
+    found = located(COURTYARD)
+    assert found.kept.all()
+    assert set(found.placement.assessment.doubts.kinds) == {Doubt.RIGHT}
+
+
+@pytest.mark.parametrize("angle_deg", [2.0, 5.0])
+@pytest.mark.parametrize("chosen", [(7,), (9, 10, 11, 12, 13)])
+def test_turned_cameras_are_left_out_and_no_others(chosen, angle_deg):
+    model, wrong = turned(COURTYARD, chosen, angle_deg)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db")
+    left_out = {row.name for row in found.cameras if not row.placed}
+    assert left_out == wrong
+    assert any(
+        "its rotation is wrong" in row.reason and f"{angle_deg:.0f} degrees" in row.reason
+        for row in found.cameras
+        if row.name in wrong
+    )
+
+
+def test_measured_rotations_are_not_doubted():
+    model, _ = turned(COURTYARD, (7,), 2.0)
+    found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="measured")
+    assert found.placement.assessment.doubts is None
+    assert "rotation" not in "".join(row.reason for row in found.cameras)
+    for options in ({"refine_rotations": True}, {"map": True}):
+        kind = sfm_shapefit.MapOptions if options.pop("map", False) else sfm_shapefit.LocateOptions
+        with pytest.raises(ValueError, match="measured"):
+            kind(rotations="measured", **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["sparse/0", "global"])
+def test_all_images_of_a_rig_of_fisheye_cameras_are_kept(model):
+    scene = real_scene("kerry-park")
+    found = sfm_shapefit.locate(scene / model, scene / "database.db")
+    assert found.reconstruction.num_reg_images() == 48

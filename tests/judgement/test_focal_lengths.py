@@ -1,0 +1,61 @@
+"""A camera whose focal length is wrong is named, and no other; without an error nobody is."""
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.directions.matches import RayMatches
+from sfm_shapefit.geometry import normalized
+from sfm_shapefit.judgement.focal_lengths import Lenses, doubt_focal_lengths
+from tests.problems import all_pairs, random_rotations
+
+FOCAL_PX = 900.0
+IMAGES = 12
+
+
+def matches(factors, seed, *, angular=False, count=60):
+    """Matches of images of three cameras around a scene, read with focal lengths off by factors (3,)."""
+    rng = np.random.default_rng(seed)
+    camera_of = np.arange(IMAGES) % 3
+    centers = 8.0 * normalized(rng.standard_normal((IMAGES, 3)) * [1.0, 1.0, 0.3])
+    forward = -normalized(centers + 0.3 * rng.standard_normal((IMAGES, 3)))
+    side = normalized(np.cross(forward, random_rotations(rng, IMAGES)[:, 0]))
+    rotations = np.stack([side, np.cross(forward, side), forward], axis=1)
+    pairs = np.array(all_pairs(IMAGES))
+    read = ([], [])
+    for i, j in pairs.tolist():
+        points = rng.uniform(-2.0, 2.0, (count, 3))
+        for rays, k in zip(read, (i, j), strict=True):
+            inside = (points - centers[k]) @ rotations[k].T
+            angles = np.arctan2(np.hypot(inside[:, 0], inside[:, 1]), inside[:, 2])
+            radius = FOCAL_PX * (angles if angular else np.tan(angles))
+            pixels = radius[:, None] * normalized(inside[:, :2]) + 0.3 * rng.standard_normal((count, 2))
+            off = np.hypot(*pixels.T) / (FOCAL_PX * factors[camera_of[k]])
+            off = off if angular else np.arctan(off)
+            rays.append(np.column_stack([np.sin(off)[:, None] * normalized(pixels), np.cos(off)]))
+    given = RayMatches(
+        pairs=pairs,
+        offsets=count * np.arange(len(pairs) + 1),
+        rays_i=np.concatenate(read[0]),
+        rays_j=np.concatenate(read[1]),
+        pixel_angles=np.full(len(pairs), 1.0 / FOCAL_PX),
+    )
+    focal_lengths = FOCAL_PX * np.array(factors)[camera_of]
+    return given, rotations, Lenses(camera_of, focal_lengths, np.full(IMAGES, angular))
+
+
+@pytest.mark.parametrize("angular", [False, True])
+@pytest.mark.parametrize("factor", [0.42, 0.9, 1.1, 1.3, 2.4])
+def test_a_camera_with_a_wrong_focal_length_is_named_with_the_right_one(factor, angular):
+    found = doubt_focal_lengths(*matches([1.0, factor, 1.0], 1, angular=angular))
+    assert [doubt.camera for doubt in found] == [1]
+    # The factors that are tried are 5 % apart or less near the best one.
+    assert factor * found[0].factor == pytest.approx(1.0, rel=0.06)
+
+
+def test_without_an_error_or_for_a_single_camera_nobody_is_named():
+    assert doubt_focal_lengths(*matches([1.0, 1.0, 1.0], 3)) == ()
+    rays, rotations, lenses = matches([1.2, 1.2, 1.2], 3)
+    assert (
+        doubt_focal_lengths(rays, rotations, lenses._replace(camera_of=np.zeros(IMAGES, dtype=np.int64)))
+        == ()
+    )
