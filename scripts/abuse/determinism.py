@@ -116,8 +116,11 @@ def _run(command: str, scene: Path, out: Path, flags: tuple[str, ...], environme
     return out
 
 
-def measure_reordering(scene: Path, work: Path, seed: int) -> float:
-    """Return by how much of the extent positions move when everything is listed in another order."""
+def measure_reordering(scene: Path, work: Path, seed: int, *, adjust: bool = False) -> float:
+    """Return by how much of the extent positions move when everything is listed in another order.
+
+    An adjustment ends at a tolerance, which another order of sums reaches elsewhere.
+    """
     from sfm_shapefit.commands.locate import locate
     from sfm_shapefit.commands.write import write_result
     from sfm_shapefit.locate_options import LocateOptions
@@ -126,7 +129,8 @@ def measure_reordering(scene: Path, work: Path, seed: int) -> float:
     tables = []
     for place in (scene, copy):
         out = work / "out"
-        write_result(locate(place / "sparse" / "0", options=LocateOptions(threads=1)), out, overwrite=True)
+        options = LocateOptions(threads=1, adjust=adjust)
+        write_result(locate(place / "sparse" / "0", options=options), out, overwrite=True)
         tables.append({row["name"]: row for row in read_cameras(out)})
     shutil.rmtree(copy)
     shutil.rmtree(out)

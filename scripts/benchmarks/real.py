@@ -156,10 +156,11 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
         quick: Case = partial(measure, QUICK, ROOT / "data_synthetic" / QUICK.name, args)
         return {QUICK.name: quick, "ring": partial(measure_made, "ring", 12)}
     made: dict[str, Case] = {f"made {shape}": partial(measure_made, shape, 60) for shape in MADE}
-    return made | {
+    real: dict[str, Case] = {
         case: if_there(args.data / scene.name, partial(measure, scene, args.data / scene.name, args))
         for case, scene in SCENES.items()
     }
+    return real | made
 
 
 def measure(scene: Scene, folder: Path, args: argparse.Namespace) -> Measured:

@@ -42,6 +42,7 @@ def test_locate_counts_pairs_and_images():
         "directions",
         "solve",
         "adjustment",
+        "trust",
         "further pieces",
         "structure",
         "triangulation",

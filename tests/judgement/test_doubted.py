@@ -70,10 +70,8 @@ def test_measured_rotations_are_not_doubted():
     found = sfm_shapefit.locate(model, COURTYARD / "database.db", rotations="measured")
     assert found.placement.assessment.doubts is None
     assert "rotation" not in "".join(row.reason for row in found.cameras)
-    for options in ({"refine_rotations": True}, {"map": True}):
-        kind = sfm_shapefit.MapOptions if options.pop("map", False) else sfm_shapefit.LocateOptions
-        with pytest.raises(ValueError, match="measured"):
-            kind(rotations="measured", **options)
+    with pytest.raises(ValueError, match="map finds the rotations itself"):
+        sfm_shapefit.MapOptions(rotations="measured")
 
 
 @pytest.mark.slow

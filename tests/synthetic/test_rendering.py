@@ -230,7 +230,7 @@ def test_rotations_averaged_from_the_photographs_alone_place_the_median_camera_a
         PHOTOGRAPHED / "database.db",
         progress=lambda stage, *done: steps.append(done) if stage == "relative rotations" else None,
     )
-    assert (steps[:2], steps[-2:]) == ([(0, 1), (1, 57)], [(57, 57), (1, 1)])
+    assert (steps[0], steps[-2:]) == ((0, 1), [(57, 57), (1, 1)])
     errors = evaluate(found.models[0].located.reconstruction, PHOTOGRAPHED / "truth")
     # Measured: 14 of 16 placed, 34 mm median in a yard of 24 m; two cameras follow the repeated houses.
     assert len(errors.names) >= 13
