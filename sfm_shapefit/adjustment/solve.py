@@ -160,7 +160,7 @@ def _costs_of_frames(problem: AdjustmentProblem, loss_scale_px: float) -> FloatA
     """Return the cost of each frame's observations (n,), px^2."""
     errors_px = np.nan_to_num(reprojection_errors_px(problem), nan=_BEHIND_PX)
     losses = 0.5 * loss_scale_px**2 * np.log1p((errors_px / loss_scale_px) ** 2)
-    return np.bincount(problem.frames_seeing(), losses, problem.num_frames)
+    return np.bincount(problem.frames_seeing(), losses, problem.num_frames).astype(np.float64)
 
 
 def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float]) -> float:
