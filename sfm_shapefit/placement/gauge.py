@@ -28,7 +28,7 @@ _CAP_OF_SIZE = 0.5
 _ROUGH = 0.1
 # A smaller spread of centers, relative to their distance from the origin, counts as none.
 _COINCIDENT = 1e-9
-_FEWEST_PRIORS = 2
+FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
 # A spread across a line of fewer residuals than this says nothing of the turn about the line.
 _FLAT = 5.0
@@ -189,7 +189,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
     """
-    if len(priors.cameras) < _FEWEST_PRIORS:
+    if len(priors.cameras) < FEWEST_PRIORS:
         raise InputError(
             f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
