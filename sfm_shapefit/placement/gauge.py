@@ -6,7 +6,7 @@ whole model onto their axes.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -37,6 +37,14 @@ _KERNEL_WIDTH = 3.0
 _REWEIGHTINGS = 20
 
 
+class Datum(NamedTuple):
+    """A point on Earth: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Gauge:
     """The map from the solver's locations to the output's units, and the sentence that states it."""
@@ -52,6 +60,8 @@ class Gauge:
     after `similarity`; None where the axes are the input's."""
     warning: str = ""
     """Why the scale may be rough, if it may."""
+    datum: Datum | None = None
+    """Where the output's origin is on Earth, if priors on Earth set it."""
 
     def apply(self, locations: FloatArray) -> FloatArray:
         """Map the solver's locations (n, 3) to the output's units and axes."""
@@ -71,15 +81,14 @@ class PositionPriors:
     """(k, 3, 3), in the positions' units squared; NaN where unknown."""
     statement: str
     """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
-        return PositionPriors(
-            cameras=places,
-            positions=self.positions[rows],
-            covariances=self.covariances[rows],
-            statement=self.statement,
+        return replace(
+            self, cameras=places, positions=self.positions[rows], covariances=self.covariances[rows]
         )
 
 
@@ -214,6 +223,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
         axes=found.rotation if turns else None,
         statement=_prior_statement(priors, found, weights, level, turns=turns),
         warning=_prior_warning(level, size, turns=turns),
+        datum=priors.datum if turns else None,
     )
 
 
