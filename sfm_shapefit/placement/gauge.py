@@ -101,7 +101,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
         locations: (n, 3) the solver's answer.
         input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
     """
-    if _coincide(input_centers):
+    if coincide(input_centers):
         return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
     size = median_spread(input_centers)
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
@@ -134,7 +134,7 @@ def metric_gauge(
     shifts = input_centers - scale * locations
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
-    elif not _coincide(input_centers):
+    elif not coincide(input_centers):
         shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
@@ -227,7 +227,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     )
 
 
-def _coincide(centers: FloatArray) -> bool:
+def coincide(centers: FloatArray) -> bool:
     """Return whether centers (n, 3) are one point to rounding."""
     return bool(np.ptp(centers, axis=0).max() <= _COINCIDENT * max(1.0, float(np.abs(centers).max())))
 
