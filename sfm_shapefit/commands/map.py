@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.locate import Locating, locate_source
@@ -183,15 +184,15 @@ class _Run(NamedTuple):
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
-            source, centers, covariances = averaged, None, None
+            source, centers, uncertainty = averaged, None, Uncertainty()
             if self.options.adjust:
                 with self.clock("first placement"):
-                    rotations, centers, covariances = adjust_first_placement(
+                    rotations, centers, uncertainty = adjust_first_placement(
                         averaged, GaugeRule(model, rigid, options, priors), self.clock
                     )
                 source = averaged.turned(self._pose(image_ids, rotations))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(inputs, rigid, priors, centers=centers, covariances=covariances)
+            locating = Locating(inputs, rigid, priors, centers=centers, uncertainty=uncertainty)
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()

@@ -14,6 +14,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     MEDIAN_NORMAL_LENGTH,
+    METRIC_SIGMA,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
@@ -60,6 +61,8 @@ class Gauge:
     after `similarity`; None where the axes are the input's."""
     warning: str = ""
     """Why the scale may be rough, if it may."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, where that is measured and its error known."""
     datum: Datum | None = None
     """Where the output's origin is on Earth, if priors on Earth set it."""
 
@@ -225,6 +228,20 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
         warning=_prior_warning(level, size, turns=turns),
         datum=priors.datum if turns else None,
     )
+
+
+def tell_scale(gauge: Gauge, sigma: float | None) -> Gauge:
+    """Return the gauge with the relative standard deviation of a scale that was measured, and says it."""
+    if sigma is None or gauge.scale not in ("rig", "prior"):
+        return gauge
+    statement = f"{gauge.statement}; the scale is known to {100.0 * sigma:.2g} %"
+    warning = gauge.warning
+    if sigma > METRIC_SIGMA:
+        warning = (
+            f"the scale is known to {100.0 * sigma:.2g} % only, so it is not metric: the offsets that tell "
+            "it are too short for this scene"
+        )
+    return replace(gauge, statement=statement, warning=warning, scale_sigma=sigma)
 
 
 def coincide(centers: FloatArray) -> bool:

@@ -5,12 +5,10 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
+from sfm_shapefit.colmap.bundle_adjustment import Uncertainty, adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
@@ -24,8 +22,8 @@ from sfm_shapefit.placement.gauge import unit_gauge
 
 def adjust_first_placement(
     source: MatchSource, rule: GaugeRule, clock: Clock
-) -> tuple[FloatArray, FloatArray, Mapping[int, FloatArray]]:
-    """Return rotations (n, 3, 3) cam_from_world, centers (n, 3) and their covariances by image id, adjusted.
+) -> tuple[FloatArray, FloatArray, Uncertainty]:
+    """Return rotations (n, 3, 3) cam_from_world and centers (n, 3), adjusted, and how well these are known.
 
     Images that the first placement lacks keep their averaged rotations, turned as the others were on average,
     and have NaN for a center.
@@ -47,7 +45,7 @@ def adjust_first_placement(
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
         centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
-    return _turn_the_others(model.rotations, rotations, posed), centers, adjusted.covariances
+    return _turn_the_others(model.rotations, rotations, posed), centers, adjusted.uncertainty
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:
