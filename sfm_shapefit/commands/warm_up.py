@@ -37,8 +37,8 @@ NEEDED = (
 )
 """Examples of what `locate`, `map`, `place` and `inspect` do in most runs.
 
-Parts come first, so that no two processes compile the same kernels, those that take longest before the others,
-then the whole.
+Parts come first, so that no two processes compile the same kernels, and of them those that take longest; then
+the whole.
 """
 FURTHER = (
     "place_graph",
