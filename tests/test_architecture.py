@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 # Bottom first; the modules of a folder, and rooms on one floor, may import each other.
 LAYERS = [
     {"errors", "arrays", "atomic_folder", "settings", "display"},
-    {"jit", "kernel_cache", "executors"},
+    {"jit", "kernel_cache", "kernel_code", "executors"},
     {"geometry"},
     {"viewgraph"},
     {"theory"},
@@ -44,7 +44,7 @@ LAYERS = [
 ROOMS = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
 
 DOORS = {
-    "numba": {"jit.py", "kernel_cache.py"},
+    "numba": {"jit.py", "kernel_cache.py", "kernel_code.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "pymetis": {"laplacian"},
     "distributed": {"commands/stages/execution.py"},
