@@ -78,6 +78,8 @@ const SPHERE = [[0, 1], [0, 2], [1, 2]].flatMap(([a, b]) => Array.from({ length:
 }));
 const SEGMENT = [[[0, 0, 0], [1, 0, 0]]];
 
+const MANY_SHAPES = 3000; // more are drawn by lines of one pixel, which are a third of the work
+
 const HALF_FIELD = Math.tan((20 * Math.PI) / 180);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -147,9 +149,12 @@ const makePainter = (canvas) => {
   // Columns are center and, as far as the template has them, u, v, w; and color, 4 bytes each.
   const shapes = (template, columns) => {
     const made = arranged(columns, true);
+    const instances = columns.center.length / 3;
+    const isThin = instances > MANY_SHAPES;
+    const corners = isThin ? [[0, 0], [1, 0]] : [[0, -1], [1, -1], [1, 1], [0, -1], [1, 1], [0, 1]];
     const flat = { from: [], to: [], corner: [] };
     for (const [from, to] of template) {
-      for (const corner of [[0, -1], [1, -1], [1, 1], [0, -1], [1, 1], [0, 1]]) {
+      for (const corner of corners) {
         flat.from.push(...from);
         flat.to.push(...to);
         flat.corner.push(...corner);
@@ -158,7 +163,7 @@ const makePainter = (canvas) => {
     bind("from", new Float32Array(flat.from), 3, false);
     bind("to", new Float32Array(flat.to), 3, false);
     bind("corner", new Float32Array(flat.corner), 2, false);
-    return { ...made, kind: "lines", vertices: flat.corner.length / 2, instances: columns.center.length / 3 };
+    return { ...made, kind: "lines", mode: isThin ? gl.LINES : gl.TRIANGLES, vertices: flat.corner.length / 2, instances };
   };
   const cloud = (columns) => ({ ...arranged(columns, false), kind: "points", vertices: columns.center.length / 3 });
   const pictures = (columns, atlas) => {
@@ -169,7 +174,7 @@ const makePainter = (canvas) => {
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, gl.RGBA, gl.UNSIGNED_BYTE, atlas);
     gl.generateMipmap(gl.TEXTURE_2D);
     gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.LINEAR_MIPMAP_LINEAR);
-    return { ...made, kind: "pictures", vertices: 6, instances: columns.center.length / 3, texture };
+    return { ...made, kind: "pictures", mode: gl.TRIANGLES, vertices: 6, instances: columns.center.length / 3, texture };
   };
   const recolor = (thing, colors) => {
     gl.bindBuffer(gl.ARRAY_BUFFER, thing.buffers.color);
@@ -179,7 +184,7 @@ const makePainter = (canvas) => {
     if (thing.texture) gl.bindTexture(gl.TEXTURE_2D, thing.texture);
     use(programs[thing.kind], thing.array, { tint: [-1, 0, 0, 1], ...values });
     if (thing.instances === undefined) gl.drawArrays(gl.POINTS, 0, thing.vertices);
-    else gl.drawArraysInstanced(gl.TRIANGLES, 0, thing.vertices, thing.instances);
+    else gl.drawArraysInstanced(thing.mode, 0, thing.vertices, thing.instances);
   };
   const drop = (thing) => {
     for (const buffer of Object.values(thing.buffers)) gl.deleteBuffer(buffer);

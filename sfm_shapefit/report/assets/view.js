@@ -4,6 +4,7 @@ const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked f
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
 const PICK_PAIR_PX = 5;
+const SLOW_FRAME_MS = 90;
 const LEAST_FRUSTUM_PX = 15; // at first sight, frusta are at least so deep
 
 const makeScene = (onChoice) => {
@@ -196,7 +197,8 @@ const makeScene = (onChoice) => {
 
   // --- drawing ---
 
-  const cameraSize = () => (hasFrusta ? 5 : 9) * devicePixelRatio * (placed.length > 2000 ? 0.7 : 1);
+  const pixelRatio = () => devicePixelRatio * (isMoving && isSlow ? 0.5 : 1);
+  const cameraSize = () => (hasFrusta ? 5 : 9) * pixelRatio() * (placed.length > 2000 ? 0.7 : 1);
   const dots = (thing, common, size, tint) => painter.paint(thing, {
     ...common, size: 0, least: size, most: size, ...(tint ? { tint } : {}),
   });
@@ -204,20 +206,20 @@ const makeScene = (onChoice) => {
     if (!highlight) return;
     painter.inFront();
     for (const [verdict, thing] of highlight.pairs) {
-      painter.paint(thing, { ...common, scale: 1, width: 1.8 * devicePixelRatio, tint: [...rgbOf(VARIABLES[verdict]), 0.9] });
+      painter.paint(thing, { ...common, scale: 1, width: 1.8 * pixelRatio(), tint: [...rgbOf(VARIABLES[verdict]), 0.9] });
     }
     if (highlight.frusta) {
-      painter.paint(highlight.frusta, { ...common, scale: sizes.frustum, width: 3 * devicePixelRatio, tint: [...chosen, 1] });
+      painter.paint(highlight.frusta, { ...common, scale: sizes.frustum, width: 3 * pixelRatio(), tint: [...chosen, 1] });
     }
     if (highlight.dots) dots(highlight.dots, common, 1.9 * cameraSize(), [...chosen, 1]);
   };
   const drawLayer = (one, common, tint) => {
-    const ratio = devicePixelRatio;
+    const ratio = pixelRatio();
     if (one.cloud) {
       const size = 0.003 * radius * sizes.point * eye.pixelsPerUnit() * view.distance * ratio;
       painter.paint(one.cloud, { ...common, size, least: 1.8 * ratio * Math.min(sizes.point, 1.5), most: 6 * ratio * sizes.point });
     }
-    if (one.lines) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
+    if (one.lines && !(isMoving && isSlow)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
     if (one.ghosts) painter.paint(one.ghosts, { ...common, scale: sizes.frustum, width: 1.2 * ratio, tint: [...tint, 0.55] });
     if (one.dots) dots(one.dots, common, cameraSize(), one.lines ? null : [...tint, 0.8]);
     if (one.ellipsoids) painter.paint(one.ellipsoids, { ...common, scale: sizes.ellipsoid, width: 1.2 * ratio });
@@ -228,7 +230,7 @@ const makeScene = (onChoice) => {
   };
   const ORDER = ["grid", "points", "cameras", "ghosts", "ellipsoids", "input", "agrees", "nodirection", "undetermined", "contradicts"];
   const draw = () => {
-    const ratio = devicePixelRatio;
+    const ratio = pixelRatio();
     const [width, height] = [canvas.clientWidth, canvas.clientHeight].map((side) => Math.round(side * ratio));
     if (!width || !height) return;
     if (canvas.width !== width || canvas.height !== height) [canvas.width, canvas.height] = [width, height];
@@ -251,10 +253,26 @@ const makeScene = (onChoice) => {
   const redraw = () => {
     if (waits) return;
     waits = true;
-    requestAnimationFrame(() => {
+    requestAnimationFrame((now) => {
       waits = false;
+      clockFrame(now);
       draw();
     });
+  };
+  // Where frames take long, the picture is coarse and cameras are dots while the scene moves, and frusta again when it rests.
+  let [isMoving, isSlow, lastFrame, rest] = [false, false, 0, 0];
+  const clockFrame = (now) => {
+    if (isMoving && lastFrame && now - lastFrame > SLOW_FRAME_MS) isSlow = placed.length > 300;
+    lastFrame = isMoving ? now : 0;
+  };
+  const moved = () => {
+    isMoving = true;
+    clearTimeout(rest);
+    rest = setTimeout(() => {
+      isMoving = false;
+      redraw();
+    }, 200);
+    redraw();
   };
 
   // Axes of the model in the corner, and the name beside what is chosen.
@@ -511,7 +529,8 @@ const makeScene = (onChoice) => {
   };
 
   [view.target, view.distance] = whole();
-  sizes.frustum = Math.max(data.frustum, LEAST_FRUSTUM_PX / eye.pixelsPerUnit());
+  const leastPixels = LEAST_FRUSTUM_PX * Math.min(Math.sqrt(400 / Math.max(placed.length, 1)), 1);
+  sizes.frustum = Math.max(data.frustum, leastPixels / eye.pixelsPerUnit());
   if (certain.length) {
     const size = quantile(certain.map((k) => Math.hypot(...at(cameras.sigmas, k))), 0.5);
     const power = 10 ** Math.floor(Math.log10(sizes.frustum / size));
@@ -519,7 +538,7 @@ const makeScene = (onChoice) => {
   }
   drawLayerControls();
   drawLegend();
-  steer(canvas, eye, () => { flight += 1; redraw(); }, (event) => {
+  steer(canvas, eye, () => { flight += 1; moved(); }, (event) => {
     const found = under(event);
     if (found) onChoice(...found);
   }, hovered);
