@@ -48,7 +48,7 @@ DOORS = {
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "pymetis": {"laplacian"},
     "distributed": {"commands/stages/execution.py"},
-    "cv2": {"synthetic"},
+    "cv2": {"synthetic", "report/thumbnails.py"},
     "trimesh": {"synthetic/surfaces.py", "report/mesh.py"},
     "pycolmap": {
         "colmap",
@@ -57,7 +57,6 @@ DOORS = {
         "synthetic/rendered_workspace.py",
     },
     "sqlite3": {"colmap", "synthetic/workspace.py"},
-    "plotly": {"report/page.py"},
     "viser": {"report/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -41,7 +41,7 @@ class Run(Generic[Options]):
         """How the result is written; keywords of `write_result`."""
         flags = self.flags
         how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
-        return how | {"protect": self.protect}
+        return how | {"protect": self.protect, "images": flags.images}
 
     def show(self, title: str, facts: dict[str, Any], table: Callable[[], Rows]) -> None:
         """Print the facts as JSON, or a table, or nothing, once the output is complete."""
@@ -69,8 +69,17 @@ def command_run(
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
         options = read_options(settings, given, config)
+        if flags.images:  # now, not when all is computed
+            from sfm_shapefit.report.thumbnails import refuse_no_folder
+
+            refuse_no_folder(Path(flags.images))
         fixed = getattr(options, "fix", "")
-        paths = [*inputs, config, Path(fixed) if fixed else None]
+        paths = [
+            *inputs,
+            config,
+            Path(fixed) if fixed else None,
+            Path(flags.images) if flags.images else None,
+        ]
         run = Run(options=options, flags=flags, protect=[path for path in paths if path is not None])
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
             from sfm_shapefit.colmap.quiet import hear_pycolmap
