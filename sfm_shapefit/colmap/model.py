@@ -192,10 +192,10 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
 
 
 def camera_rays(camera: pycolmap.Camera, xy: FloatArray) -> FloatArray:
-    """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for pixels that are no image of a ray.
+    """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those that are no image of a ray.
 
-    pycolmap folds rays of a fisheye beyond 90 degrees back: 58 degrees where 90.3 is right. Such a ray has its
-    image elsewhere, by which it is told.
+    pycolmap folds rays of a fisheye beyond 90 degrees back: 58 degrees where 90.3 is right. Such a ray has
+    its image elsewhere, by which it is told.
     """
     rays = np.asarray(camera.cam_ray_from_img(xy), dtype=np.float64).reshape(-1, 3)
     if len(rays) == 0 or camera.model_name in _ONE_TO_ONE:
