@@ -25,6 +25,7 @@ import platform
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -36,6 +37,7 @@ import numba
 from numba.core import config
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
+from numba.core.event import Listener, install_listener
 from numba.core.registry import cpu_target
 from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
@@ -54,6 +56,8 @@ _missed: list[Callable[[], None]] = []
 """What is called when a kernel is not found, once, before it is looked for again."""
 _hearing: list[Callable[[str], None]] = []
 """What is told the names of kernels that are found, or compiled and kept."""
+_measuring: "list[CompileTime]" = []
+"""What counts the seconds that are spent compiling."""
 
 
 def choose_target() -> str:
@@ -96,6 +100,50 @@ def hear_of_kernels(hear: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         _hearing.remove(hear)
+
+
+class CompileTime(Listener):  # type: ignore[misc]
+    """Adds up the seconds that are spent compiling; what is compiled inside another kernel counts once."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth, self._since = 0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        """Begin to compile something."""
+        if self._depth == 0:
+            self._since = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, _event: Any) -> None:
+        """Have compiled something."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._since
+
+
+@contextmanager
+def measure_compilation() -> Iterator[CompileTime]:
+    """Yield what counts the seconds that the block spends compiling, or waiting for others that do."""
+    spent = CompileTime()
+    _measuring.append(spent)
+    try:
+        with install_listener("numba:compile", spent):
+            yield spent
+    finally:
+        _measuring.remove(spent)
+
+
+@contextmanager
+def counted_as_compiling() -> Iterator[None]:
+    """Count the block as time that is spent compiling: other processes compile meanwhile."""
+    for spent in _measuring:
+        spent.on_start(None)
+    try:
+        yield
+    finally:
+        for spent in _measuring:
+            spent.on_end(None)
 
 
 class KernelCache(NullCache):  # type: ignore[misc]

@@ -33,6 +33,7 @@ from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
+from sfm_shapefit.wording import counted
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.
@@ -214,8 +215,8 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         yield "the database's rigs are not used: every camera is placed on its own"
     if images.num_guessed_cameras:
         yield (
-            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; "
-            "calibrate them first (pycolmap.calibrate_view_graph) if the result is poor"
+            f"a guessed focal length stays as it is in {counted(images.num_guessed_cameras, 'camera')}; "
+            "calibrate (pycolmap.calibrate_view_graph) if the result is poor"
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
@@ -228,9 +229,10 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         if len(doubtful):
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
-                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, "
-                f"above all those of {worst}"
+                f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
+                f"rotations, above all those of {worst}"
             )
     if left_out:
         name, reason = next(iter(left_out.items()))
-        yield f"{len(left_out)} images are in no model, {name} for one: {reason}"
+        many = f"{len(left_out)} images are in no model, {name} for one"
+        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"

@@ -14,6 +14,7 @@ from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.wording import counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -74,4 +75,5 @@ class MapResult(Displayed):
         return dict(facts)
 
     def _headline(self) -> str:
-        return f"{self.num_placed} of {self.num_images} images placed in {len(self.models)} models"
+        models = counted(len(self.models), "model")
+        return f"{self.num_placed} of {self.num_images} images placed in {models}"

@@ -27,6 +27,7 @@ from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -106,7 +107,7 @@ class LocateResult(Displayed):
 
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
-        return f"{self.verdict.grade.value}: {images}, {self.reconstruction.num_points3D()} points"
+        return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
 
     @cached_property
     def image_names(self) -> tuple[str, ...]:
@@ -151,7 +152,7 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            reason = f"it sees {count} points, fewer than {self.options.min_points_per_image}"
+            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
             rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]

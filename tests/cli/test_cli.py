@@ -38,8 +38,13 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
-    for words in ("8 of 8 images", "certified to", "locate.json"):
+    for words in ("8 of 8 images", "typical pair error", "typical deviation", "locate.json"):
         assert words in result.stdout
+    assert "certified" not in result.stdout  # but with --verbose
+    *_, verdict, report, command = result.stdout.splitlines()
+    assert verdict == "verdict: good"
+    assert report == f"next:    open {out / 'report.html'}"
+    assert command == f"         colmap bundle_adjuster --input_path {out} --output_path ADJUSTED"
     assert result.stderr == ""
 
 
@@ -295,7 +300,11 @@ def test_evaluate_prints_a_table_json_and_csv_and_writes_over_no_other_file(ring
     assert "8 in common of 8" in table.stdout
     errors = json.loads(run(*arguments, "--json").stdout)
     assert errors["position_error"]["max"] < 1e-5
-    assert errors["recall"][-1] == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0}
+    last = errors["recall"][-1]
+    assert last == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0, "auc": last["auc"]}
+    assert last["auc"] > 0.9999
+    assert "rotation error" in table.stdout
+    assert re.search(r"ATE +│ rms \d", run(*arguments, "--trajectory", code=0).stdout)
     lines = (tmp_path / "errors.csv").read_text().splitlines()
     assert lines[0] == "name,position_error,rotation_error_deg,x,y,z"
     assert len(lines) == 9
