@@ -56,6 +56,12 @@ _missed: list[Callable[[], None]] = []
 """What is called when a kernel is not found, once, before it is looked for again."""
 _hearing: list[Callable[[str], None]] = []
 """What is told the names of kernels that are found, or compiled and kept."""
+_said: list[bool] = []
+"""Not empty once a caller was told that kernels are compiled."""
+_COMPILING = (
+    "sfm_shapefit: compiling kernels, once, which may take a minute or two; they are kept on disk "
+    "(`sfm-shapefit warm-up` compiles all of them beforehand)"
+)
 _measuring: "list[CompileTime]" = []
 """What counts the seconds that are spent compiling."""
 
@@ -166,6 +172,8 @@ class KernelCache(NullCache):  # type: ignore[misc]
         if found is None and _missed:
             _missed.pop()()
             found = self._find(name, target_context)
+        if found is None:
+            self._say_once()
         if found is not None:
             self._tell()
         return found
@@ -184,6 +192,13 @@ class KernelCache(NullCache):  # type: ignore[misc]
             self._remove_stale(folder)
             break
         self._tell()
+
+    def _say_once(self) -> None:
+        """Say on stderr that kernels are compiled, to who calls from Python; the program says it itself."""
+        is_ours = self._source.is_relative_to(PACKAGE)
+        if is_ours and not (_said or _hearing or "sfm_shapefit.cli" in sys.modules):
+            _said.append(True)
+            print(_COMPILING, file=sys.stderr)  # noqa: T201
 
     def _tell(self) -> None:
         for hear in _hearing:

@@ -1,7 +1,7 @@
 """What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
 
 The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
-130 interrupted.
+5 a package is missing; 130 interrupted.
 """
 
 import os
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from sfm_shapefit.errors import ShapeFitError, UnsolvableError
+from sfm_shapefit.extras import MissingExtraError
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.stages.clock import Progress
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_INTERRUPTED = 3, 4, 130
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130
 NAMES_SHOWN = 8
 SEE_JSON = "see --json"
 
@@ -74,6 +75,8 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
             )
         if isinstance(error, UnsolvableError):
             _fail(str(error), EXIT_UNSOLVABLE)
+        if isinstance(error, MissingExtraError):
+            _fail(str(error), EXIT_MISSING)
         if isinstance(error, ShapeFitError):
             _fail(str(error), EXIT_INPUT)
         if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):

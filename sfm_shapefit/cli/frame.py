@@ -102,13 +102,36 @@ class Run(Generic[Options]):
         self.is_unusable = self.flags.strict and verdict.is_bad
 
 
+def refuse_swapped(source: Path, target: Path, order: str) -> None:
+    """Refuse an output that is what the command reads: the arguments are swapped.
+
+    Raises:
+        InputError: if OUT is a model that no command of this program wrote, a database or another file.
+    """
+    from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
+    from sfm_shapefit.errors import InputError
+
+    ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
+    is_model = any((target / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
+    if (is_model and not ours) or (target.is_file() and not source.is_file()):
+        what = "holds a model" if is_model else "is a file"
+        raise InputError(
+            f"{target} {what}, but OUT is a folder to be made; the order is {order}, so give {target} first"
+        )
+
+
 @contextmanager
 def command_run(
-    settings: type[Options], given: dict[str, Any], target: Path, inputs: Sequence[Path | None]
+    settings: type[Options],
+    given: dict[str, Any],
+    target: Path,
+    inputs: Sequence[Path | None],
+    order: str = "MODEL OUT",
 ) -> Iterator[Run[Options]]:
     """Run a command that makes OUT: errors become one sentence and an exit code, and OUT is whole or absent.
 
-    Flags of `settings` and of `OutputFlags` are None where the user says nothing. Inputs stay as they are.
+    The first input is that which stands before OUT, `order` the names of both. Flags of `settings` and of
+    `OutputFlags` are None where the user says nothing. Inputs stay as they are.
     """
     started = time.perf_counter()
     with report_errors(target):
@@ -121,6 +144,8 @@ def command_run(
         paths = [*inputs, config, Path(fixed) if fixed else None]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)
+        if inputs[0] is not None:
+            refuse_swapped(inputs[0], target, order)
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
             from sfm_shapefit.colmap.quiet import hear_pycolmap
             from sfm_shapefit.kernel_cache import measure_compilation

@@ -37,7 +37,7 @@ def map_command(
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
-    with command_run(MapOptions, given, target, [source]) as run:
+    with command_run(MapOptions, given, target, [source], "DATABASE OUT") as run:
         from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.commands.write import write_result
 

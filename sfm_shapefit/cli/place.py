@@ -68,7 +68,7 @@ def place_command(
     """Place the nodes of a bare view GRAPH of directions, or of relative poses; write tables to OUT."""
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
-    with command_run(PlacementOptions, given, target, [source, rotations]) as run:
+    with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
         from sfm_shapefit.commands.place import place_graph_file
         from sfm_shapefit.commands.write import write_result
         from sfm_shapefit.results.exports import export_files

@@ -24,7 +24,7 @@ from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
@@ -52,7 +52,8 @@ def map_database(
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
 
     Args:
-        database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
+        database: with keypoints and two-view geometries, or the folder that holds it as database.db; it is
+            never changed. Intrinsics are the database's.
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
@@ -66,7 +67,7 @@ def map_database(
         UnsolvableError: if no component of three images or more can be placed.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = Path(database), Clock(progress) if progress else Clock()
+    path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     with clock("read"):
         images = read_images(path)
         unposed = read_model(images.reconstruction)
@@ -101,6 +102,19 @@ def map_database(
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
     )
+
+
+def database_in(path: Path) -> Path:
+    """Return the database of a folder, which is its database.db; any other path is that of a database.
+
+    Raises:
+        InputError: if the folder has none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / "database.db").is_file():
+        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
+    return path / "database.db"
 
 
 class _Run(NamedTuple):
