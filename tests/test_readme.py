@@ -5,12 +5,11 @@ import re
 import shlex
 from pathlib import Path
 
-import pycolmap
 import pytest
 
 from sfm_shapefit.cli import app
 from tests.program import run, run_python, viewing
-from tests.scenes import COURTYARD, RING, ROOT
+from tests.scenes import ROOT
 
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
@@ -57,14 +56,6 @@ def test_every_python_example_of_the_docs_runs(page, number, monkeypatch, capsys
 def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data_synthetic").symlink_to(ROOT / "data_synthetic")
-    # What the pages take as the user's own: measured positions, one far off, and names to be fixed.
-    truth = pycolmap.Reconstruction(COURTYARD / "truth")
-    rows = [(image.name, *image.projection_center()) for image in truth.images.values()]
-    off = {rows[3][0]: 30.0}
-    lines = [f"{name} {x + 100.0 + off.get(name, 0.0)} {y} {z} 0.05\n" for name, x, y, z in rows]
-    (tmp_path / "gps.csv").write_text("".join(lines))
-    ring = sorted(image.name for image in pycolmap.Reconstruction(RING / "sparse/0").images.values())
-    (tmp_path / "names.txt").write_text("\n".join(ring[:4]))
     for command in commands_of(page):
         arguments = shlex.split(command)
         if arguments[0] == "view":

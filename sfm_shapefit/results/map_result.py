@@ -4,6 +4,7 @@ OUT/0, OUT/1, ...   models, largest first: each a folder as `locate` writes it
 OUT/map.json        the averaging behind each, and the images in no model with the reason
 """
 
+import html
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -73,6 +74,10 @@ class MapResult(Displayed):
             "warnings": list(self.warnings),
         }
         return dict(facts)
+
+    def _repr_html_(self) -> str:
+        """Return what matters of all models, and what the largest shows of itself."""
+        return f"<p>{html.escape(self._headline())}</p>{self.models[0].located._repr_html_()}"
 
     def _headline(self) -> str:
         models = counted(len(self.models), "model")

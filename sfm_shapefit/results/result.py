@@ -20,8 +20,11 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
+from sfm_shapefit.results.columns import Column, TableName, table_of
+from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
 from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
+from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
@@ -108,6 +111,15 @@ class LocateResult(Displayed):
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
         return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.warnings]
+        return notebook_html(self, [*headline_of_model(self).rows(), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, 3)
 
     @cached_property
     def image_names(self) -> tuple[str, ...]:
@@ -270,6 +282,15 @@ class GraphResult(Displayed):
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
         return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.summary()["warnings"]]
+        return notebook_html(self, [*headline_of_graph(self).rows(), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, self.placement.graph.dimension)
 
     @cached_property
     def departure(self) -> Departure:
