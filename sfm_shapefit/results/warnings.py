@@ -78,11 +78,14 @@ def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        of_extent = f"more than {_UNCERTAIN_SHARE:.0%} of the extent"
-        what = f"{len(uncertain)} cameras are uncertain by {of_extent}, above all {worst}"
+        share, see = f"{_UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
         if len(uncertain) == 1:
-            what = f"{worst} is uncertain by {of_extent}"
-        yield f"{what}; see sigma and trust in cameras.csv"
+            yield f"{worst} is uncertain by more than {share} of the extent; {see}"
+        else:
+            yield (
+                f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
+                f"{worst}; {see}"
+            )
 
 
 def extent_of(locations: FloatArray) -> float:
