@@ -126,13 +126,23 @@ def test_the_package_is_imported_and_help_shown_in_tenths_of_a_second():
 
 
 @pytest.mark.slow
-def test_the_api_reference_builds_without_a_warning(tmp_path):
+def test_the_documentation_builds_as_a_site_with_a_search_over_pages_and_api(tmp_path):
     pytest.importorskip("pdoc")
-    done = run_python("-W", "error", "scripts/api_reference.py", tmp_path)
+    done = run_python("-W", "error", "scripts/docs_site.py", tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")
+    page = (tmp_path / "api/sfm_shapefit.html").read_text(encoding="utf-8")
     assert all(f'id="{name}"' in page for name in sfm_shapefit.__all__)
+    text = (tmp_path / "search-index.js").read_text(encoding="utf-8")
+    index = json.loads(text.removeprefix("const INDEX = ").rstrip(";\n"))
+    urls = {entry["url"] for entry in index}
+    assert {"glossary.html#glossary", "api/sfm_shapefit.html#locate"} <= urls
+    for url in urls:
+        file, _, anchor = url.partition("#")
+        assert f'id="{anchor}"' in (tmp_path / file).read_text(encoding="utf-8"), url
+    home = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for link in re.findall(r'(?:href|src)="(?!https:|#)([^"#]+)', home):
+        assert (tmp_path / link).is_file(), link
 
 
 def outputs_of(notebook: Path) -> list[object]:

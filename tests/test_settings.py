@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import inspect
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -11,7 +12,8 @@ import sfm_shapefit
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.locate_options import LocateOptions, MapOptions
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.options import PlacementOptions, Scale
+from sfm_shapefit.results import headline
 from sfm_shapefit.results.columns import columns_of
 from sfm_shapefit.results.tables import CameraRow
 from sfm_shapefit.settings import groups_of, merge_options
@@ -161,6 +163,10 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     assert "good</b>" in table
     assert "<iframe sandbox='allow-scripts'" in table
     assert "method</th><td>newton<" in solved._repr_html_()
+
+
+def test_every_scale_has_its_unit():
+    assert set(headline._UNITS) == {*get_args(Scale), "fixed"} - {"auto"}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):

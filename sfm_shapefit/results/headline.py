@@ -27,6 +27,7 @@ _UNITS = {
     "input": "of the input's units",
     "unit": "units",
     "rig": "of the rigs' units",
+    "distance": "of the known distance's units",
     "prior": "of the priors' units",
     "fixed": "of the fixed cameras' units",
 }
