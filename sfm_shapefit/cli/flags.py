@@ -33,6 +33,14 @@ Database = Annotated[
         help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
     ),
 ]
+PriorsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--priors",
+        metavar="FILE",
+        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Scene = Annotated[

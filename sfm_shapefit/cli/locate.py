@@ -15,6 +15,7 @@ from sfm_shapefit.cli.flags import (
     OutArgument,
     OutputFlags,
     OutputPath,
+    PriorsFile,
     one_path,
     takes,
 )
@@ -46,14 +47,7 @@ def locate_command(
     input_path: InputPath = None,
     output_path: OutputPath = None,
     database: Database = None,
-    priors: Annotated[
-        Path | None,
-        typer.Option(
-            "--priors",
-            metavar="FILE",
-            help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
-        ),
-    ] = None,
+    priors: PriorsFile = None,
     executor: Annotated[
         Literal["serial", "processes", "dask"],
         typer.Option(

@@ -7,7 +7,15 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, shorten
-from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, OutputPath, one_path, takes
+from sfm_shapefit.cli.flags import (
+    GroupedCommand,
+    OutArgument,
+    OutputFlags,
+    OutputPath,
+    PriorsFile,
+    one_path,
+    takes,
+)
 from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import describe_adjustment, describe_points
 from sfm_shapefit.locate_options import MapOptions
@@ -32,16 +40,17 @@ def map_command(
     *,
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
+    priors: PriorsFile = None,
     **given: Any,
 ) -> None:
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
-    with command_run(MapOptions, given, target, [source], "DATABASE OUT") as run:
+    with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
         from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.commands.write import write_result
 
-        found = map_database(source, run.options, progress=run.progress)
+        found = map_database(source, run.options, progress=run.progress, priors=priors)
         write_result(found, target, **run.writing)
         title = f"{counted(found.num_images, 'image')} of {source}"
         run.heed(found.models[0].located.verdict)

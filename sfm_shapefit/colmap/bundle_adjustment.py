@@ -32,6 +32,7 @@ from sfm_shapefit.adjustment import (
     AdjustmentProblem,
     adjust,
     choose_loss_scale_px,
+    frames_not_gained,
     reprojection_errors_px,
 )
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
@@ -41,6 +42,7 @@ from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import (
+    KnownCenters,
     add_points,
     collect_tracks,
     read_frames,
@@ -120,11 +122,15 @@ class AdjustedPlacement:
         )
 
 
-class GivenRotations(NamedTuple):
-    """The rotations of a model, and how an adjustment treats them."""
+class GivenPoses(NamedTuple):
+    """What is known of poses beside the pixels, and how an adjustment treats it."""
 
-    weight: RotationWeight
-    model: pycolmap.Reconstruction
+    weight: RotationWeight = _FREE
+    """Of the model's rotations."""
+    model: pycolmap.Reconstruction | None = None
+    """Whose rotations were given; None: those of the seed."""
+    centers: KnownCenters | None = None
+    """Measured otherwise, which pull at the frames."""
 
 
 def bundle_adjust(
@@ -134,7 +140,7 @@ def bundle_adjust(
     *,
     adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
-    given: GivenRotations | None = None,
+    given: GivenPoses | None = None,
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -144,13 +150,13 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: rotations that were given, and how they are treated; all are free if None, and with Ceres.
+        given: what is known of poses, and how it is treated; nothing if None, and with Ceres.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
-        frames and rigs do not hold stays near the seed's: by our own, the centers' best similarity to the
-        seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs stay what they
-        are, and intrinsics to the bit.
+        frames, rigs and known centers do not hold stays near the seed's: by our own, the centers' best
+        similarity to the seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs
+        stay what they are, and intrinsics to the bit.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or Ceres diverges.
@@ -162,9 +168,11 @@ def bundle_adjust(
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
         covariances: Mapping[int, FloatArray] = {}
     else:
-        run = _Run(seed, tracks, structure_options, fixed_frames)
-        if given is not None:
-            run.weight, run.given = given.weight, rotations_of_frames(given.model, run.frames.frame_ids)
+        given = given or GivenPoses()
+        run = _Run(seed, tracks, structure_options, fixed_frames, given.centers)
+        run.weight = given.weight
+        if given.model is not None:
+            run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
         iterations, converged, covariances = run.iterations, run.converged, run.covariances(last)
     answer = filter_points(unfiltered, structure_options)
@@ -187,6 +195,9 @@ def adjust_thinly(
 ) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
 
+    Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as
+    long rings are. A ring of 300 images ends 0.0097 off after the first solve, 0.0020 after the second.
+
     Args:
         seed: the placed images, which is not changed; any points are ignored.
         tracks: as in `triangulate`.
@@ -201,6 +212,9 @@ def adjust_thinly(
     """
     run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames)
     adjusted = run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
+    joined, found = run.triangulate(1.0)
+    if len(found.points):
+        adjusted = run.adjust_thinly(joined, found)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
         reconstruction=poses, weight=_FREE, errors=None, covariances=run.covariances(adjusted)
@@ -214,6 +228,7 @@ def adjust_placement(
     weight: RotationWeight | None,
     *,
     fixed_frames: Collection[int] = (),
+    known: KnownCenters | None = None,
 ) -> AdjustedPlacement:
     """Adjust placed cameras whose rotations were given, on all tracks at once.
 
@@ -223,11 +238,12 @@ def adjust_placement(
         structure_options: filters.
         weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        known: centers measured otherwise, which pull at the frames.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options, fixed_frames)
+    run = _Run(seed, tracks, structure_options, fixed_frames, known)
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
     problem, errors = run.frames.problem(joined, found), None
@@ -236,7 +252,7 @@ def adjust_placement(
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    adjusted = run.return_frames(problem, run.solve(problem, run.choose_scale(problem), _GIVEN_FALL))
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
         reconstruction=poses, weight=weight, errors=errors, covariances=run.covariances(adjusted)
@@ -252,8 +268,9 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
+        known: KnownCenters | None = None,
     ) -> None:
-        self.start = self.frames = read_frames(seed, fixed_frames)
+        self.start = self.frames = read_frames(seed, fixed_frames, known)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
@@ -299,6 +316,14 @@ class _Run:
         self.iterations += adjusted.iterations
         self.converged = adjusted.converged
         return adjusted.problem
+
+    def return_frames(self, before: AdjustmentProblem, after: AdjustmentProblem) -> AdjustmentProblem:
+        """Put the frames back that gained nothing by moving, and return the problem with them."""
+        returned = frames_not_gained(before, after, self.loss_scale_px)
+        rotations = np.where(returned[:, None, None], before.rotations, after.rotations)
+        centers = np.where(returned[:, None], before.centers, after.centers)
+        self.frames = replace(self.frames, rotations=rotations, centers=centers)
+        return replace(after, rotations=rotations, centers=centers)
 
     def covariances(self, problem: AdjustmentProblem) -> dict[int, FloatArray]:
         """Return the covariance of the center of each image by its id, at the optimum last solved for."""

@@ -12,10 +12,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg, with_covariances
+from sfm_shapefit.commands.stages.adjustment import (
+    adjust_placed,
+    pull_cameras,
+    turned_deg,
+    weight_of_rotations,
+    with_covariances,
+)
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
@@ -36,7 +42,6 @@ from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
@@ -136,23 +141,25 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             there = np.isfinite(centers).all(axis=1)
             scale = median_spread(centers[there]) / median_spread(placed[there])
             placement = with_covariances(placement, model, known.covariances or {}, scale)
-        rule = GaugeRule(model, rigid, options, known.priors)
-    adjustment, given = None, None
-    if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
+        located = _choose(placement, GaugeRule(model, rigid, options, known.priors))
+        pulls = known.priors is not None and options.refine_with_priors
+        if known.priors is not None and pulls:
+            located = pull_cameras(model, located, known.priors, options)
+            placement = located.placement
+    adjustment = None
+    is_adjusted = known.centers is not None and not pulls
+    if not is_adjusted and options.adjusts_cameras(len(placement.cameras)):
+        weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            after = adjust_placed(source, directions, _choose(placement, rule), options, clock)
+            after = adjust_placed(source, directions, located, options, clock, weight)
             source, directions, placement, adjustment = after
-            given = GivenRotations(adjustment.weight, model.reconstruction)
+            given = located.given._replace(weight=adjustment.weight, model=model.reconstruction)
+            located = located._replace(given=given)
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
         focal_doubts = question_focal_lengths(source, directions, options)
         placement = doubt_cameras(placement, directions, relative, source.model, options)
-        located = _choose(placement, rule)._replace(given=given)
-        if known.priors is not None and options.refine_with_priors:
-            placement, gauge = pull_to_priors(placement, located.gauge, known.priors, options)
-            placement = doubt_cameras(placement, directions, relative, source.model, options)
-            kept = select_trusted(placement, options.min_trust)
-            located = Located(placement, kept, gauge, rigid.fixed, rule)
+        located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
@@ -192,6 +199,16 @@ def _choose(placement: Placement, rule: GaugeRule) -> Located:
     kept = select_trusted(placement, rule.options.min_trust) | fixed[placement.cameras]
     gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
     return Located(placement, kept, gauge, fixed, rule)
+
+
+def _judge_again(located: Located, placement: Placement, min_trust: float) -> Located:
+    """Return what is in the output by the trust of another placement, in a gauge that is found anew.
+
+    Where priors hold the gauge it stays.
+    """
+    if located.given.centers is not None or located.rule is None:
+        return located._replace(placement=placement, kept=select_trusted(placement, min_trust))
+    return _choose(placement, located.rule)._replace(given=located.given)
 
 
 def _collect_warnings(

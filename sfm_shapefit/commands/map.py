@@ -26,6 +26,7 @@ from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -47,6 +48,7 @@ def map_database(
     options: MapOptions | None = None,
     *,
     progress: Progress | None = None,
+    priors: Path | str | None = None,
     **overrides: Any,
 ) -> MapResult:
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
@@ -57,6 +59,8 @@ def map_database(
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
+        priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
+            "unit".
 
     Returns:
         `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
@@ -71,12 +75,14 @@ def map_database(
     with clock("read"):
         images = read_images(path)
         unposed = read_model(images.reconstruction)
+        inputs = choose_inputs(images.reconstruction, path, options.directions)
+        positions = read_priors(unposed, inputs, options, priors)
     with clock("relative rotations"):
         sharing = Sharing(options.num_threads(), advance=clock.advance)
         relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
         scores = score_triplets(unposed.num_images, relative).tolist()
     triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
-    run = _Run(options, clock, path, images, unposed, triplet_scores)
+    run = _Run(options, clock, path, images, unposed, triplet_scores, positions)
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.average_components(relative, reasons):
         try:
@@ -128,6 +134,7 @@ class _Run(NamedTuple):
     """The images as a model."""
     triplet_scores: dict[tuple[int, int], float]
     """Of the pairs with a relative rotation."""
+    priors: PositionPriors | None
 
     def average_components(
         self, relative: RelativeRotations, reasons: dict[int, str]
@@ -172,16 +179,10 @@ class _Run(NamedTuple):
     def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
-        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
-        known = self.options.known_distance
-        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
-            # The known distance belongs to another component.
-            known, settings["known_distance"] = None, None
-            settings["scale"] = "auto"
-        if known is None and settings["scale"] in ("auto", "input"):
-            # There is no input whose scale could be taken.
-            settings["scale"] = "unit"
-        options = LocateOptions(**settings)
+        priors = None if self.priors is None else self.priors.of(members)
+        if priors is not None and len(priors.cameras) < FEWEST_PRIORS:
+            priors = None
+        options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
         with open_source(model, inputs, options) as averaged:
@@ -190,7 +191,6 @@ class _Run(NamedTuple):
                 with self.clock("first placement"):
                     rotations, centers, covariances = adjust_first_placement(averaged, options, self.clock)
                 source = averaged.turned(self._pose(image_ids, rotations))
-            priors = read_priors(source.model, inputs, options, None)
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             locating = Locating(inputs, rigid, priors, centers=centers, covariances=covariances)
             with self.clock("locate"):
@@ -198,6 +198,21 @@ class _Run(NamedTuple):
         ends = members[found.directions.pairs].tolist()
         scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
         return replace(found, triplet_scores=scores)
+
+    def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
+        """Return the options of one component, whose scale is what is known of its own images."""
+        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
+        known = self.options.known_distance
+        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
+            # The known distance belongs to another component.
+            known, settings["known_distance"] = None, None
+            settings["scale"] = "auto"
+        if not has_priors:
+            settings["refine_with_priors"] = False
+        if known is None and not has_priors and settings["scale"] in ("auto", "input", "prior"):
+            # There is no input whose scale could be taken.
+            settings["scale"] = "unit"
+        return LocateOptions(**settings)
 
     def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
         """Return images with these rotations and all centers 0."""

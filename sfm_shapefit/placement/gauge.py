@@ -6,7 +6,7 @@ whole model onto their axes.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -28,13 +28,21 @@ _CAP_OF_SIZE = 0.5
 _ROUGH = 0.1
 # A smaller spread of centers, relative to their distance from the origin, counts as none.
 _COINCIDENT = 1e-9
-_FEWEST_PRIORS = 2
+FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
 # A spread across a line of fewer residuals than this says nothing of the turn about the line.
 _FLAT = 5.0
 # The weight of a prior is half at so many standard deviations.
 _KERNEL_WIDTH = 3.0
 _REWEIGHTINGS = 20
+
+
+class Datum(NamedTuple):
+    """A point on Earth: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,6 +60,8 @@ class Gauge:
     after `similarity`; None where the axes are the input's."""
     warning: str = ""
     """Why the scale may be rough, if it may."""
+    datum: Datum | None = None
+    """Where the output's origin is on Earth, if priors on Earth set it."""
 
     def apply(self, locations: FloatArray) -> FloatArray:
         """Map the solver's locations (n, 3) to the output's units and axes."""
@@ -71,15 +81,14 @@ class PositionPriors:
     """(k, 3, 3), in the positions' units squared; NaN where unknown."""
     statement: str
     """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
-        return PositionPriors(
-            cameras=places,
-            positions=self.positions[rows],
-            covariances=self.covariances[rows],
-            statement=self.statement,
+        return replace(
+            self, cameras=places, positions=self.positions[rows], covariances=self.covariances[rows]
         )
 
 
@@ -189,7 +198,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
     """
-    if len(priors.cameras) < _FEWEST_PRIORS:
+    if len(priors.cameras) < FEWEST_PRIORS:
         raise InputError(
             f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
@@ -214,6 +223,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
         axes=found.rotation if turns else None,
         statement=_prior_statement(priors, found, weights, level, turns=turns),
         warning=_prior_warning(level, size, turns=turns),
+        datum=priors.datum if turns else None,
     )
 
 

@@ -30,6 +30,14 @@ class JudgedModel(TypedDict):
     reasons: Annotated[list[str], "Why the grade is not better."]
 
 
+class EarthDatum(TypedDict):
+    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: Annotated[float, "Geodetic latitude."]
+    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
+    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
+
+
 class LooseGroup(TypedDict):
     """Cameras that are rigid by the graph but loose by the geometry."""
 
@@ -218,6 +226,7 @@ class LocateSummary(PlacementSummary):
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+    datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]

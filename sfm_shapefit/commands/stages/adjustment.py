@@ -13,7 +13,8 @@ import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_placement
+from sfm_shapefit.colmap.adjustment import KnownCenters
+from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, adjust_placement
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -23,8 +24,10 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.viewgraph import ViewGraph
 
 
@@ -33,6 +36,21 @@ def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     if options.rotation_sigma_deg:
         return RotationWeight(sigma_rad=math.radians(options.rotation_sigma_deg))
     return {"auto": None, "measured": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+
+
+def pull_cameras(
+    model: PosedModel, located: Located, priors: PositionPriors, options: LocateOptions
+) -> Located:
+    """Return the cameras pulled by position priors, which hold the gauge from here on.
+
+    Raises:
+        UnsolvableError: if the factor would take more memory than the options allow.
+    """
+    pulled = pull_to_priors(located.placement, located.gauge, priors, options)
+    nodes, positions, information = pulled.anchors
+    frame_ids = model.frame_ids[pulled.placement.nodes[nodes]]
+    given = GivenPoses(centers=KnownCenters(frame_ids, positions, information))
+    return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 
 class AfterAdjustment(NamedTuple):
@@ -54,8 +72,9 @@ def adjust_placed(
     located: Located,
     options: LocateOptions,
     clock: Clock,
+    weight: RotationWeight | None,
 ) -> AfterAdjustment:
-    """Adjust all placed cameras, in the gauge that was chosen.
+    """Adjust all placed cameras, in the gauge that was chosen; `weight` is of their rotations.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
@@ -64,7 +83,9 @@ def adjust_placed(
     fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed, tracks = seed_and_tracks(source, everyone, clock.advance)
-    adjusted = adjust_placement(seed, tracks, options, weight_of_rotations(options), fixed_frames=fixed)
+    adjusted = adjust_placement(
+        seed, tracks, options, weight, fixed_frames=fixed, known=located.given.centers
+    )
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
