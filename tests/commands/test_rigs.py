@@ -286,7 +286,7 @@ def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_pa
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
     scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
     names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
-    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--fix"]
+    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
     done = run(*arguments, names, code=0)
     assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
         done.output.replace("│", " ").split()
