@@ -24,6 +24,7 @@ import platform
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -34,6 +35,7 @@ import llvmlite.binding as llvm
 import numba
 from numba.core import config
 from numba.core.caching import NullCache
+from numba.core.event import Listener, install_listener
 from numba.core.registry import cpu_target
 from numba.misc.appdirs import AppDirs
 
@@ -53,6 +55,14 @@ _missed: list[Callable[[], None]] = []
 """What is called when a kernel is not found, once, before it is looked for again."""
 _hearing: list[Callable[[str], None]] = []
 """What is told the names of kernels that are found, or compiled and kept."""
+_said: list[bool] = []
+"""Not empty once a caller was told that kernels are compiled."""
+_COMPILING = (
+    "sfm_shapefit: compiling kernels, once, which may take a minute or two; they are kept on disk "
+    "(`sfm-shapefit warm-up` compiles all of them beforehand)"
+)
+_measuring: "list[CompileTime]" = []
+"""What counts the seconds that are spent compiling."""
 
 
 def choose_target() -> str:
@@ -97,6 +107,50 @@ def hear_of_kernels(hear: Callable[[str], None]) -> Iterator[None]:
         _hearing.remove(hear)
 
 
+class CompileTime(Listener):  # type: ignore[misc]
+    """Adds up the seconds that are spent compiling; what is compiled inside another kernel counts once."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth, self._since = 0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        """Begin to compile something."""
+        if self._depth == 0:
+            self._since = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, _event: Any) -> None:
+        """Have compiled something."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._since
+
+
+@contextmanager
+def measure_compilation() -> Iterator[CompileTime]:
+    """Yield what counts the seconds that the block spends compiling, or waiting for others that do."""
+    spent = CompileTime()
+    _measuring.append(spent)
+    try:
+        with install_listener("numba:compile", spent):
+            yield spent
+    finally:
+        _measuring.remove(spent)
+
+
+@contextmanager
+def counted_as_compiling() -> Iterator[None]:
+    """Count the block as time that is spent compiling: other processes compile meanwhile."""
+    for spent in _measuring:
+        spent.on_start(None)
+    try:
+        yield
+    finally:
+        for spent in _measuring:
+            spent.on_end(None)
+
+
 class KernelCache(NullCache):  # type: ignore[misc]
     """The compiled code of one function, for numba's dispatchers."""
 
@@ -116,6 +170,8 @@ class KernelCache(NullCache):  # type: ignore[misc]
         if found is None and _missed:
             _missed.pop()()
             found = self._find(name, target_context)
+        if found is None:
+            self._say_once()
         if found is not None:
             self._tell()
         return found
@@ -134,6 +190,13 @@ class KernelCache(NullCache):  # type: ignore[misc]
             self._remove_stale(folder)
             break
         self._tell()
+
+    def _say_once(self) -> None:
+        """Say on stderr that kernels are compiled, to who calls from Python; the program says it itself."""
+        is_ours = self._source.is_relative_to(PACKAGE)
+        if is_ours and not (_said or _hearing or "sfm_shapefit.cli" in sys.modules):
+            _said.append(True)
+            print(_COMPILING, file=sys.stderr)  # noqa: T201
 
     def _tell(self) -> None:
         for hear in _hearing:

@@ -55,6 +55,17 @@ Images = Annotated[
 
 _SHORT = {"quiet": "-q", "verbose": "-v"}
 
+_METAVARS: dict[Any, str] = {
+    "known_distance": "NAME NAME DISTANCE",
+    "fix": "FILE|solved",
+    "config": "FILE",
+    int: "INTEGER",
+    float: "NUMBER",
+    int | None: "INTEGER",
+    float | None: "NUMBER",
+}
+"""What stands for a flag's value in the help, by the field's name or else by its type."""
+
 _EARLIER_NAMES: dict[str, str] = {}
 """Flags that are taken beside their present names, without standing in any help."""
 
@@ -140,7 +151,12 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
             names += [_SHORT[item.name]] if item.name in _SHORT else []
             shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
             default = "" if item.default in (None, "") or is_switch else f" [default: {shown}]"
-            flagged = typer.Option(*names, help=item.metadata["help"] + default, rich_help_panel=group.title)
+            flagged = typer.Option(
+                *names,
+                help=item.metadata["help"] + default,
+                rich_help_panel=group.title,
+                metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
+            )
             annotation: Any = Annotated[kinds[item.name] | None, flagged]
             kind = inspect.Parameter.KEYWORD_ONLY
             parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
@@ -177,6 +193,8 @@ def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str
     refuse_irregular_file(path)
     try:
         read = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     values = {earlier.get(name, name): value for name, value in read.items()}

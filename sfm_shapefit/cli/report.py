@@ -1,5 +1,6 @@
 """`sfm-shapefit report OUT` and `sfm-shapefit view OUT`: what an earlier run found, to be looked at."""
 
+import shlex
 import time
 from pathlib import Path
 from typing import Annotated
@@ -7,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import report_errors
+from sfm_shapefit.cli.console import print_steps, print_table, report_errors
 from sfm_shapefit.cli.flags import GroupedCommand, Images, Scene, one_path
 
 Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
@@ -38,6 +39,9 @@ def report_command(out: Output = None, *, scene: Scene = False, images: Images =
             write_report(drawn, facts, folder / "report.html", pictures)
             if scene:
                 write_meshes(drawn, folder)
+            names = ["report.html", *(["scene.glb", "scene.ply"] if scene else [])]
+            print_table(str(folder), [("written", ", ".join(names))])
+            print_steps([f"open {shlex.quote(str(folder / 'report.html'))}"])
         except OSError as error:
             what = f"{folder} cannot be written ({error.strerror})"
             raise InputError(f"{what}; copy it elsewhere first") from error

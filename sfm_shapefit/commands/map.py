@@ -25,7 +25,7 @@ from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.map_result import MappedModel, MapResult
@@ -36,6 +36,7 @@ from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
+from sfm_shapefit.wording import counted
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.
@@ -55,7 +56,8 @@ def map_database(
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
 
     Args:
-        database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
+        database: with keypoints and two-view geometries, or the folder that holds it as database.db; it is
+            never changed. Intrinsics are the database's.
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
@@ -71,7 +73,7 @@ def map_database(
         UnsolvableError: if no component of three images or more can be placed.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = Path(database), Clock(progress) if progress else Clock()
+    path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     with clock("read"):
         images = read_images(path)
         unposed = read_model(images.reconstruction)
@@ -119,6 +121,19 @@ def map_database(
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
     )
+
+
+def database_in(path: Path) -> Path:
+    """Return the database of a folder, which is its database.db; any other path is that of a database.
+
+    Raises:
+        InputError: if the folder has none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / "database.db").is_file():
+        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
+    return path / "database.db"
 
 
 class _Run(NamedTuple):
@@ -254,8 +269,8 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         )
     if images.num_guessed_cameras:
         yield (
-            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; "
-            "calibrate them first (pycolmap.calibrate_view_graph) if the result is poor"
+            f"a guessed focal length stays as it is in {counted(images.num_guessed_cameras, 'camera')}; "
+            "calibrate (pycolmap.calibrate_view_graph) if the result is poor"
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
@@ -268,9 +283,10 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         if len(doubtful):
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
-                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, "
-                f"above all those of {worst}"
+                f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
+                f"rotations, above all those of {worst}"
             )
     if left_out:
         name, reason = next(iter(left_out.items()))
-        yield f"{len(left_out)} images are in no model, {name} for one: {reason}"
+        many = f"{len(left_out)} images are in no model, {name} for one"
+        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"

@@ -20,7 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from sfm_shapefit.errors import ShapeFitError
-from sfm_shapefit.kernel_cache import PACKAGE, hear_of_kernels, here, is_noted, made_for, note, on_miss
+from sfm_shapefit.kernel_cache import (
+    PACKAGE,
+    counted_as_compiling,
+    hear_of_kernels,
+    here,
+    is_noted,
+    made_for,
+    note,
+    on_miss,
+)
 
 Tell = Callable[[int, int], None]
 """Called with the number of kernels that are ready and of all that will be."""
@@ -120,7 +129,7 @@ def compile_together(tell: Tell, say: Callable[[str], None]) -> Iterator[None]:
         missing = not_done(NEEDED)
         if missing and num_cores() > 1:
             # Where no process can be started, as where memory is short, all is compiled here.
-            with suppress(OSError, MemoryError):
+            with suppress(OSError, MemoryError), counted_as_compiling():
                 warm_up(missing, tell)
 
     with on_miss(act):

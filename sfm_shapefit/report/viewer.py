@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
+from sfm_shapefit.extras import MissingExtraError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners, input_centers
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
@@ -88,9 +88,7 @@ def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "vis
     try:
         import viser
     except ImportError as error:
-        raise InputError(
-            "the viewer needs viser: pip install '.[viewer]' in the folder of sfm_shapefit"
-        ) from error
+        raise MissingExtraError("the viewer", "viser", "viewer") from error
     # The server prints a banner; the address is for the caller to tell.
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)

@@ -269,7 +269,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     [
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
-        (None, "is not a readable text file"),
+        (None, "does not exist"),
         ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
 )
@@ -287,7 +287,7 @@ def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_pa
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
     scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
     names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
-    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--fix"]
+    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
     done = run(*arguments, names, code=0)
     assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
         done.output.replace("│", " ").split()
