@@ -9,7 +9,7 @@ first three are drawn.
 import enum
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -89,6 +89,15 @@ class Cameras:
         return np.where(np.isfinite(largest), largest, np.nan)
 
 
+class CameraColumn(NamedTuple):
+    """A further column of the table of cameras, which can also color the scene."""
+
+    title: str
+    hint: str
+    values: FloatArray
+    """(n,) NaN where it is not known."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Pairs:
     """The m rows of pairs.csv."""
@@ -163,6 +172,8 @@ class Drawing:
     """Whether the input's centers are in the output's units, so that both can be drawn together."""
     history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
+    further: tuple[CameraColumn, ...] = ()
+    """What is known of the cameras beside."""
 
     def shifts(self) -> FloatArray:
         """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""

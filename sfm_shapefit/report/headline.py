@@ -63,6 +63,7 @@ def tiles(drawing: Drawing, facts: dict[str, Any]) -> list[dict[str, str]]:
         _doubtful_tile(drawing, facts),
         *_points_tile(drawing, facts),
         *_shift_tile(drawing),
+        *_track_tile(facts),
     ]
 
 
@@ -95,8 +96,11 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
         return f"{reasons}." if reasons else ""
     more = f" and {len(cameras) - _NAMED:,} more" if len(cameras) > _NAMED else ""
     named = f"{', '.join(cameras[:_NAMED])}{more}"
+    verb = "is" if len(cameras) == 1 else "are"
+    if facts.get("examined"):
+        return f"{named} {verb} weak, as said below; the others show no weakness."
     others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
-    return f"{named} may be wrong or {'is' if len(cameras) == 1 else 'are'} left out; {others}."
+    return f"{named} may be wrong or {verb} left out; {others}."
 
 
 def _next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
@@ -106,6 +110,8 @@ def _next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
             "Next: the positions are in cameras.csv; look at them from all sides.",
             "sfm-shapefit view {out}",
         )
+    if facts.get("examined"):
+        return _next_of_model(grade, shlex.quote(input_of(facts)))
     if grade == "do not use":
         path = shlex.quote(input_of(facts))
         return "Next: find out what is wrong with the input.", f"sfm-shapefit inspect {path}"
@@ -118,6 +124,19 @@ def _next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
     return (
         first,
         "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
+    )
+
+
+def _next_of_model(grade: str, path: str) -> tuple[str, str]:
+    """Return what to do with a model that was only looked at."""
+    if grade == "good":
+        return (
+            "Next: undistort the images for dense reconstruction.",
+            f"colmap image_undistorter --image_path IMAGES --input_path {path} --output_path dense",
+        )
+    return (
+        "Next: place the cameras anew from their rotations and matches, and compare.",
+        f"sfm-shapefit locate {path} located",
     )
 
 
@@ -190,6 +209,12 @@ def _shift_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
             f"typical shift from the input's positions ({100.0 * median / drawing.extent:.2g}% of the scene)"
         )
         yield _tile(f"{median:.2g} units", label, "The input's positions place no camera; they may be wrong.")
+
+
+def _track_tile(facts: dict[str, Any]) -> Iterator[dict[str, str]]:
+    length = facts.get("median_track_length")
+    if length is not None and np.isfinite(length):
+        yield _tile(f"{length:.3g}", "images see a 3D point (median)", "The median track length.")
 
 
 def _count(number: int, noun: str) -> str:

@@ -83,8 +83,9 @@ def page_data(
 ) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
-    # Cameras of unknown trust come last.
-    cameras = np.lexsort((trust, np.isnan(trust)))
+    # Cameras of unknown trust come last; of these, those with a reason come first.
+    has_reason = np.array([bool(reason) for reason in drawing.cameras.reasons], dtype=np.bool_)
+    cameras = np.lexsort((~has_reason, np.nan_to_num(trust), np.isnan(trust)))
     pairs = drawing.pairs.worst_first()[:MAX_PAIRS]
     reasons: dict[str, int] = {"": 0}
     rank = np.empty(len(cameras), dtype=np.int64)
@@ -175,6 +176,10 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
         "ghost": _pack(display(_ghosts(drawing)[order]), "f4"),
         "inputCenter": _pack(display(cameras.poses.centers[order]), "f4") if aligned else None,
         "shift": _pack(drawing.shifts()[order], "f4") if aligned else None,
+        "further": [
+            {"title": column.title, "hint": column.hint, "values": _pack(column.values[order], "f4")}
+            for column in drawing.further
+        ],
     }
 
 
@@ -308,7 +313,7 @@ def _trust_note(trust: FloatArray) -> str:
     known = int(np.isfinite(trust).sum())
     high = int(np.sum(trust >= _HIGH_TRUST))
     if not known:
-        return "No camera has a trust."
+        return ""
     said = f"{high:,} of {known:,} cameras have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
     return f"{said}; the least trusted others are shown." if high < known else f"{said}."
 

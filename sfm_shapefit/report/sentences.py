@@ -26,6 +26,7 @@ _SOLVER_SCALE = "solver: the solver's own units, the centroid at the origin"
 _FEW_PAIRS = 4
 # So many items of a kind are among the first things to look at.
 _SHOWN = 3
+_MOST_WEAK = 6
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,6 +62,8 @@ def expert_sentences(facts: dict[str, Any]) -> list[str]:
     """Return what only those who know the method ask for."""
     level = facts["residual_level_deg"]
     said = [f"Pairs that agree are off by a standard deviation of {level:.2g} degrees per axis."]
+    if not np.isfinite(level):
+        said = []
     if "delivered" in facts:  # which earlier outputs lack
         said.append(f"The certificate: {facts['delivered']['statement']}.")
     adjustment = facts.get("adjustment")
@@ -72,7 +75,7 @@ def expert_sentences(facts: dict[str, Any]) -> list[str]:
 
 def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
-    cameras = [*_left_out(drawing), *_least_trusted(drawing)]
+    cameras = [*_left_out(drawing), *_least_trusted(drawing), *_weak(drawing)]
     return [
         *_warnings(drawing, facts, {hint.camera for hint in cameras}),
         *cameras,
@@ -160,6 +163,18 @@ def _least_trusted(drawing: Drawing) -> Iterator[Hint]:
         )
 
 
+def _weak(drawing: Drawing) -> Iterator[Hint]:
+    """Yield cameras that have no trust, as those of a model that is only looked at, but a weakness."""
+    cameras = drawing.cameras
+    rows = [
+        k for k in np.flatnonzero(cameras.placed & np.isnan(cameras.trust)).tolist() if cameras.reasons[k]
+    ]
+    for row in rows[:_MOST_WEAK]:
+        yield Hint(text=f"{shorten(cameras.names[row])}: {shorten(cameras.reasons[row])}", camera=row)
+    if len(rows) > _MOST_WEAK:
+        yield Hint(text=f"{len(rows) - _MOST_WEAK:,} more are weak; the table of cameras says why")
+
+
 def _contradictions(drawing: Drawing) -> Iterator[Hint]:
     """Yield the contradicting pairs with most matches: repeated structure, or wrong rotations.
 
@@ -185,7 +200,9 @@ def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
     """Say how many pairs contradict the placed cameras, by how much if it is little, and whose they are."""
     pairs, count = drawing.pairs, len(against)
     verb = "contradicts" if count == 1 else "contradict"
-    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed cameras and {_are(count)} set aside"
+    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed cameras"
+    if np.isfinite(drawing.cameras.trust).any():
+        text += f" and {_are(count)} set aside"
     largest = float(pairs.residuals_deg[against].max())
     if largest < _FAR_DEG:
         text += f"; by {largest:.2g} degrees at most, which does no harm"

@@ -55,10 +55,13 @@ def test_a_bare_graph_has_its_report_too_and_a_report_can_be_made_again(located,
         assert len({re.search(r'"summary":(\[.*?\])', text).group(1) for text in texts}) == 1
 
 
-@pytest.mark.parametrize("command", ["report", "view"])
-def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, command):
+@pytest.mark.parametrize(
+    ("command", "advice"),
+    [("report", "holds no COLMAP model"), ("view", "give a folder that locate or solve wrote")],
+)
+def test_folders_of_others_and_damaged_ones_are_refused_in_a_sentence(tmp_path, command, advice):
     result = run(command, tmp_path, code=3)
-    assert "give a folder that locate or solve wrote" in result.stderr
+    assert advice in result.stderr
     (tmp_path / "locate.json").write_text("{}")
     result = run(command, tmp_path, code=3)
     assert "damaged or of another version" in result.stderr

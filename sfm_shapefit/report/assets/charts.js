@@ -249,6 +249,7 @@ const drawCharts = (onChoice) => {
     const svg = draw(onChoice);
     if (svg) fill(id, svg);
     else $(id).hidden = true;
+    $(id).closest("section").hidden = !svg && !data.notes[id];
   }
 };
 // Their texts keep their size when the window changes its own.

@@ -59,6 +59,7 @@ const quantile = (values, share) => {
   const sorted = Float64Array.from(values).filter(Number.isFinite).sort();
   return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : NaN;
 };
+const isKnown = (values) => values.some(Number.isFinite);
 const middleOfName = (name, most) => {
   if (name.length <= most) return name;
   const tail = Math.ceil(most * 0.6);
@@ -89,6 +90,7 @@ const cameraFacts = (k) => [
   ["pairs", cameras.degree[k] ? agreeing(k) : "none"],
   ["typical error", off(cameras.error[k])],
   ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} units` : ""],
+  ...cameras.further.map(({ hint, values }) => [hint[0].toLowerCase() + hint.slice(1), number(values[k])]),
   ["why", reason(cameras.reason[k])],
 ];
 const pairFacts = (p) => [

@@ -350,10 +350,13 @@ const colorModes = () => {
     return [{ name, label, color, low: `${number(low, 2)}${unit}`, high: `${number(high, 2)}${unit}`, gradient: gradient(VALUE_RAMP) }];
   };
   const trust = (k) => (Number.isFinite(cameras.trust[k]) ? ramp(TRUST_RAMP, cameras.trust[k]) : null);
-  const modes = [{ name: "trust", label: "trust", color: trust, low: "0", high: "1", gradient: gradient(TRUST_RAMP) }];
+  const modes = [];
+  if (isKnown(cameras.trust)) modes.push({ name: "trust", label: "trust", color: trust, low: "0", high: "1", gradient: gradient(TRUST_RAMP) });
   modes.push(...logarithmic("sigma", "uncertainty", cameras.sigma, ""));
   modes.push(...logarithmic("residual", "error of its pairs", cameras.error, "°"));
   if (cameras.shift) modes.push(...logarithmic("shift", "shift from the input", cameras.shift, ""));
+  for (const { title, values } of cameras.further) modes.push(...logarithmic(title, title, values, ""));
+  if (!modes.length) modes.push({ name: "none", label: "none", color: () => null, low: "", high: "", gradient: "" });
   if (cameras.piece.some((piece) => piece > 0)) {
     const color = (k) => (cameras.piece[k] < 0 ? null : bytesOf(PIECES[cameras.piece[k] % PIECES.length]));
     modes.push({ name: "piece", label: "separate piece", color, low: "", high: "", gradient: "" });

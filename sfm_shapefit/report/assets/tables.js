@@ -127,14 +127,15 @@ const drawTables = (onChoice) => {
   return {
     camera: makeTable("cameras", "camera", numCameras, [
       named("Camera", (k) => cameras.names[k], why),
-      numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise"),
-      numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units"),
+      ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
+      ...(isKnown(cameras.sigma) ? [numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
       numeric("Error °", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
         cell: (k) => element("td", cameras.degree[k] ? `${cameras.agreeing[k]}/${cameras.degree[k]}` : "none", "number"),
       },
       ...shift,
+      ...cameras.further.map(({ title, hint, values }) => numeric(title, (k) => values[k], 3, hint)),
     ], (k) => cameras.names[k], onChoice),
     pair: makeTable("pairs", "pair", numPairs, [
       named("Camera 1", (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),

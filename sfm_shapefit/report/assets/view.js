@@ -178,7 +178,7 @@ const makeScene = (onChoice) => {
       variable: "--soft", segments: painter.shapes(SEGMENT, shiftColumns(moved)), alpha: 0.9,
     });
   }
-  const certain = placed.filter((k) => cameras.sigmas[3 * k] > 0);
+  const certain = placed.filter((k) => Number.isFinite(cameras.sigma[k]) && cameras.sigma[k] > 0);
   if (certain.length) {
     addLayer("ellipsoids", "Uncertainty", false, {
       ellipsoids: painter.shapes(SPHERE, { ...ellipsoidColumns(certain), color: cameraColors(certain) }), members: certain,

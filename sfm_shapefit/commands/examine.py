@@ -1,0 +1,187 @@
+"""`report MODEL`: a COLMAP model as it stands, nothing placed: which cameras are weak, and which pairs wrong.
+
+A pair contradicts the model if the direction that its matches say is off the model's baseline by more than a
+degree, and by more than six times what is usual. A camera is weak if it sees fewer than 30 points, if its
+reprojection error is above a pixel and above three times what is usual, if its points cover less than 15 % of
+the picture, or if more than a third of its pairs contradict it.
+"""
+
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sfm_shapefit import __version__
+from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.image_quality import ImageQuality, image_quality
+from sfm_shapefit.colmap.model import PosedModel, read_model
+from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.measure import measure_directions
+from sfm_shapefit.directions.pair_directions import PairDirections
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalized
+from sfm_shapefit.judgement.verdicts import Verdict
+from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.results.result import Inputs
+from sfm_shapefit.results.tables import CameraRow, PairRow
+
+_FAR_DEG, _FAR_LEVELS = 1.0, 6.0
+_FEWEST_POINTS = 30
+_LARGE_PX, _LARGE_OF_USUAL = 1.0, 3.0
+_LEAST_COVERAGE = 0.15
+_FEWEST_PAIRS = 3
+# Fewer agreeing pairs of all that have a direction, and the model is not to be used.
+_LEAST_AGREEING = 0.25
+
+
+def examine(
+    folder: Path, database: Path | None = None, *, progress: Progress | None = None
+) -> tuple[Drawing, dict[str, Any]]:
+    """Return the drawing of a model, and what the report says of it, in the form of locate.json.
+
+    Args:
+        folder: a COLMAP model, as for `locate`.
+        database: as for `locate`; without one, the pairs are those that share points of the model.
+        progress: called as stages advance.
+
+    Raises:
+        InputError: if the model or the database cannot be used.
+    """
+    options, clock = LocateOptions(), Clock(progress) if progress else Clock()
+    with clock("read"):
+        model = read_model(folder)
+        inputs = choose_inputs(folder, database, options.directions)
+    with clock("points"):
+        quality = image_quality(model)
+    with open_source(model, inputs) as matches, clock("directions"):
+        try:
+            directions = measure_directions(matches, options, clock)
+        except UnsolvableError:  # no pair shares anything
+            directions = None
+    pairs, level_deg = _pair_rows(model, directions)
+    cameras = _camera_rows(model, quality, pairs)
+    poses = poses_of(model, [row.name for row in cameras])
+    # The input is what is shown; there is nothing to be compared with it.
+    poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
+    drawing = build_drawing(cameras, pairs, poses=poses, points=model.reconstruction)
+    further = _columns(quality, len(cameras))
+    facts = _facts(inputs, cameras, pairs, level_deg) | {
+        "mean_reprojection_error_px": model.reconstruction.compute_mean_reprojection_error(),
+        "median_track_length": quality.median_track_length,
+        "timings_s": clock.seconds,
+    }
+    return replace(drawing, further=further), facts
+
+
+def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[list[PairRow], float]:
+    """Return a row per pair, and the level of the residuals in degrees."""
+    if directions is None:
+        return [], np.nan
+    i, j = directions.pairs.T
+    usable, baselines = directions.usable(), model.centers[i] - model.centers[j]
+    usable = usable[np.linalg.norm(baselines[usable], axis=1) > 0.0]
+    residuals = np.full(len(i), np.nan)
+    residuals[usable] = angle_between_deg(directions.directions[usable], normalized(baselines[usable]))
+    level = SIGMA_PER_MEDIAN * float(np.median(residuals[usable])) if len(usable) else np.nan
+    limit = max(_FAR_DEG, _FAR_LEVELS * np.nan_to_num(level))
+    rows = []
+    for e, status in enumerate(directions.status):
+        known = bool(np.isfinite(residuals[e]))
+        rows.append(
+            PairRow(
+                name1=model.names[i[e]],
+                name2=model.names[j[e]],
+                direction=tuple(directions.directions[e].tolist()) if known else (),
+                support=int(directions.num_inliers[e]),
+                residual_deg=float(residuals[e]),
+                verdict=(Verdict.INLIER if residuals[e] <= limit else Verdict.OUTLIER).value,
+                reason="" if known else status.value,
+            )
+        )
+    return rows, level
+
+
+def _camera_rows(model: PosedModel, quality: ImageQuality, pairs: list[PairRow]) -> list[CameraRow]:
+    """Return a row per image, those with a pose first."""
+    degrees, wrong = dict.fromkeys(model.names, 0), dict.fromkeys(model.names, 0)
+    for pair in pairs:
+        for name in (pair.name1, pair.name2):
+            degrees[name] += bool(pair.direction)
+            wrong[name] += bool(pair.direction) and pair.verdict == Verdict.OUTLIER.value
+    usual = float(np.nanmedian(quality.errors_px)) if np.isfinite(quality.errors_px).any() else np.nan
+    rows = [
+        CameraRow(
+            name=name,
+            placed=True,
+            reason="; ".join(_weaknesses(quality, k, usual, (wrong[name], degrees[name]))),
+            piece=0,
+            center=tuple(model.centers[k].tolist()),
+            degree=degrees[name],
+        )
+        for k, name in enumerate(model.names)
+    ]
+    others = {image.name for image in model.reconstruction.images.values()} - set(model.names)
+    return rows + [CameraRow(name=name, reason="it has no pose in the model") for name in sorted(others)]
+
+
+def _weaknesses(quality: ImageQuality, k: int, usual_px: float, pairs: tuple[int, int]) -> list[str]:
+    """Return what is weak about an image, in words; `pairs` are those that contradict it, and all of it."""
+    found, (wrong, total) = [], pairs
+    if quality.num_points[k] < _FEWEST_POINTS:
+        found.append(f"it sees only {quality.num_points[k]} 3D points")
+    elif quality.coverage[k] < _LEAST_COVERAGE:
+        found.append(f"its points cover only {quality.coverage[k]:.0%} of the picture")
+    if quality.errors_px[k] > max(_LARGE_PX, _LARGE_OF_USUAL * usual_px):
+        found.append(
+            f"its reprojection error is {quality.errors_px[k]:.1f} px, where {usual_px:.1f} px is usual"
+        )
+    if total >= _FEWEST_PAIRS and 3 * wrong > total:
+        found.append(f"{wrong} of its {total} pairs contradict where it stands")
+    return found
+
+
+def _columns(quality: ImageQuality, num_cameras: int) -> tuple[CameraColumn, ...]:
+    """Return what the table of cameras shows beside the usual."""
+
+    def padded(values: FloatArray) -> FloatArray:
+        return np.concatenate([values, np.full(num_cameras - len(values), np.nan)])
+
+    return (
+        CameraColumn("Points", "3D points that it observes", padded(quality.num_points.astype(np.float64))),
+        CameraColumn("Reproj. px", "Mean reprojection error, in pixels", padded(quality.errors_px)),
+        CameraColumn("Tracks", "Median number of images that see its points", padded(quality.track_lengths)),
+        CameraColumn(
+            "Cover %", "Share of the picture in which it sees points", padded(100 * quality.coverage)
+        ),
+    )
+
+
+def _facts(
+    inputs: Inputs, cameras: list[CameraRow], pairs: list[PairRow], level_deg: float
+) -> dict[str, Any]:
+    """Return what the page says of a model, in the form of locate.json."""
+    usable = [pair for pair in pairs if pair.direction]
+    weak = [row.name for row in cameras if row.placed and row.reason]
+    share = np.mean([pair.verdict == Verdict.INLIER.value for pair in usable]) if usable else 1.0
+    grade, reasons = "look" if weak else "good", []
+    if share < _LEAST_AGREEING:
+        grade, reasons = "do not use", [f"only {share:.0%} of the pairs agree with its positions"]
+    facts: dict[str, Any] = {
+        "examined": True,
+        "inputs": {
+            "model": str(inputs.folder),
+            "database": None if inputs.database is None else str(inputs.database),
+            "directions": inputs.statement,
+        },
+        "verdict": {"grade": grade, "cameras": weak, "reasons": reasons},
+        "residual_level_deg": level_deg,
+        "scale": "input: those of the model",
+        "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
+    }
+    if usable:
+        facts["residuals_deg"] = {"quantile_50": float(np.median([pair.residual_deg for pair in usable]))}
+    return facts | {"options": {}, "pieces": [], "warnings": [], "loose_groups": []}
