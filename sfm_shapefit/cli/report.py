@@ -2,6 +2,7 @@
 
 import shlex
 import time
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -139,6 +140,7 @@ def view_command(
         str, typer.Option("--host", help="Address to listen on; others than this machine's let others in.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", min=1, max=65535, help="Port to listen on.")] = 8080,
+    open_browser: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
 ) -> None:
     """Explore OUT in the browser: move thresholds, pick cameras, compare with the input's poses."""
     folder = one_path(out, None, "OUT")
@@ -148,8 +150,12 @@ def view_command(
 
         drawn, facts = read_output(folder)
         server = serve(drawn, facts, host, port)
+        catch_termination()
         try:
-            print(f"http://{host}:{server.get_port()}  (end with Ctrl-C)", flush=True)  # noqa: T201
+            address = f"http://{host}:{server.get_port()}"
+            print(f"{address}  (end with Ctrl-C)", flush=True)  # noqa: T201
+            if open_browser:
+                webbrowser.open(address)
             while True:
                 time.sleep(3600)
         except KeyboardInterrupt:

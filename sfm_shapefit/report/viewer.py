@@ -6,7 +6,7 @@ as plain labels of its controls, shortened; never as markup.
 
 import io
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.extras import MissingExtraError
 from sfm_shapefit.geometry import angle_between_deg, normalized
 from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners, input_centers
+from sfm_shapefit.report.headline import banner
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
 from sfm_shapefit.report.sentences import shorten
 
@@ -29,16 +30,24 @@ _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
 # A click means the camera whose center is at most this far off.
 _PICKED_DEG = 2.0
-# The slider is logarithmic, from here to 180 degrees.
-_LEAST_DEG = 0.01
+_AS_REPORTED = "as in the report"
+_LIMITS_DEG = (0.1, 0.3, 1.0, 3.0, 10.0)
+# More agreeing pairs are not drawn until they are asked for.
+_MANY_PAIRS = 200
+# The eye starts so many radii to the right, behind and above; frusta have this share of one at least.
+_FIRST_VIEW = 2.6 * np.array([0.35, -0.84, 0.42])
+_LEAST_FRUSTUM = 0.05
+_POINT_SIZE = 0.004
+# The viewer takes colors of lines as linear in light, and would show them pale.
+_GAMMA = 2.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Thresholds:
     """What the controls say."""
 
-    residual_deg: float
-    """Pairs with a larger residual are drawn as contradicting."""
+    residual_deg: float | None
+    """Pairs with a larger residual are drawn as contradicting; None: as the report has it."""
     min_support: int
     """Pairs with fewer matches are not drawn."""
     min_trust: float
@@ -57,6 +66,8 @@ def select_pairs(drawing: Drawing, thresholds: Thresholds) -> tuple[IntArray, Bo
         kept &= (pairs.cameras == thresholds.camera).any(axis=1)
     worst = pairs.worst_first()
     rows = worst[kept[worst]][:_MAX_PAIRS]
+    if thresholds.residual_deg is None:
+        return rows, pairs.classes[rows] == PairClass.CONTRADICTS
     return rows, pairs.residuals_deg[rows] > thresholds.residual_deg
 
 
@@ -97,6 +108,18 @@ def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "vis
     return server
 
 
+def scene_radius(drawing: Drawing) -> float:
+    """Return within what distance of the cameras' median most cameras and points lie."""
+    centers = drawing.cameras.centers[drawing.cameras.placed]
+    if len(centers) == 0:
+        return 1.0
+    middle = np.median(centers, axis=0)
+    cameras = np.linalg.norm(centers - middle, axis=1)
+    points = np.linalg.norm(drawing.points.positions - middle, axis=1)
+    reach = [np.quantile(cameras, 0.95), *([np.quantile(points, 0.8)] if len(points) else [])]
+    return float(max(reach)) or 1.0
+
+
 class _View:
     """The controls and what they draw."""
 
@@ -106,22 +129,35 @@ class _View:
         self._middle = (
             np.median(centers[drawing.cameras.placed], axis=0) if drawing.cameras.placed.any() else 0.0
         )
+        self._radius = scene_radius(drawing)
+        depth = max(drawing.frustum_depth, _LEAST_FRUSTUM * self._radius)
+        self._drawing = drawing = replace(drawing, frustum_depth=depth)
         self._by_trust = np.lexsort((drawing.cameras.trust, np.isnan(drawing.cameras.trust)))
-        self._add_points()
+        self._scale = 1.0  # of the frusta
+        self._look_from_outside()
+        self._points = self._add_points()
         self._add_input()
         self._add_controls(facts)
         self._draw()
 
-    def _add_points(self) -> None:
+    def _look_from_outside(self) -> None:
+        """Let the first view, and a reset of it, show the whole scene."""
+        first = self._server.initial_camera
+        first.position = tuple((self._radius * _FIRST_VIEW @ self._drawing.axes).tolist())
+        first.look_at = (0.0, 0.0, 0.0)
+
+    def _add_points(self) -> "viser.PointCloudHandle | None":
         points = self._drawing.points
-        if len(points.positions):
-            self._server.scene.add_point_cloud(
-                "/points",
-                (points.positions - self._middle).astype(np.float32),
-                points.colors.astype(np.uint8),
-                point_size=0.02 * max(self._drawing.frustum_depth, 1e-9),
-                precision="float32",
-            )
+        if len(points.positions) == 0:
+            return None
+        return self._server.scene.add_point_cloud(
+            "/points",
+            (points.positions - self._middle).astype(np.float32),
+            points.colors.astype(np.uint8),
+            point_size=_POINT_SIZE * self._radius,
+            point_shape="circle",
+            precision="float32",
+        )
 
     def _add_input(self) -> None:
         """Draw the input's cameras in gray where they can be brought into the output's units."""
@@ -134,10 +170,11 @@ class _View:
     def _add_controls(self, facts: dict[str, Any]) -> None:
         gui, drawing = self._server.gui, self._drawing
         placed = int(drawing.cameras.placed.sum())
-        gui.add_markdown(f"**{placed:,} of {len(drawing.cameras.names):,} cameras placed**")
-        level = max(5.0 * float(facts["residual_level_deg"] or 0.0), _LEAST_DEG)
-        start = float(np.clip(np.log10(level), np.log10(_LEAST_DEG), 2.25))
-        self._residual = gui.add_slider("residual, log10 deg", -2.0, 2.26, 0.01, start)
+        total = len(drawing.cameras.names)
+        gui.add_markdown(f"**{banner(drawing, facts)['headline']}**")
+        gui.add_markdown(f"{placed:,} of {total:,} {drawing.noun}s placed, colored by trust: red 0, green 1")
+        self._limits = {_AS_REPORTED: None} | {f"above {limit:g} degrees": limit for limit in _LIMITS_DEG}
+        self._residual = gui.add_dropdown("pairs contradict", [*self._limits], initial_value=_AS_REPORTED)
         top = int(drawing.pairs.support.max(initial=0))
         self._support = gui.add_slider("least matches", 0, max(top, 1), 1, 0)
         self._trust = gui.add_slider("least trust", 0.0, 1.0, 0.01, 0.0)
@@ -147,12 +184,29 @@ class _View:
         self._picked = gui.add_dropdown("pairs of", [_NOBODY, *names], initial_value=_NOBODY)
         self._choices = {name: int(row) for name, row in zip(names, self._by_trust, strict=True)}
         self._counts = gui.add_text("pairs drawn", "", disabled=True)
+        self._add_layers()
         if self._input is not None:
-            handle, shown = self._input, gui.add_checkbox("input's poses (gray)", True)
+            self._input.visible = False
+            handle, shown = self._input, gui.add_checkbox("input's poses (gray)", False)
             shown.on_update(lambda _event: setattr(handle, "visible", shown.value))
-        for control in (self._residual, self._support, self._trust, self._picked):
+        own = (self._residual, self._support, self._trust, self._picked, self._agreeing, self._contradicting)
+        for control in (*own, self._size):
             control.on_update(lambda _event: self._draw())
         self._server.scene.on_click()(self._pick)
+
+    def _add_layers(self) -> None:
+        """Add what switches layers on and off, and their sizes."""
+        gui = self._server.gui
+        count = int(np.sum(self._drawing.pairs.classes == PairClass.AGREES))
+        self._agreeing = gui.add_checkbox("pairs that agree", count <= _MANY_PAIRS)
+        self._contradicting = gui.add_checkbox("pairs that contradict", True)
+        self._size = gui.add_slider("frustum size", 0.2, 5.0, 0.1, 1.0)
+        points = self._points
+        if points is not None:
+            shown, size = gui.add_checkbox("points", True), gui.add_slider("point size", 0.2, 5.0, 0.1, 1.0)
+            shown.on_update(lambda _event: setattr(points, "visible", shown.value))
+            base = _POINT_SIZE * self._radius
+            size.on_update(lambda _event: setattr(points, "point_size", base * size.value))
 
     def _pick(self, event: "viser.SceneClickEvent") -> None:
         """Choose the camera under a click."""
@@ -163,10 +217,10 @@ class _View:
 
     def _draw(self) -> None:
         """Draw cameras and pairs anew; a name that is drawn again replaces what it named."""
-        drawing = self._drawing
+        drawing, self._scale = self._drawing, float(self._size.value)
         chosen = self._choices.get(self._picked.value)
         thresholds = Thresholds(
-            residual_deg=10.0**self._residual.value,
+            residual_deg=self._limits[self._residual.value],
             min_support=int(self._support.value),
             min_trust=float(self._trust.value),
             camera=chosen,
@@ -176,16 +230,19 @@ class _View:
         colors[rows == (-1 if chosen is None else chosen)] = _CHOSEN
         self._frusta("/cameras", rows, drawing.cameras.centers[rows], colors)
         drawn, contradicts = select_pairs(drawing, thresholds)
+        wanted = np.where(contradicts, self._contradicting.value, self._agreeing.value)
+        drawn, contradicts = drawn[wanted], contradicts[wanted]
         kinds = np.where(contradicts, PairClass.CONTRADICTS, PairClass.AGREES)
         self._lines("/pairs", drawing.cameras.centers[drawing.pairs.cameras[drawn]], PAIR_COLORS[kinds])
         against = int(contradicts.sum())
-        self._counts.value = f"{len(drawn):,}, {against:,} above {thresholds.residual_deg:.3g} degrees"
+        self._counts.value = f"{len(drawn):,}, {against:,} of them contradict"
 
     def _frusta(
         self, name: str, rows: IntArray, centers: FloatArray, colors: Any
     ) -> "viser.LineSegmentsHandle | None":
         """Draw cameras as pyramids, those without a rotation as a cross."""
-        corners = frustum_corners(self._drawing, rows, centers)
+        depth = self._scale * self._drawing.frustum_depth
+        corners = frustum_corners(replace(self._drawing, frustum_depth=depth), rows, centers)
         known = np.isfinite(corners).all(axis=(1, 2))
         pyramids = np.concatenate([centers[:, None, :], corners], axis=1)[known][:, _EDGES]
         arms = self._drawing.frustum_depth / 3 * np.stack([-np.eye(3), np.eye(3)], axis=1)
@@ -199,8 +256,9 @@ class _View:
         if len(ends) == 0:
             self._server.scene.remove_by_name(name)
             return None
-        both = np.repeat(np.asarray(colors, dtype=np.uint8)[:, None, :], 2, axis=1)
+        linear = 255.0 * (np.asarray(colors) / 255.0) ** _GAMMA
+        both = np.repeat(linear.round().astype(np.uint8)[:, None, :], 2, axis=1)
         points = (ends - self._middle).astype(np.float32)
         return self._server.scene.add_line_segments(
-            name, points, both, thickness=1.5, thickness_units="screen"
+            name, points, both, thickness=2.0, thickness_units="screen"
         )

@@ -11,7 +11,7 @@ import pytest
 
 from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.report.viewer import Thresholds, camera_at, select_pairs, serve
+from sfm_shapefit.report.viewer import Thresholds, camera_at, scene_radius, select_pairs, serve
 from tests.drawings import make_drawing
 from tests.program import run, viewing
 from tests.scenes import BUNDLED, FACADE
@@ -111,6 +111,12 @@ def test_moving_a_control_redraws():
         before = controls["pairs drawn"].value
         controls["least matches"].value = 100
         assert controls["pairs drawn"].value != before
+        before = controls["pairs drawn"].value
+        controls["pairs that agree"].value = False
+        assert controls["pairs drawn"].value != before
+        controls["frustum size"].value = 2.0
+        eye = np.array(server.initial_camera.position)
+        assert np.linalg.norm(eye) > 2.0 * scene_radius(drawing)
         assert "input's poses (gray)" in controls
         (clicked,) = server.scene._scene_pointer_cb
         middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
@@ -119,6 +125,15 @@ def test_moving_a_control_redraws():
         assert controls["pairs of"].value.endswith(drawing.cameras.names[3])
     finally:
         server.stop()
+
+
+def test_it_opens_from_outside_and_verdicts_are_those_of_the_report():
+    drawing, _ = make_drawing()
+    distances = np.linalg.norm(drawing.cameras.centers[drawing.cameras.placed], axis=1)
+    assert scene_radius(drawing) == pytest.approx(np.quantile(distances, 0.95), rel=0.2)
+    as_reported = Thresholds(residual_deg=None, min_support=0, min_trust=0.0, camera=None)
+    rows, contradicts = select_pairs(drawing, as_reported)
+    np.testing.assert_array_equal(contradicts, drawing.pairs.classes[rows] == PairClass.CONTRADICTS)
 
 
 def test_view_serves_a_page_on_this_machine_only_and_ends_when_told(located):
