@@ -101,7 +101,7 @@ def _pairs(drawing: Drawing) -> str:
     against = counts[PairClass.CONTRADICTS]
     text = (
         f"Of {len(drawing.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the "
-        f"placed cameras and {against:,} {'contradicts' if against == 1 else 'contradict'} them"
+        f"placed {drawing.noun}s and {against:,} {'contradicts' if against == 1 else 'contradict'} them"
     )
     if counts[PairClass.UNDETERMINED]:
         text += f"; {counts[PairClass.UNDETERMINED]:,} cannot be judged"
@@ -200,13 +200,13 @@ def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
     """Say how many pairs contradict the placed cameras, by how much if it is little, and whose they are."""
     pairs, count = drawing.pairs, len(against)
     verb = "contradicts" if count == 1 else "contradict"
-    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed cameras"
+    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed {drawing.noun}s"
     if np.isfinite(drawing.cameras.trust).any():
         text += f" and {_are(count)} set aside"
     largest = float(pairs.residuals_deg[against].max())
     if largest < _FAR_DEG:
         text += f"; by {largest:.2g} degrees at most, which does no harm"
-    else:
+    elif np.any(pairs.support > 0):
         text += ": repeated structure, as a rule, if they have many matches"
     shares = np.bincount(pairs.cameras[against].ravel(), minlength=len(drawing.cameras.names))
     most = int(np.argmax(shares))

@@ -1,11 +1,14 @@
 // What the scene shows of this result: layers, colors, sizes, what a press chooses, and flights to it.
 
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
+const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
+const MANY_IN_GOOD = 50; // contradicting pairs of a good model
+const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
 const PICK_PAIR_PX = 5;
 const SLOW_FRAME_MS = 90;
-const LEAST_FRUSTUM_PX = 15; // at first sight, frusta are at least so deep
+const LEAST_FRUSTUM_PX = 12; // at first sight, frusta are at least so deep
 
 const makeScene = (onChoice) => {
   const canvas = $("canvas");
@@ -165,8 +168,9 @@ const makeScene = (onChoice) => {
     if (!drawn.length) return;
     const said = ["Pairs that agree", "that contradict", "that cannot be judged", "without a direction"][verdict];
     const amount = drawn.length === total ? count(total) : `${count(drawn.length)} of ${count(total)}`;
-    const few = drawn.length <= (verdict === 0 ? MANY_PAIRS : 20 * MANY_PAIRS);
-    const shown = few && verdict !== 3 && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
+    const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
+      : verdict === 1 && data.banner.grade === "good" ? MANY_IN_GOOD : MOST_PAIRS;
+    const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
     addLayer(name, `${said} (${amount})`, shown, {
       variable: VARIABLES[verdict], pairs: drawn, segments: painter.shapes(SEGMENT, pairColumns(drawn)),
       alpha: verdict === 0 ? Math.max(Math.min(6 / Math.sqrt(drawn.length + 1), 0.6), 0.15) : 0.6,
