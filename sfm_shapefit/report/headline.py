@@ -58,7 +58,7 @@ def tiles(drawing: Drawing, facts: dict[str, Any]) -> list[dict[str, str]]:
     """Return the key figures: value, label, what it means, and whether it is good."""
     return [
         _placed_tile(drawing),
-        *_error_tile(drawing, facts),
+        *_error_tile(drawing),
         *_uncertainty_tile(drawing, facts),
         _doubtful_tile(drawing, facts),
         *_points_tile(drawing, facts),
@@ -98,7 +98,7 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     named = f"{', '.join(cameras[:_NAMED])}{more}"
     verb = "is" if len(cameras) == 1 else "are"
     if facts.get("examined"):
-        return f"{named} {verb} weak, as said below; the others show no weakness."
+        return f"{named} {verb} weak; the others show no weakness."
     others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
     return f"{named} may be wrong or {verb} left out; {others}."
 
@@ -154,19 +154,16 @@ def _placed_tile(drawing: Drawing) -> dict[str, str]:
     return _tile(f"{placed:,} of {total:,}", f"{drawing.noun}s placed", hint, mood)
 
 
-def _error_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:
-    error = facts.get("residuals_deg", {}).get("quantile_50")
-    if error is None:
+def _error_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
+    errors = drawing.pairs.residuals_deg[drawing.pairs.classes == PairClass.AGREES]
+    if not len(errors):
         return
-    focal = drawing.cameras.poses.focal_lengths_px
+    error, focal = float(np.median(errors)), drawing.cameras.poses.focal_lengths_px
     value = f"{error:.2g}°"
     if np.isfinite(focal).any():
-        pixels = np.nanmedian(focal) * np.tan(np.radians(min(error, 89.0)))
-        value = f"{pixels:.2g} px, {error:.2g}°"
-    hint = (
-        "Median angle between what the matches of a pair say and where its cameras stand; in pixels at the "
-    )
-    yield _tile(value, "typical error of a pair", f"{hint}middle of a picture.")
+        value = f"{np.radians(error) * np.nanmedian(focal):.2g} px, {value}"
+    hint = "Median angle between what the matches of an agreeing pair say and where its cameras stand"
+    yield _tile(value, "typical error of a pair", f"{hint}; in pixels at the median focal length.")
 
 
 def _uncertainty_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:

@@ -55,7 +55,7 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     before = fingerprint(RING)
     page = tmp_path / "ring.html"
     result = run("report", RING / "sparse" / "0", "--write-to", page, code=0)
-    assert f"written to {page}" in result.output.replace("\n", "")
+    assert f"open {page}" in result.output
     assert "Share of the picture in which it sees points" in page.read_text(encoding="utf-8")
     assert "exists already" in run_refused("report", RING / "sparse" / "0", "--write-to", page)
     run("report", RING / "sparse" / "0", "--write-to", page, "--overwrite", code=0)
