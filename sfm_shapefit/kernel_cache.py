@@ -20,7 +20,6 @@ gives the same bits, on others: x86-64-v3, which has AVX2 and FMA, apple-m1, or 
 import hashlib
 import inspect
 import os
-import pickle
 import platform
 import re
 import sys
@@ -36,11 +35,11 @@ import llvmlite.binding as llvm
 import numba
 from numba.core import config
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
 from numba.core.event import Listener, install_listener
 from numba.core.registry import cpu_target
-from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
+
+from sfm_shapefit.kernel_code import pack, unpack
 
 PACKAGE = Path(__file__).parent
 SHIPPED = PACKAGE / "_kernels"
@@ -164,7 +163,6 @@ class KernelCache(NullCache):  # type: ignore[misc]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the code for a signature, or None."""
-        target_context.refresh()
         name = self._file_name(signature, target_context.codegen())
         if not name:
             return None
@@ -183,7 +181,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
         name = self._file_name(signature, compiled.codegen)
         if not name or compiled.library.has_dynamic_globals:
             return
-        content = dumps(compiled._reduce())
+        content = pack(compiled)
         for folder in own_folders(self._source.parent):
             try:
                 write_whole(folder / name, content)
@@ -215,8 +213,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
         folder_of_source = self._source.parent
         for folder in (*shipped_folders(folder_of_source), *own_folders(folder_of_source)):
             try:
-                reduced = pickle.loads((folder / name).read_bytes())
-                return CompileResult._rebuild(target_context, *reduced)
+                return unpack((folder / name).read_bytes(), target_context)
             except Exception:  # absent, unreadable, damaged: whatever it is, the kernel is compiled
                 continue
         return None

@@ -46,6 +46,12 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but er
 Scene = Annotated[
     bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
 ]
+Images = Annotated[
+    Path | None,
+    typer.Option(
+        "--images", metavar="DIR", help="Folder of the images: small pictures of them are in the report."
+    ),
+]
 
 _SHORT = {"quiet": "-q", "verbose": "-v"}
 
@@ -72,6 +78,7 @@ class OutputFlags(Settings):
     overwrite: bool = option(False, "Replace an earlier output of this command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
     scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
+    images: str = option("", "Folder of the images: report.html has small pictures of them, 4 MB at most.")
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")

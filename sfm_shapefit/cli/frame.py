@@ -68,7 +68,7 @@ class Run(Generic[Options]):
         """How the result is written; keywords of `write_result`."""
         flags = self.flags
         how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
-        return how | {"protect": self.protect}
+        return how | {"protect": self.protect, "images": flags.images}
 
     def show(self, title: str, facts: dict[str, Any], told: "Callable[[], Told]") -> None:
         """Print the facts as JSON, or what is told of them, or nothing, once the output is complete."""
@@ -142,8 +142,13 @@ def command_run(
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
         options = read_options(settings, given, config)
+        if flags.images:  # now, not when all is computed
+            from sfm_shapefit.report.thumbnails import refuse_no_folder
+
+            refuse_no_folder(Path(flags.images))
         fixed = getattr(options, "fix", "")
-        paths = [*inputs, config, Path(fixed) if fixed else None]
+        images = Path(flags.images) if flags.images else None
+        paths = [*inputs, config, Path(fixed) if fixed else None, images]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)
         if inputs[0] is not None:

@@ -71,6 +71,16 @@ _MOST_FRAMES = 2_000
 _FREE = RotationWeight()
 
 
+class Uncertainty(NamedTuple):
+    """How well an adjustment knows centers and scale, see `adjustment.shared_errors`."""
+
+    covariances: Mapping[int, FloatArray] = {}
+    """(3, 3) of the center of each image by its id, in squared units of the seed; an image of a rig has its
+    frame's. Empty where they are not known."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Adjusted:
     """A bundle adjustment's answer and how it went."""
@@ -85,9 +95,8 @@ class Adjusted:
     """Whether the last solve met its tolerance within its limit of 100 steps."""
     iterations: int
     """Steps of all solves together."""
-    covariances: Mapping[int, FloatArray]
-    """(3, 3) of the center of each image by its id, in squared units of the seed, see
-    `adjustment.shared_errors`; an image of a rig has its frame's. Empty with Ceres, and for large models."""
+    uncertainty: Uncertainty
+    """Nothing is known with Ceres, and of large models."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,8 +109,7 @@ class AdjustedPlacement:
     """How the given rotations were treated."""
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
-    covariances: Mapping[int, FloatArray]
-    """As of `Adjusted`."""
+    uncertainty: Uncertainty
 
     @property
     def statement(self) -> str:
@@ -166,7 +174,7 @@ def bundle_adjust(
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
-        covariances: Mapping[int, FloatArray] = {}
+        uncertainty = Uncertainty()
     else:
         given = given or GivenPoses()
         run = _Run(seed, tracks, structure_options, fixed_frames, given.centers)
@@ -174,7 +182,7 @@ def bundle_adjust(
         if given.model is not None:
             run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
-        iterations, converged, covariances = run.iterations, run.converged, run.covariances(last)
+        iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
@@ -182,7 +190,7 @@ def bundle_adjust(
         final_error_px=answer.compute_mean_reprojection_error(),
         converged=converged,
         iterations=iterations,
-        covariances=covariances,
+        uncertainty=uncertainty,
     )
 
 
@@ -217,7 +225,7 @@ def adjust_thinly(
         adjusted = run.adjust_thinly(joined, found)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=_FREE, errors=None, covariances=run.covariances(adjusted)
+        reconstruction=poses, weight=_FREE, errors=None, uncertainty=run.uncertainty(adjusted)
     )
 
 
@@ -255,7 +263,7 @@ def adjust_placement(
     adjusted = run.return_frames(problem, run.solve(problem, run.choose_scale(problem), _GIVEN_FALL))
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=weight, errors=errors, covariances=run.covariances(adjusted)
+        reconstruction=poses, weight=weight, errors=errors, uncertainty=run.uncertainty(adjusted)
     )
 
 
@@ -325,19 +333,20 @@ class _Run:
         self.frames = replace(self.frames, rotations=rotations, centers=centers)
         return replace(after, rotations=rotations, centers=centers)
 
-    def covariances(self, problem: AdjustmentProblem) -> dict[int, FloatArray]:
-        """Return the covariance of the center of each image by its id, at the optimum last solved for."""
+    def uncertainty(self, problem: AdjustmentProblem) -> Uncertainty:
+        """Return how well centers and scale are known at the optimum last solved for."""
         if problem.num_frames > _MOST_FRAMES:
-            return {}
+            return Uncertainty()
         options = AdjustmentOptions(
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
         try:
             found = estimate_center_errors(problem, options, self.weight.open_rad)
         except UnsolvableError:
-            return {}
+            return Uncertainty()
         of_camera = found.covariances[self.frames.frame_of_camera]
-        return {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
+        by_image = {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
+        return Uncertainty(by_image, found.scale_sigma)
 
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the last loss that the errors of a problem call for, in pixel thresholds."""

@@ -3,7 +3,7 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
 from pathlib import Path
@@ -14,13 +14,14 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
     pull_cameras,
     turned_deg,
     weight_of_rotations,
-    with_covariances,
+    with_uncertainty,
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
@@ -39,7 +40,7 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.placement.gauge import PositionPriors
+from sfm_shapefit.placement.gauge import PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.results.result import Inputs, LocateResult
@@ -118,8 +119,8 @@ class Locating(NamedTuple):
     centers: FloatArray | None = None
     """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for those it lacks.
     None if there was no adjustment."""
-    covariances: Mapping[int, FloatArray] | None = None
-    """(3, 3) of these centers by image id, in their squared units."""
+    uncertainty: Uncertainty = Uncertainty()
+    """Of these centers, in their units."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -140,7 +141,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             placement = move_cameras(placement, placed, options)
             there = np.isfinite(centers).all(axis=1)
             scale = median_spread(centers[there]) / median_spread(placed[there])
-            placement = with_covariances(placement, model, known.covariances or {}, scale)
+            placement = with_uncertainty(placement, model, known.uncertainty, scale)
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))
         pulls = known.priors is not None and options.refine_with_priors
         if known.priors is not None and pulls:
@@ -165,8 +166,9 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        placement = with_covariances(placement, model, seeded.adjusted.covariances, scale)
-    located = located._replace(placement=placement, gauge=seeded.gauge)
+        placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
+    gauge = tell_scale(seeded.gauge, placement.scale_sigma)
+    located = located._replace(placement=placement, gauge=gauge)
     warnings = (
         *focal_warnings(model, focal_doubts),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
@@ -181,7 +183,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
         agreeing_observations=seeded.agreeing_observations,
-        gauge=seeded.gauge,
+        gauge=gauge,
         adjusted=seeded.adjusted,
         adjustment=adjustment,
         turned_deg=None if adjustment is None else turned_deg(model.rotations, source.model.rotations),

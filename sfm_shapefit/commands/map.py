@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.locate import Locating, locate_source
@@ -21,7 +22,7 @@ from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
-from sfm_shapefit.commands.stages.gauge_choice import read_priors
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
@@ -30,6 +31,7 @@ from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
@@ -83,21 +85,32 @@ def map_database(
         scores = score_triplets(unposed.num_images, relative).tolist()
     triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
     run = _Run(options, clock, path, images, unposed, triplet_scores, positions)
-    models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
-    for members, averaging in run.average_components(relative, reasons):
+    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
+    of_frames = relative_rotations_of_frames(relative, frame_of_image, sensor_rotations)
+    num_frames = int(frame_of_image.max()) + 1
+    models, reasons = [], dict.fromkeys(range(num_frames), _UNMATCHED)
+    for frames, averaged in run.average_components(num_frames, of_frames, reasons):
+        members = np.flatnonzero(np.isin(frame_of_image, frames))
+        averaging = averaged.turned(
+            np.searchsorted(frames, frame_of_image[members]), sensor_rotations[members]
+        )
         try:
             found = run.locate_component(members, averaging)
         except UnsolvableError as error:
-            reasons |= dict.fromkeys(members.tolist(), f"its component cannot be placed: {error}")
+            reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
         models.append(MappedModel(located=found, averaging=averaging, names=names))
-        for k in members.tolist():
+        for k in frames.tolist():
             del reasons[k]
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
-    left_out = {unposed.names[k]: reason for k, reason in sorted(reasons.items())}
+    left_out = {
+        name: reasons[frame]
+        for name, frame in zip(unposed.names, frame_of_image.tolist(), strict=True)
+        if frame in reasons
+    }
     return MapResult(
         database=path,
         options=options,
@@ -137,14 +150,13 @@ class _Run(NamedTuple):
     priors: PositionPriors | None
 
     def average_components(
-        self, relative: RelativeRotations, reasons: dict[int, str]
+        self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
     ) -> Iterator[tuple[IntArray, AveragedRotations]]:
-        """Yield the images of each component that got rotations, ascending, and those rotations.
+        """Yield the frames of each component that got rotations, ascending, and those rotations.
 
-        Why an image belongs to none is written to `reasons`.
+        Why a frame belongs to none is written to `reasons`.
         """
-        num_images = self.unposed.num_images
-        waiting = _group_images(num_images, relative.pairs)
+        waiting = _group_frames(num_frames, relative.pairs)
         while waiting:
             members = waiting.pop(0)
             if len(members) < self.options.min_model_size:
@@ -170,7 +182,7 @@ class _Run(NamedTuple):
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
                 rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
-                among = _group_images(num_images, rest)
+                among = _group_frames(num_frames, rest)
                 waiting = [*waiting, *(group for group in among if len(group) > 1)]
             kept = answer.registered
             if kept.sum() >= self.options.min_model_size:
@@ -185,14 +197,17 @@ class _Run(NamedTuple):
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+        rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
-            source, centers, covariances = averaged, None, None
+            source, centers, uncertainty = averaged, None, Uncertainty()
             if self.options.adjust:
                 with self.clock("first placement"):
-                    rotations, centers, covariances = adjust_first_placement(averaged, options, self.clock)
+                    rotations, centers, uncertainty = adjust_first_placement(
+                        averaged, GaugeRule(model, rigid, options, priors), self.clock
+                    )
                 source = averaged.turned(self._pose(image_ids, rotations))
-            rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(inputs, rigid, priors, centers=centers, covariances=covariances)
+                rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+            locating = Locating(inputs, rigid, priors, centers=centers, uncertainty=uncertainty)
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
@@ -209,19 +224,25 @@ class _Run(NamedTuple):
             settings["scale"] = "auto"
         if not has_priors:
             settings["refine_with_priors"] = False
-        if known is None and not has_priors and settings["scale"] in ("auto", "input", "prior"):
+        has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
+        if (
+            known is None
+            and not has_priors
+            and not has_rigs
+            and settings["scale"] in ("auto", "input", "prior")
+        ):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)
 
     def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
         """Return images with these rotations and all centers 0."""
-        return read_model(pose_at_origin(self.images.reconstruction, image_ids, rotations))
+        return read_model(pose_at_origin(self.images, image_ids, rotations))
 
 
-def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:
-    """Return the connected components, ascending, the largest first; single images are components too."""
-    labels = connected_components(num_images, pairs)
+def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
+    """Return the connected components, ascending, the largest first; single frames are components too."""
+    labels = connected_components(num_frames, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
 
@@ -240,8 +261,12 @@ def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int,
 
 def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[str, str]) -> Iterator[str]:
     """Yield what the user should know, a sentence each."""
-    if images.has_rigs:
-        yield "the database's rigs are not used: every camera is placed on its own"
+    if images.rigs.uncalibrated:
+        yield (
+            f"{len(images.rigs.uncalibrated)} rigs of the database are not used, rig "
+            f"{images.rigs.uncalibrated[0]} for one, because a sensor has no pose in them or an image no "
+            "frame: their cameras are placed one by one"
+        )
     if images.num_guessed_cameras:
         yield (
             f"a guessed focal length stays as it is in {counted(images.num_guessed_cameras, 'camera')}; "

@@ -38,14 +38,16 @@ NEEDED = (
     "solve_dense",
     "start_by_lud",
     "measure_pairs",
-    "find_pieces",
+    "adjust_bundle",
     "judge_placement",
+    "find_pieces",
     "refine_in_angles",
     "locate_model",
 )
 """Examples of what `locate`, `map`, `place` and `inspect` do in most runs.
 
-Parts come first, so that no two processes compile the same kernels, then the whole.
+Parts come first, so that no two processes compile the same kernels, and of them those that take longest; then
+the whole.
 """
 FURTHER = (
     "place_graph",
@@ -53,8 +55,7 @@ FURTHER = (
     "solve_by_splitting",
     "locate_rigs",
     "solve_iteratively",
-    "adjust_bundles",
-    "adjust_few_tracks",
+    "adjust_sparsely",
     "place_long_graph",
     "locate_from_tracks",
     "place_flat_graph",
@@ -67,8 +68,8 @@ FURTHER = (
 )
 """Examples of the rest."""
 
-# The kernels of these rooms are compiled by further examples only.
-_ROOMS_OF_FURTHER = ("adjustment", "baselines", "rotations", "synthetic", "theory.py")
+# Kernels of these rooms are compiled by further examples only, all but one.
+_ROOMS_OF_FURTHER = ("baselines", "rotations", "synthetic", "theory.py")
 # Each process takes 300 MB.
 _MOST_PROCESSES = 8
 _KERNEL = re.compile(r"^@kernel\s+def (\w+)", re.MULTILINE)

@@ -14,6 +14,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     MEDIAN_NORMAL_LENGTH,
+    METRIC_SIGMA,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
@@ -60,6 +61,8 @@ class Gauge:
     after `similarity`; None where the axes are the input's."""
     warning: str = ""
     """Why the scale may be rough, if it may."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, where that is measured and its error known."""
     datum: Datum | None = None
     """Where the output's origin is on Earth, if priors on Earth set it."""
 
@@ -101,7 +104,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
         locations: (n, 3) the solver's answer.
         input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
     """
-    if _coincide(input_centers):
+    if coincide(input_centers):
         return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
     size = median_spread(input_centers)
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
@@ -134,7 +137,7 @@ def metric_gauge(
     shifts = input_centers - scale * locations
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
-    elif not _coincide(input_centers):
+    elif not coincide(input_centers):
         shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
@@ -227,7 +230,21 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     )
 
 
-def _coincide(centers: FloatArray) -> bool:
+def tell_scale(gauge: Gauge, sigma: float | None) -> Gauge:
+    """Return the gauge with the relative standard deviation of a scale that was measured, and says it."""
+    if sigma is None or gauge.scale not in ("rig", "prior"):
+        return gauge
+    statement = f"{gauge.statement}; the scale is known to {100.0 * sigma:.2g} %"
+    warning = gauge.warning
+    if sigma > METRIC_SIGMA:
+        warning = (
+            f"the scale is known to {100.0 * sigma:.2g} % only, so it is not metric: the offsets that tell "
+            "it are too short for this scene"
+        )
+    return replace(gauge, statement=statement, warning=warning, scale_sigma=sigma)
+
+
+def coincide(centers: FloatArray) -> bool:
     """Return whether centers (n, 3) are one point to rounding."""
     return bool(np.ptp(centers, axis=0).max() <= _COINCIDENT * max(1.0, float(np.abs(centers).max())))
 

@@ -226,6 +226,9 @@ class LocateSummary(PlacementSummary):
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+    scale_sigma: Annotated[
+        float | None, "Relative standard deviation of a scale that rigs or priors tell; else null."
+    ]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]

@@ -68,6 +68,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
+        "scale_sigma": found.gauge.scale_sigma,
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "adjustment": _summarize_adjustment(found),

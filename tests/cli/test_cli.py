@@ -40,13 +40,14 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
-    for words in ("8 of 8 images", "typical pair error", "typical deviation", "locate.json"):
+    for words in ("8 of 8 images", "typical error of a pair", "typical uncertainty", "locate.json"):
         assert words in result.stdout
     assert "certified" not in result.stdout  # but with --verbose
     *_, verdict, report, command = result.stdout.splitlines()
     assert verdict == "verdict: good"
     assert report == f"next:    open {out / 'report.html'}"
-    assert command == f"         colmap bundle_adjuster --input_path {out} --output_path ADJUSTED"
+    adjust = f"colmap bundle_adjuster --input_path {out} --output_path {out}/adjusted"
+    assert command == f"         mkdir -p {out}/adjusted && {adjust}"
     assert result.stderr == ""
 
 

@@ -5,7 +5,6 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,7 +13,12 @@ import numpy as np
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import KnownCenters
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, GivenPoses, adjust_placement
+from sfm_shapefit.colmap.bundle_adjustment import (
+    AdjustedPlacement,
+    GivenPoses,
+    Uncertainty,
+    adjust_placement,
+)
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -95,22 +99,23 @@ def adjust_placed(
         directions = _measure_again(source, directions, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         placement = replace(placement, measured=_turn(placement.measured, directions, turns))
-    moved = with_covariances(
-        move_cameras(placement, locations, options), model, adjusted.covariances, similarity.scale
+    moved = with_uncertainty(
+        move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
     )
     return AfterAdjustment(source, directions, moved, adjusted)
 
 
-def with_covariances(
-    placement: Placement, model: PosedModel, covariances: Mapping[int, FloatArray], scale: float
+def with_uncertainty(
+    placement: Placement, model: PosedModel, uncertainty: Uncertainty, scale: float
 ) -> Placement:
-    """Return the placement with covariances of an adjustment, by image id, `scale` to the solver's unit."""
+    """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
+    covariances = uncertainty.covariances
     if not covariances:
         return placement
     unknown = np.full((3, 3), np.nan)
     ids = model.image_ids[placement.cameras].tolist()
     own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
-    return replace(placement, adjusted_covariances=own)
+    return replace(placement, adjusted_covariances=own, scale_sigma=uncertainty.scale_sigma)
 
 
 def _measure_again(
