@@ -19,7 +19,7 @@ from sfm_shapefit.adjustment import AdjustmentProblem, CenterPrior, Lens, Rig
 from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.model import observed_points, points2d_xy
+from sfm_shapefit.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.colmap.structure import TrackSource
 from sfm_shapefit.geometry import normalized
 
@@ -388,7 +388,7 @@ def _look_up(
         if camera.model_name in _ADJUSTED_MODELS:
             pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
             continue
-        rays = np.asarray(camera.cam_ray_from_img(xy)).reshape(-1, 3)
+        rays = camera_rays(camera, xy)
         view = np.argmax(rays @ _CUBE[:, 2].T, axis=1)  # 0 for rays of NaN
         local = np.einsum("mab,mb->ma", _CUBE[view], rays)
         on_plane[own] = local[:, :2] / local[:, 2:]

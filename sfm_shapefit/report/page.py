@@ -254,10 +254,8 @@ def _convergence(drawing: Drawing) -> dict[str, Any]:
 
 
 def _subtitle(facts: dict[str, Any]) -> str:
-    inputs = facts["inputs"]
-    directions = inputs.get("directions")
-    origin = f"directions from {directions}" if directions else f"{facts.get('dimension', 3)} dimensions"
-    return shorten(f"{input_of(facts)}; {origin}", 400)
+    dimensions = "" if "model" in facts["inputs"] else f", in {facts.get('dimension', 3)} dimensions"
+    return shorten(input_of(facts) + dimensions, 400)
 
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:

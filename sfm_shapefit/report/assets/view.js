@@ -20,7 +20,9 @@ const makeScene = (onChoice) => {
   const hasPose = (k) => Number.isFinite(cameras.frusta[9 * k]);
   const hasPosition = (k) => Number.isFinite(positionOf(k)[0]);
   const hasFrusta = placed.some(hasPose);
-  const sizes = { frustum: data.frustum, point: 1, ellipsoid: 1 };
+  // Few points are drawn larger.
+  const density = Math.min(Math.max(Math.sqrt(6000 / (points.positions.length / 3 || 1)), 1), 1.7);
+  const sizes = { frustum: data.frustum, point: density, ellipsoid: 1 };
   let mode = modes[0];
   let selected = null;
   let pictures = null;
@@ -217,7 +219,7 @@ const makeScene = (onChoice) => {
     const ratio = pixelRatio();
     if (one.cloud) {
       const size = 0.003 * radius * sizes.point * eye.pixelsPerUnit() * view.distance * ratio;
-      painter.paint(one.cloud, { ...common, size, least: 1.8 * ratio * Math.min(sizes.point, 1.5), most: 6 * ratio * sizes.point });
+      painter.paint(one.cloud, { ...common, size, least: 1.8 * ratio * Math.min(sizes.point, 2), most: 6 * ratio * sizes.point });
     }
     if (one.lines && !(isMoving && isSlow)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
     if (one.ghosts) painter.paint(one.ghosts, { ...common, scale: sizes.frustum, width: 1.2 * ratio, tint: [...tint, 0.55] });
