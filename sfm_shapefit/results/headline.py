@@ -2,7 +2,7 @@
 
     placed                   25 of 25 images
     typical error of a pair  0.04 deg (0.5 px)
-    typical uncertainty      ± 0.0002 of the input's units, 0.006% of the scene (standard deviation)
+    typical uncertainty      0.0002 of the input's units, 0.006% of the scene (standard deviation)
 
 The tiles of the report say the same.
 """
@@ -63,7 +63,7 @@ class Headline:
         sigma = "not known; see warnings, or --verbose"
         if math.isfinite(self.sigma):
             share = f"{self.sigma_of_extent:.2g}% of the scene"
-            sigma = f"\N{PLUS-MINUS SIGN} {self.sigma:.2g} {self.unit}, {share}"
+            sigma = f"{self.sigma:.2g} {self.unit}, {share}"
             sigma += f" (standard deviation{f', {_NOISE_ONLY}' if self.knows_only_noise else ''})"
         return [
             ("placed", f"{self.num_placed:,} of {counted(self.num_images, self.noun)}"),

@@ -59,7 +59,7 @@ def test_the_terminal_and_the_report_give_the_same_figures(ring_run):
     error_px, error_deg = re.match(r"(\S+) px, (\S+)°", shown["typical error of a pair"]).groups()
     (uncertainty,) = (value for label, value in shown.items() if label.startswith("typical uncertainty"))
     assert re.search(rf"typical error of a pair +│ {error_deg} deg \({error_px} px\)", result.stdout)
-    assert f"│ {uncertainty.removesuffix(' units')} " in result.stdout
+    assert f"│ {uncertainty.removeprefix('± ').removesuffix(' units')} " in result.stdout
     assert "8 of 8" in shown.values()
 
 
