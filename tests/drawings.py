@@ -99,6 +99,7 @@ def _facts(names):
         },
         "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
         "residual_level_deg": 0.07,
+        "residuals_deg": {"quantile_50": 0.08},
         "sigma_of": "adjusted: noise, rotations, calibration; relative to the model's mean position",
         "mean_reprojection_error_px": 0.62,
         "scale": "input: scale and origin of the input's centers",

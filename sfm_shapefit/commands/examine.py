@@ -182,4 +182,6 @@ def _facts(
         "scale": "input: those of the model",
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
     }
+    if usable:
+        facts["residuals_deg"] = {"quantile_50": float(np.median([pair.residual_deg for pair in usable]))}
     return facts | {"options": {}, "pieces": [], "warnings": [], "loose_groups": []}

@@ -18,7 +18,6 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.results.tables import CameraRow, PairRow
-from sfm_shapefit.results.warnings import extent_of
 
 if TYPE_CHECKING:
     import pycolmap
@@ -85,9 +84,9 @@ class Cameras:
 
     @property
     def sigmas(self) -> FloatArray:
-        """(n,) norm of the standard deviations along the axes; NaN where they are not known."""
-        total = np.sqrt(np.where(np.isnan(self.axis_sigmas), 0.0, self.axis_sigmas**2).sum(axis=1))
-        return np.where(np.isfinite(total) & np.isfinite(self.axis_sigmas).any(axis=1), total, np.nan)
+        """(n,) largest standard deviation over the axes; NaN where it is not known."""
+        largest = np.where(np.isnan(self.axis_sigmas), -np.inf, self.axis_sigmas).max(axis=1)
+        return np.where(np.isfinite(largest), largest, np.nan)
 
 
 class CameraColumn(NamedTuple):
@@ -190,9 +189,9 @@ class Drawing:
 
     @property
     def extent(self) -> float:
-        """Diagonal of the box around the placed cameras but those far outside, in the output's units."""
+        """Diagonal of the box around the placed cameras, in the output's units."""
         placed = self.cameras.centers[self.cameras.placed]
-        return extent_of(placed) if len(placed) else 0.0
+        return float(np.linalg.norm(np.ptp(placed, axis=0))) if len(placed) else 0.0
 
 
 def build_drawing(

@@ -44,7 +44,7 @@ def banner(drawing: Drawing, facts: dict[str, Any]) -> dict[str, str]:
     """
     verdict = facts.get("verdict", {})
     grade = str(verdict.get("grade", ""))
-    text, command = _next_step(grade, facts)
+    text, command = next_step(grade, facts)
     return {
         "grade": grade,
         "headline": _headline(grade, drawing, verdict),
@@ -58,13 +58,37 @@ def tiles(drawing: Drawing, facts: dict[str, Any]) -> list[dict[str, str]]:
     """Return the key figures: value, label, what it means, and whether it is good."""
     return [
         _placed_tile(drawing),
-        *_error_tile(drawing),
+        *_error_tile(drawing, facts),
         *_uncertainty_tile(drawing, facts),
         _doubtful_tile(drawing, facts),
         *_points_tile(drawing, facts),
         *_shift_tile(drawing),
         *_track_tile(facts),
     ]
+
+
+def next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
+    """Return what to do, and the command that does it; in it {out} stands as `banner` says."""
+    if "graph" in facts["inputs"]:
+        return (
+            "Next: the positions are in cameras.csv; look at them from all sides.",
+            "sfm-shapefit view {out}",
+        )
+    if facts.get("examined"):
+        return _next_of_model(grade, shlex.quote(input_of(facts)))
+    if grade == "do not use":
+        path = shlex.quote(input_of(facts))
+        return "Next: find out what is wrong with the input.", f"sfm-shapefit inspect {path}"
+    if facts.get("bundle_adjustment"):
+        return (
+            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
+            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out/dense}",
+        )
+    first = "Next: bundle adjustment" + (", once you have looked." if grade == "look" else ".")
+    return (
+        first,
+        "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
+    )
 
 
 # --- the banner ------------------------------------------------------------------------------------
@@ -103,30 +127,6 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     return f"{named} may be wrong or {verb} left out; {others}."
 
 
-def _next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
-    """Return what to do, and the command that does it."""
-    if "graph" in facts["inputs"]:
-        return (
-            "Next: the positions are in cameras.csv; look at them from all sides.",
-            "sfm-shapefit view {out}",
-        )
-    if facts.get("examined"):
-        return _next_of_model(grade, shlex.quote(input_of(facts)))
-    if grade == "do not use":
-        path = shlex.quote(input_of(facts))
-        return "Next: find out what is wrong with the input.", f"sfm-shapefit inspect {path}"
-    if facts.get("bundle_adjustment"):
-        return (
-            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
-            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out/dense}",
-        )
-    first = "Next: bundle adjustment" + (", once you have looked." if grade == "look" else ".")
-    return (
-        first,
-        "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
-    )
-
-
 def _next_of_model(grade: str, path: str) -> tuple[str, str]:
     """Return what to do with a model that was only looked at."""
     if grade == "good":
@@ -154,16 +154,19 @@ def _placed_tile(drawing: Drawing) -> dict[str, str]:
     return _tile(f"{placed:,} of {total:,}", f"{drawing.noun}s placed", hint, mood)
 
 
-def _error_tile(drawing: Drawing) -> Iterator[dict[str, str]]:
-    errors = drawing.pairs.residuals_deg[drawing.pairs.classes == PairClass.AGREES]
-    if not len(errors):
+def _error_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:
+    error = facts.get("residuals_deg", {}).get("quantile_50")
+    if error is None:
         return
-    error, focal = float(np.median(errors)), drawing.cameras.poses.focal_lengths_px
+    focal = drawing.cameras.poses.focal_lengths_px
     value = f"{error:.2g}°"
     if np.isfinite(focal).any():
-        value = f"{np.radians(error) * np.nanmedian(focal):.2g} px, {value}"
-    hint = "Median angle between what the matches of an agreeing pair say and where its cameras stand"
-    yield _tile(value, "typical error of a pair", f"{hint}; in pixels at the median focal length.")
+        pixels = np.nanmedian(focal) * np.tan(np.radians(min(error, 89.0)))
+        value = f"{pixels:.2g} px, {error:.2g}°"
+    hint = (
+        "Median angle between what the matches of a pair say and where its cameras stand; in pixels at the "
+    )
+    yield _tile(value, "typical error of a pair", f"{hint}middle of a picture.")
 
 
 def _uncertainty_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:

@@ -170,8 +170,7 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     drawing, facts = make_drawing()
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
     assert shown["cameras placed"] == "24 of 25"
-    error = np.median(drawing.pairs.residuals_deg[drawing.pairs.classes == PairClass.AGREES])
-    assert shown["typical error of a pair"] == f"{1000 * np.radians(error):.2g} px, {error:.2g}°"
+    assert shown["typical error of a pair"] == "1.4 px, 0.08°"  # 1000 px * tan(0.08 deg)
     assert shown["camera to check"] == "1"
     sigma = next(value for label, value in shown.items() if label.startswith("typical uncertainty"))
     assert sigma == f"± {np.median(drawing.cameras.sigmas[:24]):.2g} units"
@@ -241,7 +240,7 @@ def test_the_title_is_the_name_of_the_scene(inputs, title):
 def test_nothing_known_nothing_claimed():
     drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
     facts |= {"warnings": [], "loose_groups": []}
-    for key in ("verdict", "delivered", "sigma_of", "scale", "mean_reprojection_error_px"):
+    for key in ("verdict", "delivered", "residuals_deg", "sigma_of", "scale", "mean_reprojection_error_px"):
         del facts[key]
     data = page_data(drawing, facts)
     assert data["banner"]["grade"] == ""

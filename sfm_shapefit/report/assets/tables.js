@@ -128,7 +128,7 @@ const drawTables = (onChoice) => {
     camera: makeTable("cameras", "camera", numCameras, [
       named("Camera", (k) => cameras.names[k], why),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
-      ...(isKnown(cameras.sigma) ? [numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation over all axes together, in units")] : []),
+      ...(isKnown(cameras.sigma) ? [numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
       numeric("Error °", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
       {
         title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
