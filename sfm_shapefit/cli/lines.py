@@ -20,6 +20,14 @@ def further_piece_rows(facts: dict[str, Any]) -> Rows:
     return [("further pieces", shorten(lines))] if lines else []
 
 
+def intrinsics_rows(facts: dict[str, Any], indent: str = "") -> Rows:
+    """Return a row on cameras whose intrinsics were in doubt, if there are any."""
+    from sfm_shapefit.results.intrinsics import describe_intrinsics
+
+    lines = describe_intrinsics(facts["intrinsics"])
+    return [(f"{indent}intrinsics", shorten(lines, "see locate.json"))] if lines else []
+
+
 def describe_time(timings_s: dict[str, float], detailed: bool) -> str:
     """Say how long the command took, and, in detail, each stage."""
     total = f"{sum(timings_s.values()):.1f} s"

@@ -23,6 +23,7 @@ from sfm_shapefit.cli.lines import (
     describe_adjustment,
     describe_time,
     further_piece_rows,
+    intrinsics_rows,
     name_pictures,
 )
 from sfm_shapefit.locate_options import LocateOptions
@@ -102,6 +103,7 @@ def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
         ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
         ("centers", found.placement.refined.statement()),
         *([("adjustment", found.adjustment.statement)] if found.adjustment else []),
+        *intrinsics_rows(facts),
         ("scale", found.gauge.statement),
         ("points", points),
         *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),

@@ -9,7 +9,7 @@ from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, OutputPath, one_path, takes
 from sfm_shapefit.cli.frame import command_run
-from sfm_shapefit.cli.lines import describe_adjustment, describe_time
+from sfm_shapefit.cli.lines import describe_adjustment, describe_time, intrinsics_rows
 from sfm_shapefit.locate_options import MapOptions
 
 if TYPE_CHECKING:
@@ -57,6 +57,7 @@ def _map_table(found: "MapResult", out: Path, flags: OutputFlags) -> Rows:
             ("  placed", f"{int(located.kept.sum())} of {len(model.names)} images placed"),
             ("  rotations", model.averaging.statement),
             ("  points", str(located.reconstruction.num_points3D())),
+            *intrinsics_rows(located.summary(), "  "),
             ("  scale", located.gauge.statement),
             *([("  bundle adjustment", describe_adjustment(located.adjusted))] if located.adjusted else []),
             *[("  warning", warning) for warning in located.warnings],

@@ -20,7 +20,7 @@ One thread does all, as the answer must not depend on their number.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -34,6 +34,7 @@ from sfm_shapefit.adjustment import (
     choose_loss_scale_px,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
@@ -46,6 +47,7 @@ from sfm_shapefit.colmap.adjustment import (
     read_frames,
     rotations_of_frames,
     with_poses,
+    with_rays_of,
 )
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
@@ -69,6 +71,19 @@ _MOST_FRAMES = 2_000
 _FREE = RotationWeight()
 
 
+class RefinedLenses(NamedTuple):
+    """What an adjustment makes of the lenses that it may change, by the ids of their cameras."""
+
+    sigmas: Mapping[int, float]
+    """Standard deviation of the focal length, as a share of it; NaN where it is not known, as with Ceres."""
+    undetermined: tuple[int, ...]
+    """Those whose focal length the points leave open: they have what was given."""
+
+
+UNREFINED = RefinedLenses({}, ())
+"""Where no lens was free."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Adjusted:
     """A bundle adjustment's answer and how it went."""
@@ -86,6 +101,8 @@ class Adjusted:
     covariances: Mapping[int, FloatArray]
     """(3, 3) of the center of each image by its id, in squared units of the seed, see
     `adjustment.shared_errors`; an image of a rig has its frame's. Empty with Ceres, and for large models."""
+    lenses: RefinedLenses = UNREFINED
+    """What became of lenses that were free."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -100,6 +117,8 @@ class AdjustedPlacement:
     """What the matches said of them, if they were asked."""
     covariances: Mapping[int, FloatArray]
     """As of `Adjusted`."""
+    lenses: RefinedLenses = UNREFINED
+    """What became of lenses that were free."""
 
     @property
     def statement(self) -> str:
@@ -127,6 +146,18 @@ class GivenRotations(NamedTuple):
     model: pycolmap.Reconstruction
 
 
+class Given(NamedTuple):
+    """What was given beside a seed, and how an adjustment treats it."""
+
+    rotations: GivenRotations | None = None
+    """None: all rotations are free."""
+    lenses: FreeLenses | None = None
+    """None: intrinsics stay what they are, to the bit."""
+
+
+NOTHING_GIVEN = Given()
+
+
 def bundle_adjust(
     seed: pycolmap.Reconstruction,
     tracks: TrackSource,
@@ -134,7 +165,7 @@ def bundle_adjust(
     *,
     adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
-    given: GivenRotations | None = None,
+    given: Given = NOTHING_GIVEN,
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -144,13 +175,13 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: rotations that were given, and how they are treated; all are free if None, and with Ceres.
+        given: rotations that were given, all of which are free with Ceres, and lenses that may change.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
         frames and rigs do not hold stays near the seed's: by our own, the centers' best similarity to the
         seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs stay what they
-        are, and intrinsics to the bit.
+        are, and intrinsics that are not free to the bit.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or Ceres diverges.
@@ -159,14 +190,20 @@ def bundle_adjust(
     if adjuster == "ceres":
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
-        unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
+        unfiltered, iterations, converged = adjust_by_ceres(
+            start, tracks, structure_options, fixed_frames, given.lenses
+        )
         covariances: Mapping[int, FloatArray] = {}
+        doubts = {} if given.lenses is None else given.lenses.doubts
+        refined = RefinedLenses(dict.fromkeys(doubts, math.nan), ())
     else:
-        run = _Run(seed, tracks, structure_options, fixed_frames)
-        if given is not None:
-            run.weight, run.given = given.weight, rotations_of_frames(given.model, run.frames.frame_ids)
+        run = _Run(seed, tracks, structure_options, fixed_frames, given.lenses)
+        if given.rotations is not None:
+            run.weight = given.rotations.weight
+            run.given = rotations_of_frames(given.rotations.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
         iterations, converged, covariances = run.iterations, run.converged, run.covariances(last)
+        refined = run.refined
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
@@ -175,6 +212,7 @@ def bundle_adjust(
         converged=converged,
         iterations=iterations,
         covariances=covariances,
+        lenses=refined,
     )
 
 
@@ -184,17 +222,20 @@ def adjust_thinly(
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
+    lenses: FreeLenses | None = None,
 ) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
 
-    Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as long
-    rings are. A ring of 300 images ends 0.0097 off after the first solve, 0.0020 after the second.
+    Twice: the wide limit that coarse poses need lets wrong matches in, which bend what is held loosely, as
+    long rings are. A ring of 300 images ends 0.0097 off after the first solve, 0.0020 after the second.
 
     Args:
         seed: the placed images, which is not changed; any points are ignored.
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None. Observations may miss by four times their limit.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        lenses: those that change with the poses; none if None. One whose focal length the points leave open
+            gets what was given back, and the poses are adjusted again.
 
     Returns:
         The adjusted poses, all rotations free; their gauge is as from `bundle_adjust`.
@@ -202,14 +243,15 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames)
-    adjusted = run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
-    joined, found = run.triangulate(1.0)
-    if len(found.points):
-        adjusted = run.adjust_thinly(joined, found)
+    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, lenses)
+    adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=_FREE, errors=None, covariances=run.covariances(adjusted)
+        reconstruction=poses,
+        weight=_FREE,
+        errors=None,
+        covariances=run.covariances(adjusted),
+        lenses=run.refined,
     )
 
 
@@ -220,6 +262,7 @@ def adjust_placement(
     weight: RotationWeight | None,
     *,
     fixed_frames: Collection[int] = (),
+    lenses: FreeLenses | None = None,
 ) -> AdjustedPlacement:
     """Adjust placed cameras whose rotations were given, on all tracks at once.
 
@@ -229,23 +272,32 @@ def adjust_placement(
         structure_options: filters.
         weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        lenses: as in `adjust_thinly`.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options, fixed_frames)
+    run, errors = _Run(seed, tracks, structure_options, fixed_frames, lenses), None
+    if run.lenses.doubts:  # points are found, and rotations judged, with the lenses that come out
+        run.repeat_with_known_lenses(run.adjust_twice_thinly)
+        run.frames = replace(run.frames, rotations=run.start.rotations)
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
-    problem, errors = run.frames.problem(joined, found), None
+    problem = run.frames.problem(joined, found)
     if weight is None:
         loss_scale_px = _GIVEN_SCALE * structure_options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
     adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    run.judge_lenses(adjusted)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=weight, errors=errors, covariances=run.covariances(adjusted)
+        reconstruction=poses,
+        weight=weight,
+        errors=errors,
+        covariances=run.covariances(adjusted),
+        lenses=run.refined,
     )
 
 
@@ -258,7 +310,10 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
+        lenses: FreeLenses | None = None,
     ) -> None:
+        self.lenses = lenses or ALL_HELD
+        self.refined = UNREFINED
         self.start = self.frames = read_frames(seed, fixed_frames)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
@@ -289,19 +344,69 @@ class _Run:
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
         return self.solve(self.frames.problem(thin.subset(chosen), points), _THIN_SCALE, _THIN_FALL)
 
+    def adjust_twice_thinly(self) -> AdjustmentProblem:
+        """Move coarse frames: at the wide limit, then at the threshold; return the last problem."""
+        adjusted = self.adjust_thinly(*self.triangulate(_THIN_LIMIT))
+        joined, found = self.triangulate(1.0)
+        return self.adjust_thinly(joined, found) if len(found.points) else adjusted
+
+    def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
+        """Solve, and as long as a focal length is left open, hold what was given of it and solve again."""
+        while True:
+            adjusted = solve()
+            unknown = self.judge_lenses(adjusted)
+            if not unknown:
+                return adjusted
+            self.hold_lenses(unknown)
+
+    def judge_lenses(self, adjusted: AdjustmentProblem) -> list[int]:
+        """Note how well free focal lengths are known; return the cameras whose points leave them open."""
+        if not self.lenses.doubts:
+            return []
+        options = AdjustmentOptions(
+            loss_scale_px=self.loss_scale_px,
+            hold_rotations=self.weight.hold,
+            noise_px=self.weight.noise_px,
+            **self.lenses.overrides(),
+        )
+        ids = self.frames.colmap_camera_of_lens
+        try:
+            found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
+        except UnsolvableError:
+            found = dict.fromkeys(ids, math.inf)
+        sigmas = {camera: found[camera] for camera in ids if camera in self.lenses.doubts}
+        self.refined = self.refined._replace(sigmas=sigmas)
+        lenses = dict(zip(ids, self.frames.lenses, strict=True))
+        doubts = self.lenses.doubts
+        return [i for i in sigmas if not doubts[i].accepts(lenses[i], sigmas[i])]
+
+    def hold_lenses(self, camera_ids: Sequence[int]) -> None:
+        """Give lenses back what was given of them, and hold it from now on."""
+        given = {camera: self.lenses.doubts[camera].given for camera in camera_ids}
+        ids = self.frames.colmap_camera_of_lens
+        lenses = tuple(given.get(i, lens) for i, lens in zip(ids, self.frames.lenses, strict=True))
+        self.frames = replace(self.frames, lenses=lenses)
+        self.source = with_rays_of(self.frames, self.source)
+        self.lenses = self.lenses.without(camera_ids)
+        self.refined = self.refined._replace(undetermined=(*self.refined.undetermined, *camera_ids))
+
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = self.loss_scale_px = scale * self.options.max_reprojection_error_px
+        problem = self.lenses.apply(problem, self.frames.colmap_camera_of_lens)
         adjusted = adjust(
             self.weight.apply(problem, self.given),
             loss_scale_px=loss_scale_px,
             cost_tolerance=fall,
             hold_rotations=self.weight.hold,
             noise_px=self.weight.noise_px,
+            **self.lenses.overrides(),
         )
-        self.frames = replace(
-            self.frames, rotations=adjusted.problem.rotations, centers=adjusted.problem.centers
-        )
+        found = adjusted.problem
+        lenses = tuple(found.lenses)
+        self.frames = replace(self.frames, rotations=found.rotations, centers=found.centers, lenses=lenses)
+        if self.lenses.doubts:
+            self.source = with_rays_of(self.frames, self.source)
         self.iterations += adjusted.iterations
         self.converged = adjusted.converged
         return adjusted.problem
@@ -325,6 +430,12 @@ class _Run:
         threshold_px = self.options.max_reprojection_error_px
         return choose_loss_scale_px(problem, [scale * threshold_px for scale in _LAST_SCALES]) / threshold_px
 
+    def adjust_coarsely(self) -> AdjustmentProblem:
+        """Move the frames by all points, the first of two times; return the problem."""
+        joined, found = self.triangulate(1.0)
+        refuse_without_points(len(found.points))
+        return self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
+
     def adjust_all(
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
@@ -334,13 +445,12 @@ class _Run:
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self.adjust_thinly(loosely, loose)
-        joined, found = self.triangulate(1.0)
-        refuse_without_points(len(found.points))
-        adjusted = self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
+        adjusted = self.repeat_with_known_lenses(self.adjust_coarsely)
         last_scale = self.choose_scale(adjusted)
         joined, found = self.triangulate(1.0)
         refuse_without_points(len(found.points))
         adjusted = self.solve(self.frames.problem(joined, found), last_scale, _LAST_FALL)
+        self.judge_lenses(adjusted)
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks

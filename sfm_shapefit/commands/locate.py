@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import GivenRotations
+from sfm_shapefit.colmap.bundle_adjustment import Given, GivenRotations
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg, with_covariances
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
+from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import Rigid, find_rigid_parts, place_cameras
@@ -36,6 +37,7 @@ from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.placement.prior_refinement import pull_to_priors
+from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
@@ -96,10 +98,12 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     with open_source(model, inputs, options) as opened:
-        return locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
+        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics)
+        return locate_source(opened, known, options, clock)
 
 
 class Locating(NamedTuple):
@@ -114,6 +118,8 @@ class Locating(NamedTuple):
     None if there was no adjustment."""
     covariances: Mapping[int, FloatArray] | None = None
     """(3, 3) of these centers by image id, in their squared units."""
+    intrinsics: Intrinsics = NO_DOUBTS
+    """Which of them are in doubt, and what became of them so far."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -136,12 +142,15 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             scale = median_spread(centers[there]) / median_spread(placed[there])
             placement = with_covariances(placement, model, known.covariances or {}, scale)
         rule = GaugeRule(model, rigid, options, known.priors)
-    adjustment, given = None, None
+    adjustment, intrinsics = None, known.intrinsics
+    given = Given(lenses=intrinsics.free)
     if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            after = adjust_placed(source, directions, _choose(placement, rule), options, clock)
+            located = _choose(placement, rule)._replace(given=given)
+            after = adjust_placed(source, directions, located, options, clock)
             source, directions, placement, adjustment = after
-            given = GivenRotations(adjustment.weight, model.reconstruction)
+            intrinsics = intrinsics.after(adjustment.lenses)
+            given = Given(GivenRotations(adjustment.weight, model.reconstruction), intrinsics.free)
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
         focal_doubts = question_focal_lengths(source, directions, options)
@@ -158,9 +167,12 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_covariances(placement, model, seeded.adjusted.covariances, scale)
+        intrinsics = intrinsics.after(seeded.adjusted.lenses)
     located = located._replace(placement=placement, gauge=seeded.gauge)
+    focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     warnings = (
-        *focal_warnings(model, focal_doubts),
+        *focal_warnings(source.model, focal_doubts),
+        *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
     )
     return LocateResult(
@@ -182,6 +194,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         further=further,
         fixed=rigid.fixed,
         focal_doubts=focal_doubts,
+        intrinsics=intrinsics,
     )
 
 

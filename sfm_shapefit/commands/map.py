@@ -9,7 +9,7 @@ Images that the averaging drops form components of their own.
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,9 +23,11 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -33,6 +35,9 @@ from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
+
+if TYPE_CHECKING:
+    import pycolmap
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.
@@ -68,13 +73,13 @@ def map_database(
     path, clock = Path(database), Clock(progress) if progress else Clock()
     with clock("read"):
         images = read_images(path)
-        unposed = read_model(images.reconstruction)
+        unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
     with clock("relative rotations"):
         sharing = Sharing(options.num_threads(), advance=clock.advance)
         relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
         scores = score_triplets(unposed.num_images, relative).tolist()
     triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
-    run = _Run(options, clock, path, images, unposed, triplet_scores)
+    run = _Run(options, clock, path, intrinsics, unposed, triplet_scores)
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.average_components(relative, reasons):
         try:
@@ -108,7 +113,8 @@ class _Run(NamedTuple):
     options: MapOptions
     clock: Clock
     database: Path
-    images: UnposedImages
+    intrinsics: Intrinsics
+    """Which of them are in doubt."""
     unposed: PosedModel
     """The images as a model."""
     triplet_scores: dict[tuple[int, int], float]
@@ -167,26 +173,31 @@ class _Run(NamedTuple):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         options = LocateOptions(**settings)
-        model = self._pose(image_ids, averaging.rotations)
+        model = _pose(self.unposed.reconstruction, image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
         with open_source(model, inputs, options) as averaged:
-            source, centers, covariances = averaged, None, None
+            source, centers, covariances, intrinsics = averaged, None, None, self.intrinsics
             if self.options.adjust:
                 with self.clock("first placement"):
-                    rotations, centers, covariances = adjust_first_placement(averaged, options, self.clock)
-                source = averaged.turned(self._pose(image_ids, rotations))
+                    first = adjust_first_placement(averaged, options, self.clock, intrinsics.free)
+                centers, covariances = first.centers, first.adjusted.covariances
+                intrinsics = intrinsics.after(first.adjusted.lenses)
+                source = averaged.turned(_pose(first.adjusted.reconstruction, image_ids, first.rotations))
             priors = read_priors(source.model, inputs, options, None)
             rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(inputs, rigid, priors, centers=centers, covariances=covariances)
+            locating = Locating(
+                inputs, rigid, priors, centers=centers, covariances=covariances, intrinsics=intrinsics
+            )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
         scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
         return replace(found, triplet_scores=scores)
 
-    def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
-        """Return images with these rotations and all centers 0."""
-        return read_model(pose_at_origin(self.images.reconstruction, image_ids, rotations))
+
+def _pose(images: "pycolmap.Reconstruction", image_ids: list[int], rotations: FloatArray) -> PosedModel:
+    """Return some images of a model with these rotations and all centers 0."""
+    return read_model(pose_at_origin(images, image_ids, rotations))
 
 
 def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:
@@ -212,11 +223,6 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
     """Yield what the user should know, a sentence each."""
     if images.has_rigs:
         yield "the database's rigs are not used: every camera is placed on its own"
-    if images.num_guessed_cameras:
-        yield (
-            f"{images.num_guessed_cameras} cameras have a guessed focal length, which stays as it is; "
-            "calibrate them first (pycolmap.calibrate_view_graph) if the result is poor"
-        )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
         if share < _ALARMING_SHARE:

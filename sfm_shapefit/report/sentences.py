@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from sfm_shapefit.report.drawing import Drawing, PairClass
+from sfm_shapefit.results.intrinsics import describe_intrinsics
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -50,6 +51,7 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         _pairs(drawing, facts),
         *_certainty(drawing),
         f"Scale and origin: {shorten(facts.get('scale') or _SOLVER_SCALE, 2 * MAX_TEXT)}.",
+        *_intrinsics(facts),
         *_delivered(facts),
     ]
 
@@ -116,6 +118,14 @@ def _delivered(facts: dict[str, Any]) -> Iterator[str]:
     """Yield what is certified and what is delivered, which earlier outputs lack."""
     if "delivered" in facts:
         yield f"The certificate: {facts['delivered']['statement']}."
+
+
+def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what became of intrinsics in doubt, of the cameras with most images; earlier outputs lack it."""
+    lines = describe_intrinsics(facts.get("intrinsics", []))
+    more = f"; {len(lines) - _SHOWN:,} more cameras stand in locate.json" if len(lines) > _SHOWN else ""
+    if lines:
+        yield f"Intrinsics: {'; '.join(lines[:_SHOWN])}{more}."
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

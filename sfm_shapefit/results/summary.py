@@ -68,6 +68,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
         "rigid_groups": _summarize_groups(found),
+        "intrinsics": found.intrinsics.rows(model),
         "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),

@@ -142,7 +142,7 @@ def focal_warnings(model: PosedModel, doubts: tuple[FocalDoubt, ...]) -> Iterato
         yield (
             f"the matches of camera {doubt.camera} prefer a focal length of about "
             f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
-            "asked); its images stand wrong if that is so"
+            "asked); its images stand wrong if that is so: --refine-intrinsics focal lets it change"
         )
 
 

@@ -64,12 +64,15 @@ def adjust_placed(
     fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed, tracks = seed_and_tracks(source, everyone, clock.advance)
-    adjusted = adjust_placement(seed, tracks, options, weight_of_rotations(options), fixed_frames=fixed)
+    weight = weight_of_rotations(options)
+    adjusted = adjust_placement(
+        seed, tracks, options, weight, fixed_frames=fixed, lenses=located.given.lenses
+    )
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
     locations = (centers - similarity.translation) / similarity.scale
-    if not adjusted.weight.hold:
+    if not adjusted.weight.hold or adjusted.lenses.sigmas:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
         directions = _measure_again(source, directions, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations

@@ -5,12 +5,13 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
-from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
+from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -22,13 +23,28 @@ from sfm_shapefit.placement.gauge import unit_gauge
 from sfm_shapefit.placement.place import place
 
 
-def adjust_first_placement(
-    source: MatchSource, options: LocateOptions, clock: Clock
-) -> tuple[FloatArray, FloatArray, Mapping[int, FloatArray]]:
-    """Return rotations (n, 3, 3) cam_from_world, centers (n, 3) and their covariances by image id, adjusted.
+class FirstPlacement(NamedTuple):
+    """What comes out of the adjustment of a first placement."""
 
-    Images that the first placement lacks keep their averaged rotations, turned as the others were on average,
-    and have NaN for a center.
+    adjusted: AdjustedPlacement
+    """With the intrinsics that it ended with, and the covariances of the centers."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
+    as the others were on average."""
+    centers: FloatArray
+    """(n, 3); NaN for images that the first placement lacks."""
+
+
+def adjust_first_placement(
+    source: MatchSource, options: LocateOptions, clock: Clock, lenses: FreeLenses | None = None
+) -> FirstPlacement:
+    """Place the images of a source by their averaged rotations, and adjust all on few tracks.
+
+    Args:
+        source: at the averaged rotations.
+        options: of the directions, the placement and the points.
+        clock: hears of progress.
+        lenses: that change with the poses; none if None.
 
     Raises:
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
@@ -38,12 +54,13 @@ def adjust_first_placement(
     placement = place(build_graph(source, directions, options), options, on_iteration=clock.iteration)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     located = Located(placement, everyone, unit_gauge(placement.locations))
-    adjusted = adjust_thinly(*seed_and_tracks(source, located, clock.advance), options)
+    seed, tracks = seed_and_tracks(source, located, clock.advance)
+    adjusted = adjust_thinly(seed, tracks, options, lenses=lenses)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
         centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
-    return _turn_the_others(model.rotations, rotations, posed), centers, adjusted.covariances
+    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, posed), centers)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenRotations, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import NOTHING_GIVEN, Adjusted, Given, bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     deregister_of_few_points,
@@ -47,8 +47,8 @@ class Located(NamedTuple):
     """(n,) the images that keep their poses to the last bit; none if None."""
     rule: GaugeRule | None = None
     """What sets the gauge, and again after bundle adjustment; "unit" if None."""
-    given: GivenRotations | None = None
-    """The rotations of the input, and how bundle adjustment treats them; they are free if None."""
+    given: Given = NOTHING_GIVEN
+    """Rotations and lenses of the input, and how adjustments treat them."""
 
     @property
     def cameras(self) -> IntArray:
