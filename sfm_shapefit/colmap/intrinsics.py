@@ -13,7 +13,7 @@ nothing else of the user's. Pairs whose matches fit a homography say nothing, so
 
 import sqlite3
 import tempfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import closing
 from enum import Enum
 from pathlib import Path
@@ -45,6 +45,8 @@ _WITH_DEPTH = (2, 3)
 _FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3
 # Pairs of most matches that take part: 100 bytes each, and the time is in proportion to them.
 _MOST_PAIRS = 50_000
+# Of unit rays: what makes relative rotations worth measuring anew.
+_SAME_RAYS = 0.01
 
 
 class Uncalibrated(NamedTuple):
@@ -103,13 +105,37 @@ def doubt_lenses(
 
 def with_focal_lengths(model: PosedModel, factors: Mapping[int, float]) -> PosedModel:
     """Return a model whose focal lengths are some factor larger, by camera; the input is not touched."""
-    copy = pycolmap.Reconstruction(model.reconstruction)
+    found = {}
     for camera_id, factor in factors.items():
-        camera = copy.camera(camera_id)
+        camera = model.reconstruction.camera(camera_id)
         params = camera.params.copy()
         params[camera.focal_length_idxs()] *= factor
-        camera.params = params.tolist()
+        found[camera_id] = params.tolist()
+    return with_parameters(model, found)
+
+
+def with_parameters(model: PosedModel, found: Mapping[int, Sequence[float]]) -> PosedModel:
+    """Return a model with other parameters of some cameras, by their id; the input is not touched."""
+    if not found:
+        return model
+    copy = pycolmap.Reconstruction(model.reconstruction)
+    for camera_id, params in found.items():
+        copy.camera(camera_id).params = list(params)
     return read_model(copy)
+
+
+def differ_in_rays(one: PosedModel, other: PosedModel) -> bool:
+    """Return whether the rays of a camera's corner or edges differ by a hundredth between two models."""
+    for camera_id, camera in one.reconstruction.cameras.items():
+        against = other.reconstruction.camera(camera_id)
+        if camera.params.tolist() == against.params.tolist():
+            continue
+        w, h = camera.width, camera.height
+        xy = np.array([[w, h], [w, 0.5 * h], [0.5 * w, h]], dtype=np.float64)
+        rays, those = (np.asarray(through.cam_ray_from_img(xy)) for through in (camera, against))
+        if not np.abs(rays - those).max() <= _SAME_RAYS:  # NaN differs too
+            return True
+    return False
 
 
 def calibrate_view_graph(database: Path, cameras: Collection[int]) -> dict[int, float]:

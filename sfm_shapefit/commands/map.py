@@ -6,15 +6,18 @@
 Images that the averaging drops form components of their own.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
+from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
@@ -74,12 +77,15 @@ def map_database(
     with clock("read"):
         images = read_images(path)
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
-    with clock("relative rotations"):
-        sharing = Sharing(options.num_threads(), advance=clock.advance)
-        relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
-        scores = score_triplets(unposed.num_images, relative).tolist()
-    triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
-    run = _Run(options, clock, path, intrinsics, unposed, triplet_scores)
+    run = _Run(options, clock, path, intrinsics, unposed)
+    relative = run.measure()
+    if options.adjust and intrinsics.free.doubts:
+        known = run.refine_intrinsics(relative)
+        if differ_in_rays(known, unposed):
+            run = run._replace(unposed=known)
+            relative = run.measure()
+    scores = score_triplets(unposed.num_images, relative).tolist()
+    run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
     models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
     for members, averaging in run.average_components(relative, reasons):
         try:
@@ -117,8 +123,36 @@ class _Run(NamedTuple):
     """Which of them are in doubt."""
     unposed: PosedModel
     """The images as a model."""
-    triplet_scores: dict[tuple[int, int], float]
+    triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
     """Of the pairs with a relative rotation."""
+
+    def measure(self) -> RelativeRotations:
+        """Return the relative rotations of all pairs, by the intrinsics that the images have."""
+        with self.clock("relative rotations"):
+            sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
+            source = self.options.relative_rotations
+            return measure_rotations(self.database, self.unposed, LEAST_MATCHES, source, sharing)
+
+    def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
+        """Return the images with the intrinsics that first placements of all components find.
+
+        Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
+        ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
+        in several components the one with most images counts.
+        """
+        found: dict[int, tuple[float, ...]] = {}
+        for members, averaging in self.average_components(relative, {}):
+            image_ids = self.unposed.image_ids[members].tolist()
+            model = _pose(self.unposed.reconstruction, image_ids, averaging.rotations)
+            inputs = choose_inputs(model.reconstruction, self.database, self.options.directions)
+            with open_source(model, inputs, self.options) as source, suppress(UnsolvableError):
+                with self.clock("first placement"):
+                    adjusted = adjust_first_placement(
+                        source, self.options, self.clock, self.intrinsics.free
+                    ).adjusted
+                for camera in adjusted.lenses.sigmas:
+                    found.setdefault(camera, tuple(adjusted.reconstruction.camera(camera).params))
+        return with_parameters(self.unposed, found)
 
     def average_components(
         self, relative: RelativeRotations, reasons: dict[int, str]

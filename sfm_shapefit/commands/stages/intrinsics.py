@@ -48,7 +48,7 @@ def settle_intrinsics(
         free=FreeLenses(doubts, distortion=wanted != "focal"),
         view_graph=factors,
     )
-    return with_focal_lengths(model, factors) if factors else model, intrinsics
+    return with_focal_lengths(model, factors), intrinsics
 
 
 def _cameras_in_use(model: PosedModel) -> list[int]:
