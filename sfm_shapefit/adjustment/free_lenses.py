@@ -3,7 +3,7 @@
 The prior of a focal length is relative, exp(+-s) f to first order; those of the distortion are absolute, as
 the coefficients of a lens are of the same size whatever its focal length. A lens without a doubt stays what
 it is to the last bit. What the observations leave open after all is told by the standard deviation at the
-answer: a focal length known to worse than `LARGEST_SIGMA` is not known.
+answer: a focal length known to worse than `LARGEST_SIGMA`, or no better than what was given, stays as given.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,6 +20,11 @@ from sfm_shapefit.arrays import FloatArray
 LARGEST_SIGMA = 0.02
 """Of a focal length, as a share of it: beyond, the observations do not tell it."""
 
+# Errors that keypoints share make those of a focal length larger than the noise alone does: on kitti-turn,
+# driven straight ahead for the greatest part, seven times.
+_SHARED_NOISE = 7.0
+# So many standard deviations, of the noise and of what was given, are no chance.
+_CONTRADICTION = 10.0
 # By what factor a guess may be off, and the largest coefficient of a distortion.
 _MOST_OFF, _MOST_DISTORTION = 6.0, 2.0
 _FOCAL_LENGTHS, _DISTORTION = slice(0, 2), slice(4, NUM_VALUES)
@@ -42,13 +47,17 @@ class LensDoubt(NamedTuple):
         return information
 
     def accepts(self, found: Lens, sigma: float) -> bool:
-        """Return whether an adjusted lens is known, its focal length to `sigma` as a share of it.
+        """Return whether an adjusted lens is to be believed, its focal length known to `sigma` by the noise.
 
-        One that has run away, beyond what any lens given so is off by, is not known either.
+        It is to be known better than what was given, or to contradict that clearly. One that has run away,
+        beyond what any lens given so is off by, is not believed either.
         """
         ratio = found.values()[0] / self.given.values()[0]
         sound = bool(np.abs(found.values()[_DISTORTION]).max() <= _MOST_DISTORTION)
-        return sigma <= LARGEST_SIGMA and sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
+        sound = sound and 1.0 / _MOST_OFF <= ratio <= _MOST_OFF
+        better = _SHARED_NOISE * sigma <= self.focal_sigma
+        contradicts = abs(ratio - 1.0) >= _CONTRADICTION * max(sigma, self.focal_sigma)
+        return sound and sigma <= LARGEST_SIGMA and (better or contradicts)
 
 
 class FreeLenses(NamedTuple):

@@ -37,7 +37,7 @@ class Origin(Enum):
     CALIBRATION = "given"
 
 
-_FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
+_FOCAL_SIGMAS = {Origin.GUESS: 0.3, Origin.EXIF: 0.15, Origin.CALIBRATION: 0.01}
 _DISTORTION_SIGMAS = {Origin.GUESS: 0.1, Origin.EXIF: 0.1, Origin.CALIBRATION: 0.01}
 # COLMAP's TwoViewGeometryConfiguration: essential or fundamental matrix, not a homography.
 _WITH_DEPTH = (2, 3)

@@ -72,6 +72,10 @@ def test_what_the_points_do_not_tell_is_not_accepted():
     assert not doubt.accepts(Lens("SIMPLE_RADIAL", (700.0, 320.0, 240.0, -3.0)), 0.001)
     assert not doubt.accepts(Lens("SIMPLE_RADIAL", (5000.0, 320.0, 240.0, 0.0)), 0.001)
     assert not doubt.accepts(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)), np.inf)
+    # What was calibrated stays if the noise alone makes an error of its size, and goes if it cannot be right.
+    calibrated = LensDoubt(Lens("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)), 0.01, 0.01)
+    for focal_px, sigma, is_taken in ((517.0, 0.005, False), (560.0, 0.005, True), (503.0, 0.001, True)):
+        assert calibrated.accepts(Lens("SIMPLE_PINHOLE", (focal_px, 320.0, 240.0)), sigma) == is_taken
 
 
 def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
