@@ -148,7 +148,7 @@ class _Run(NamedTuple):
             with open_source(model, inputs, self.options) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
                     adjusted = adjust_first_placement(
-                        source, self.options, self.clock, self.intrinsics.free
+                        source, self.options, self.clock, self.intrinsics.free, thorough=False
                     ).adjusted
                 for camera in adjusted.lenses.sigmas:
                     found.setdefault(camera, tuple(adjusted.reconstruction.camera(camera).params))

@@ -36,7 +36,12 @@ class FirstPlacement(NamedTuple):
 
 
 def adjust_first_placement(
-    source: MatchSource, options: LocateOptions, clock: Clock, lenses: FreeLenses | None = None
+    source: MatchSource,
+    options: LocateOptions,
+    clock: Clock,
+    lenses: FreeLenses | None = None,
+    *,
+    thorough: bool = True,
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
@@ -45,6 +50,7 @@ def adjust_first_placement(
         options: of the directions, the placement and the points.
         clock: hears of progress.
         lenses: that change with the poses; none if None.
+        thorough: as in `adjust_thinly`.
 
     Raises:
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
@@ -55,7 +61,7 @@ def adjust_first_placement(
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
     located = Located(placement, everyone, unit_gauge(placement.locations))
     seed, tracks = seed_and_tracks(source, located, clock.advance)
-    adjusted = adjust_thinly(seed, tracks, options, lenses=lenses)
+    adjusted = adjust_thinly(seed, tracks, options, lenses=lenses, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
