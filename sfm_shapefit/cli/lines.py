@@ -25,7 +25,7 @@ def intrinsics_rows(facts: dict[str, Any], indent: str = "") -> Rows:
     from sfm_shapefit.results.intrinsics import describe_intrinsics
 
     lines = describe_intrinsics(facts["intrinsics"])
-    return [(f"{indent}intrinsics", shorten(lines, "see locate.json"))] if lines else []
+    return [(f"{indent}intrinsics", shorten(lines))] if lines else []
 
 
 def describe_time(timings_s: dict[str, float], detailed: bool) -> str:

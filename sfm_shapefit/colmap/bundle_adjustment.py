@@ -65,6 +65,8 @@ _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 _FINE = 0.9
 # Of the solves after a placement: the scale at which the rotations are judged, and where they end.
 _GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
+# So often lenses are held that turn out to be left open, and all is solved for again.
+_MOST_REPETITIONS = 2
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
 # With more frames, the standard deviations would take longer than all the rest.
 _MOST_FRAMES = 2_000
@@ -356,13 +358,20 @@ class _Run:
         return self.adjust_thinly(joined, found) if len(found.points) else adjusted
 
     def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
-        """Solve, and as long as a focal length is left open, hold what was given of it and solve again."""
-        while True:
-            adjusted = solve()
+        """Solve, and where focal lengths are left open, hold what was given of them and solve again.
+
+        What is still open after a few times keeps what it has, with its standard deviation.
+        """
+        adjusted = solve()
+        for _ in range(_MOST_REPETITIONS):
             unknown = self.judge_lenses(adjusted)
             if not unknown:
-                return adjusted
+                break
             self.hold_lenses(unknown)
+            adjusted = solve()
+        else:
+            self.judge_lenses(adjusted)
+        return adjusted
 
     def judge_lenses(self, adjusted: AdjustmentProblem) -> list[int]:
         """Note how well free focal lengths are known; return the cameras whose points leave them open."""

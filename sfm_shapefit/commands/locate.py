@@ -171,7 +171,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     located = located._replace(placement=placement, gauge=seeded.gauge)
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     warnings = (
-        *focal_warnings(source.model, focal_doubts),
+        *focal_warnings(source.model, focal_doubts, intrinsics.refined.undetermined),
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
     )

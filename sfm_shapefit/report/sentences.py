@@ -121,11 +121,10 @@ def _delivered(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what became of intrinsics in doubt, of the cameras with most images; earlier outputs lack it."""
+    """Yield what became of intrinsics in doubt, which earlier outputs lack."""
     lines = describe_intrinsics(facts.get("intrinsics", []))
-    more = f"; {len(lines) - _SHOWN:,} more cameras stand in locate.json" if len(lines) > _SHOWN else ""
     if lines:
-        yield f"Intrinsics: {'; '.join(lines[:_SHOWN])}{more}."
+        yield f"Intrinsics: {'; '.join(lines)}."
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:

@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 _NAMED = 3
 _UNCHANGED = 1e-12
 
+_FOUND = ("adjusted", "view graph")
+
 How = Literal["adjusted", "view graph", "undetermined", "held"]
 
 
@@ -82,8 +84,24 @@ def _focal_px(camera: "pycolmap.Camera") -> float:
 
 
 def describe_intrinsics(rows: list[CameraIntrinsics]) -> list[str]:
-    """Return a sentence for each camera in doubt, those of most images first."""
+    """Return a sentence for each camera in doubt, most images first; of many, one for all."""
+    if len(rows) > _NAMED:
+        return [_describe_together(rows)]
     return [_describe(row) for row in sorted(rows, key=lambda row: (-row["num_images"], row["camera"]))]
+
+
+def _describe_together(rows: list[CameraIntrinsics]) -> str:
+    """Say what became of many cameras."""
+    changes = [row["focal_px"] / row["given_focal_px"] - 1.0 for row in rows if row["decided_by"] in _FOUND]
+    unknown = sum(row["decided_by"] == "undetermined" for row in rows)
+    held = len(rows) - len(changes) - unknown
+    parts = [f"{len(changes)} of {len(rows)} cameras in doubt have another focal length now"]
+    if changes:
+        low, middle, high = np.quantile(changes, [0.0, 0.5, 1.0])
+        parts = [f"{parts[0]}, by {low:+.1%} to {high:+.1%} (median {middle:+.1%})"]
+    parts += [f"{unknown} kept what was given, as the matches do not tell it"] if unknown else []
+    parts += [f"{held} were not to be changed"] if held else []
+    return "; ".join(parts) + "; each stands in locate.json"
 
 
 def _describe(row: CameraIntrinsics) -> str:
