@@ -11,6 +11,8 @@ from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.synthetic import (
     RenderOptions,
@@ -20,6 +22,7 @@ from sfm_shapefit.synthetic import (
     make_scene,
     random_graph_problem,
 )
+from sfm_shapefit.synthetic.models import image_name
 from sfm_shapefit.synthetic.rendered_workspace import write_rendered_workspace
 from sfm_shapefit.synthetic.workspace import write_workspace
 from sfm_shapefit.viewgraph import ViewGraph
@@ -35,7 +38,7 @@ class BundledScene(NamedTuple):
     """How its images are drawn; None for made-up keypoints."""
 
 
-GRAPH = "graph40.txt"
+GRAPH, GPS, NAMES = "graph40.txt", "gps.csv", "names.txt"
 SCENES = {
     "courtyard": BundledScene(
         purpose="A yard with four facades, photographed from inside. A quarter of the image pairs is wrong in"
@@ -94,6 +97,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the scenes")
     out = parser.parse_args().out
     (out / GRAPH).write_text(bundled_graph_text(), encoding="utf-8")
+    (out / GPS).write_text(measured_positions_text(), encoding="utf-8")
+    (out / NAMES).write_text(names_text(), encoding="utf-8")
     for name in SCENES:
         write_scene(name, out / name)
         size_kb = sum(file.stat().st_size for file in (out / name).rglob("*") if file.is_file()) / 1e3
@@ -107,6 +112,24 @@ def bundled_graph_text() -> str:
         "# i j vx vy vz: unit directions of t_i - t_j, a fifth of them wrong; python scripts/make_data.py\n"
     )
     return header + graph_text(ViewGraph(40, problem.edges, problem.directions))
+
+
+def measured_positions_text() -> str:
+    """Return positions of the courtyard's cameras as GPS would give them: 5 cm off, and one of them 30 m."""
+    scene = make_scene(SCENES["courtyard"].scene)
+    noise = 0.05 * np.random.default_rng(0).standard_normal(scene.centers.shape)
+    measured = scene.centers + noise
+    measured[:, 0] += 100.0
+    measured[3, 0] += 30.0
+    lines = [
+        f"{image_name(k)},{x:.3f},{y:.3f},{z:.3f},0.05\n" for k, (x, y, z) in enumerate(measured.tolist())
+    ]
+    return "name,x,y,z,sigma\n" + "".join(lines)
+
+
+def names_text() -> str:
+    """Return the names of four images of ring8, as a file for --fix."""
+    return "".join(f"{image_name(k)}\n" for k in range(4))
 
 
 def write_scene(name: str, folder: Path) -> None:

@@ -7,7 +7,8 @@ The rotations are compared independently of that: with ref_from_model = Q, a per
 R_ref = R_model Q^T, so Q is the L1 mean of the R_ref^T R_model, and the error is the angle of what remains.
 
 Recall at a threshold is the share of *all* reference cameras whose position error is at most the threshold;
-a camera that the model misses counts as a failure.
+a camera that the model misses counts as a failure. AUC of relative poses, ATE and RPE are those of
+`pose_errors`, on which the alignment has no influence, or one of their own.
 """
 
 from collections.abc import Sequence
@@ -26,15 +27,28 @@ from sfm_shapefit.geometry import (
     median_spread,
     rotation_angles_deg,
 )
+from sfm_shapefit.pose_errors import (
+    ErrorSummary,
+    Poses,
+    TrajectoryErrors,
+    area_under_recall,
+    relative_pose_errors,
+    summarize_errors,
+    trajectory_errors,
+)
 
 _ON_A_LINE = (
     "the camera centers lie on a line, so the alignment's rotation about it is arbitrary; position errors "
     "across the line are a lower bound"
 )
 
+AUC_THRESHOLDS_DEG = (0.5, 1.0, 5.0, 10.0)
+"""Errors of relative poses up to which the area under the recall is given."""
 RELATIVE_THRESHOLDS = (0.001, 0.003, 0.01, 0.03, 0.1)
 """Position errors at which recall is always given, as fractions of the reference's extent."""
 
+# So many of the worst cameras are named.
+_WORST = 10
 # Fewer centers never determine a similarity.
 _MIN_COMMON = 3
 # Caps of 0.3 and 0.5 survived every corruption of half of the cameras minus one that was tried; a cap of 1
@@ -58,16 +72,6 @@ class CameraPoses(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ErrorSummary:
-    """Statistics of one kind of error over the common cameras."""
-
-    median: Annotated[float, "Of all errors."]
-    mean: Annotated[float, "Of all errors."]
-    rms: Annotated[float, "Root of the mean square."]
-    max: Annotated[float, "The largest error."]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Recall:
     """The share of the reference's cameras that are placed to within a threshold."""
 
@@ -77,6 +81,17 @@ class Recall:
         "The threshold as a fraction of the reference's extent; null for one given in the reference's units.",
     ]
     recall: Annotated[float, "In [0, 1]; cameras that the model misses count as failures."]
+    auc: Annotated[float, "Area under the recall up to the threshold, divided by it, in [0, 1]."]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RelativePoseAuc:
+    """How well the relative poses of all pairs of the reference's cameras are known."""
+
+    threshold_deg: Annotated[float, "The larger of the angles of rotation and of translation direction."]
+    auc: Annotated[
+        float, "Area under the recall up to the threshold, divided by it; pairs that the model misses fail."
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -103,6 +118,12 @@ class Evaluation(Displayed):
     """Diagonal of the bounding box of all reference centers, in the reference's units."""
     recalls: tuple[Recall, ...]
     """Recall at the relative thresholds, then at the absolute ones that were asked for."""
+    relative_pose_errors_deg: FloatArray
+    """(p,) of the pairs of common cameras: the larger of the angles of rotation and translation direction."""
+    relative_pose_aucs: tuple[RelativePoseAuc, ...]
+    """The area under the recall of these errors at 0.5, 1, 5 and 10 degrees."""
+    trajectory: TrajectoryErrors | None
+    """ATE and RPE of the common cameras in the order of their names; None if not asked for."""
     warnings: tuple[str, ...]
     """What a reader of the numbers must know; one sentence each."""
 
@@ -114,12 +135,12 @@ class Evaluation(Displayed):
     @property
     def position(self) -> ErrorSummary:
         """Statistics of the position errors, in the reference's units."""
-        return _summary(self.position_errors)
+        return summarize_errors(self.position_errors)
 
     @property
     def rotation_deg(self) -> ErrorSummary:
         """Statistics of the rotation errors, in degrees."""
-        return _summary(self.rotation_errors_deg)
+        return summarize_errors(self.rotation_errors_deg)
 
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain Python values with stable keys, as they stand in JSON."""
@@ -135,6 +156,9 @@ class Evaluation(Displayed):
             "position_error": asdict(self.position),
             "rotation_error_deg": asdict(self.rotation_deg),
             "recall": [asdict(recall) for recall in self.recalls],
+            "relative_pose_auc": [asdict(auc) for auc in self.relative_pose_aucs],
+            "trajectory": None if self.trajectory is None else asdict(self.trajectory),
+            "worst": self.worst(),
             "ref_from_model": {
                 "scale": self.ref_from_model.scale,
                 "rotation": self.ref_from_model.rotation.tolist(),
@@ -149,6 +173,17 @@ class Evaluation(Displayed):
         median, worst = self.position.median, self.position.max
         return f"{len(self.names)} cameras in common, position error {median:.3g} (median), {worst:.3g} (max)"
 
+    def worst(self, count: int = _WORST) -> list[dict[str, Any]]:
+        """Return name, position error and rotation error in degrees of the cameras that are farthest off."""
+        return [
+            {
+                "name": self.names[k],
+                "position_error": float(self.position_errors[k]),
+                "rotation_error_deg": float(self.rotation_errors_deg[k]),
+            }
+            for k in np.argsort(-self.position_errors, kind="stable")[:count].tolist()
+        ]
+
     def rows(self) -> list[dict[str, str | float]]:
         """Return one row per common camera, for a table: errors and the aligned center."""
         keys = ("name", "position_error", "rotation_error_deg", "x", "y", "z")
@@ -160,13 +195,18 @@ class Evaluation(Displayed):
 
 
 def evaluate_poses(
-    model: CameraPoses, reference: CameraPoses, thresholds: Sequence[float] = ()
+    model: CameraPoses,
+    reference: CameraPoses,
+    thresholds: Sequence[float] = (),
+    *,
+    trajectory: bool = False,
 ) -> Evaluation:
     """Compare a model's camera poses with a reference's; cameras correspond by name.
 
     Args:
         model, reference: the two.
-        thresholds: position errors in the reference's units at which recall is given too.
+        thresholds: position errors in the reference's units at which recall and its AUC are given too.
+        trajectory: also compute ATE and RPE of the common cameras in the order of their names.
 
     Raises:
         InputError: if an array has a wrong shape, is not finite or holds a matrix that is no rotation, a name
@@ -193,6 +233,9 @@ def evaluate_poses(
     close = errors < cap
     degenerate = _on_a_line(x, close) or _on_a_line(y, close)
     extent = float(np.linalg.norm(np.ptp(reference.centers, axis=0)))
+    ours, theirs = Poses(model.rotations[in_model], x), Poses(reference.rotations[in_ref], y)
+    pair_errors = relative_pose_errors(ours, theirs, extent)
+    in_time = np.argsort(np.array([reference.names[k] for k in in_ref]), kind="stable")
     return Evaluation(
         names=tuple(reference.names[k] for k in in_ref),
         missing=_only_in(reference.names, model.names),
@@ -204,6 +247,9 @@ def evaluate_poses(
         rotation_ref_from_model=frozen(global_rotation),
         extent=extent,
         recalls=_recalls(errors, len(reference.names), extent, thresholds),
+        relative_pose_errors_deg=frozen(pair_errors),
+        relative_pose_aucs=_relative_pose_aucs(pair_errors, len(in_ref), len(reference.names)),
+        trajectory=trajectory_errors(ours.taken(in_time), theirs.taken(in_time)) if trajectory else None,
         warnings=_warnings(degenerate, close, cap),
     )
 
@@ -278,11 +324,31 @@ def _recalls(
     """Return the recall at the relative thresholds and at the given absolute ones."""
     relative = [(fraction * extent, fraction) for fraction in RELATIVE_THRESHOLDS]
     absolute = [(float(threshold), None) for threshold in thresholds]
-    found = []
-    for threshold, fraction in [*relative, *absolute]:
-        share = float(np.count_nonzero(errors <= threshold)) / num_reference
-        found.append(Recall(threshold=threshold, fraction_of_extent=fraction, recall=share))
-    return tuple(found)
+    both = [*relative, *absolute]
+    num_missing = num_reference - len(errors)
+    aucs = area_under_recall(errors, num_missing, [threshold for threshold, _ in both])
+    return tuple(
+        Recall(
+            threshold=threshold,
+            fraction_of_extent=fraction,
+            recall=float(np.count_nonzero(errors <= threshold)) / num_reference,
+            auc=auc,
+        )
+        for (threshold, fraction), auc in zip(both, aucs, strict=True)
+    )
+
+
+def _relative_pose_aucs(
+    errors: FloatArray, num_common: int, num_reference: int
+) -> tuple[RelativePoseAuc, ...]:
+    """Return the areas of all pairs of the reference's cameras, of which the model has those of `errors`."""
+    of_common = num_common * (num_common - 1) / (num_reference * (num_reference - 1))
+    num_missing = round(len(errors) * (1.0 / of_common - 1.0))
+    areas = area_under_recall(errors, num_missing, AUC_THRESHOLDS_DEG)
+    return tuple(
+        RelativePoseAuc(threshold_deg=threshold, auc=area)
+        for threshold, area in zip(AUC_THRESHOLDS_DEG, areas, strict=True)
+    )
 
 
 def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]:
@@ -296,13 +362,3 @@ def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]
             " the alignment may rest on the wrong ones"
         )
     return tuple(found)
-
-
-def _summary(errors: FloatArray) -> ErrorSummary:
-    """Return the statistics of errors of shape (k,)."""
-    return ErrorSummary(
-        median=float(np.median(errors)),
-        mean=float(errors.mean()),
-        rms=float(np.sqrt(np.mean(errors**2))),
-        max=float(errors.max()),
-    )

@@ -15,6 +15,9 @@ SIGMA_PER_MEDIAN = 1.4826
 MEDIAN_NORMAL_LENGTH = 1.538
 """Median length of a vector of three normal components of variance 1."""
 
+METRIC_SIGMA = 0.1
+"""Relative standard deviation up to which a scale counts as known."""
+
 FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 """From camera axes with y up, looking along -z (OpenGL, Bundler, NeRF), to COLMAP's, and back."""
 

@@ -20,11 +20,11 @@ gives the same bits, on others: x86-64-v3, which has AVX2 and FMA, apple-m1, or 
 import hashlib
 import inspect
 import os
-import pickle
 import platform
 import re
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -35,10 +35,11 @@ import llvmlite.binding as llvm
 import numba
 from numba.core import config
 from numba.core.caching import NullCache
-from numba.core.compiler import CompileResult
+from numba.core.event import Listener, install_listener
 from numba.core.registry import cpu_target
-from numba.core.serialize import dumps
 from numba.misc.appdirs import AppDirs
+
+from sfm_shapefit.kernel_code import pack, unpack
 
 PACKAGE = Path(__file__).parent
 SHIPPED = PACKAGE / "_kernels"
@@ -54,6 +55,14 @@ _missed: list[Callable[[], None]] = []
 """What is called when a kernel is not found, once, before it is looked for again."""
 _hearing: list[Callable[[str], None]] = []
 """What is told the names of kernels that are found, or compiled and kept."""
+_said: list[bool] = []
+"""Not empty once a caller was told that kernels are compiled."""
+_COMPILING = (
+    "sfm_shapefit: compiling kernels, once, which may take a minute or two; they are kept on disk "
+    "(`sfm-shapefit warm-up` compiles all of them beforehand)"
+)
+_measuring: "list[CompileTime]" = []
+"""What counts the seconds that are spent compiling."""
 
 
 def choose_target() -> str:
@@ -98,6 +107,50 @@ def hear_of_kernels(hear: Callable[[str], None]) -> Iterator[None]:
         _hearing.remove(hear)
 
 
+class CompileTime(Listener):  # type: ignore[misc]
+    """Adds up the seconds that are spent compiling; what is compiled inside another kernel counts once."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._depth, self._since = 0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        """Begin to compile something."""
+        if self._depth == 0:
+            self._since = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, _event: Any) -> None:
+        """Have compiled something."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._since
+
+
+@contextmanager
+def measure_compilation() -> Iterator[CompileTime]:
+    """Yield what counts the seconds that the block spends compiling, or waiting for others that do."""
+    spent = CompileTime()
+    _measuring.append(spent)
+    try:
+        with install_listener("numba:compile", spent):
+            yield spent
+    finally:
+        _measuring.remove(spent)
+
+
+@contextmanager
+def counted_as_compiling() -> Iterator[None]:
+    """Count the block as time that is spent compiling: other processes compile meanwhile."""
+    for spent in _measuring:
+        spent.on_start(None)
+    try:
+        yield
+    finally:
+        for spent in _measuring:
+            spent.on_end(None)
+
+
 class KernelCache(NullCache):  # type: ignore[misc]
     """The compiled code of one function, for numba's dispatchers."""
 
@@ -110,7 +163,6 @@ class KernelCache(NullCache):  # type: ignore[misc]
 
     def load_overload(self, signature: Any, target_context: Any) -> Any:
         """Return the code for a signature, or None."""
-        target_context.refresh()
         name = self._file_name(signature, target_context.codegen())
         if not name:
             return None
@@ -118,6 +170,8 @@ class KernelCache(NullCache):  # type: ignore[misc]
         if found is None and _missed:
             _missed.pop()()
             found = self._find(name, target_context)
+        if found is None:
+            self._say_once()
         if found is not None:
             self._tell()
         return found
@@ -127,7 +181,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
         name = self._file_name(signature, compiled.codegen)
         if not name or compiled.library.has_dynamic_globals:
             return
-        content = dumps(compiled._reduce())
+        content = pack(compiled)
         for folder in own_folders(self._source.parent):
             try:
                 write_whole(folder / name, content)
@@ -136,6 +190,13 @@ class KernelCache(NullCache):  # type: ignore[misc]
             self._remove_stale(folder)
             break
         self._tell()
+
+    def _say_once(self) -> None:
+        """Say on stderr that kernels are compiled, to who calls from Python; the program says it itself."""
+        is_ours = self._source.is_relative_to(PACKAGE)
+        if is_ours and not (_said or _hearing or "sfm_shapefit.cli" in sys.modules):
+            _said.append(True)
+            print(_COMPILING, file=sys.stderr)  # noqa: T201
 
     def _tell(self) -> None:
         for hear in _hearing:
@@ -152,8 +213,7 @@ class KernelCache(NullCache):  # type: ignore[misc]
         folder_of_source = self._source.parent
         for folder in (*shipped_folders(folder_of_source), *own_folders(folder_of_source)):
             try:
-                reduced = pickle.loads((folder / name).read_bytes())
-                return CompileResult._rebuild(target_context, *reduced)
+                return unpack((folder / name).read_bytes(), target_context)
             except Exception:  # absent, unreadable, damaged: whatever it is, the kernel is compiled
                 continue
         return None

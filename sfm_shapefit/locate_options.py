@@ -164,8 +164,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         return self.points == "always" or (self.points == "auto" and num_cameras <= _MAX_CAMERAS_WITH_POINTS)
 
     def adjusts_cameras(self, num_cameras: int) -> bool:
-        """Return whether placed cameras are adjusted; the optimum as it is, or with priors, is not."""
-        as_found = self.objective not in ("auto", "lud") or not self.refine or self.refine_with_priors
+        """Return whether placed cameras are adjusted; the optimum as it is, is not."""
+        as_found = self.objective not in ("auto", "lud") or not self.refine
         return self.adjust and not as_found and num_cameras <= _MOST_ADJUSTED_CAMERAS
 
     def points_statement(self, num_cameras: int, num_points: int) -> str:

@@ -19,6 +19,7 @@ import types
 from collections.abc import Iterator
 from dataclasses import Field, dataclass, field, fields, replace
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeVar, Union, get_args, get_origin, get_type_hints
 
 S = TypeVar("S", bound="Settings")
@@ -121,6 +122,7 @@ _KINDS: dict[Any, tuple[type, ...]] = {
     str: (str,),
     bool: (bool,),
     tuple: (tuple, list),
+    Path: (Path,),
 }
 
 

@@ -75,5 +75,5 @@ def requests(driver):
     """Return the addresses that were asked for since the last call, files and data apart."""
     messages = (json.loads(entry["message"])["message"] for entry in driver.get_log("performance"))
     asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    own = ("file:", "data:", "blob:", "chrome:")  # the last are the browser's own pages, before ours
+    own = ("file:", "data:", "blob:", "chrome:", "chrome-untrusted:")  # the last two are the browser's own
     return [url for url in asked if not url.startswith(own)]

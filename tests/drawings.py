@@ -33,7 +33,12 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
     drawing = build_drawing(cameras, pairs, certified=centers + rng.normal(0, 0.01, centers.shape))
     drawing = replace(drawing, history=tuple(history))
     halves = np.tile([0.6, 0.45], (num_cameras, 1))
-    poses = Poses(rotations=rotations, centers=centers + rng.normal(0, 0.3, centers.shape), half_sizes=halves)
+    poses = Poses(
+        rotations=rotations,
+        centers=centers + rng.normal(0, 0.3, centers.shape),
+        half_sizes=halves,
+        focal_lengths_px=np.full(num_cameras, 1000.0),
+    )
     points = Points(
         positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
         colors=rng.integers(60, 220, (num_points, 3)),
@@ -94,6 +99,8 @@ def _facts(names):
         },
         "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
         "residual_level_deg": 0.07,
+        "residuals_deg": {"quantile_50": 0.08},
+        "sigma_of": "adjusted: noise, rotations, calibration; relative to the model's mean position",
         "mean_reprojection_error_px": 0.62,
         "scale": "input: scale and origin of the input's centers",
         "loose_groups": [{"cameras": list(names[:2]), "cause": "two agreeing pairs or fewer hold it"}],
@@ -107,7 +114,12 @@ def _facts(names):
             },
             {"num_cameras": 4, "scale": "unit", "hinges": [names[0]], "folder": "pieces/1", "num_placed": 4},
         ],
-        "verdict": {"grade": "look", "statement": "look at 1 camera (images/IMG_00000.jpg)"},
+        "verdict": {
+            "grade": "look",
+            "statement": "look at 1 camera (images/IMG_00000.jpg)",
+            "cameras": [names[0]],
+            "reasons": [],
+        },
         "delivered": {"statement": "ShapeFit's optimum is certified to 3.0e-09; delivered: that optimum"},
         "solve": {"objective": 0.02, "gap": 3e-9, "unique": True, "status": "converged"},
         "timings_s": {"read": 0.11, "directions": 0.4, "solve": 0.3, "structure": 0.5},

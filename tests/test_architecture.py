@@ -13,8 +13,8 @@ PACKAGE = Path(__file__).parents[1] / "sfm_shapefit"
 
 # Bottom first; the modules of a folder, and rooms on one floor, may import each other.
 LAYERS = [
-    {"errors", "arrays", "atomic_folder", "settings", "display"},
-    {"jit", "kernel_cache", "executors"},
+    {"errors", "arrays", "atomic_folder", "settings", "display", "extras", "wording"},
+    {"jit", "kernel_cache", "kernel_code", "executors"},
     {"geometry"},
     {"viewgraph"},
     {"theory"},
@@ -29,7 +29,7 @@ LAYERS = [
     {"adjustment"},
     {"judgement"},
     {"placement"},
-    {"evaluation"},
+    {"evaluation", "pose_errors"},
     {"formats"},
     {"colmap"},
     {"synthetic"},
@@ -44,11 +44,11 @@ LAYERS = [
 ROOMS = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms}
 
 DOORS = {
-    "numba": {"jit.py", "kernel_cache.py"},
+    "numba": {"jit.py", "kernel_cache.py", "kernel_code.py"},
     "cvxpy": {"solver/conic.py", "baselines/linf.py"},
     "pymetis": {"laplacian"},
     "distributed": {"commands/stages/execution.py"},
-    "cv2": {"synthetic"},
+    "cv2": {"synthetic", "report/thumbnails.py"},
     "trimesh": {"synthetic/surfaces.py", "report/mesh.py"},
     "pycolmap": {
         "colmap",
@@ -57,7 +57,6 @@ DOORS = {
         "synthetic/rendered_workspace.py",
     },
     "sqlite3": {"colmap", "synthetic/workspace.py"},
-    "plotly": {"report/page.py"},
     "viser": {"report/viewer.py"},
     "typer": {"cli"},
     "rich": {"cli"},

@@ -1,7 +1,9 @@
 """The examples run as a reader would run them, and what is shipped is complete."""
 
+import ast
 import inspect
 import itertools
+import json
 import re
 import zipfile
 from pathlib import Path
@@ -124,10 +126,49 @@ def test_the_package_is_imported_and_help_shown_in_tenths_of_a_second():
 
 
 @pytest.mark.slow
-def test_the_api_reference_builds_without_a_warning(tmp_path):
+def test_the_documentation_builds_as_a_site_with_a_search_over_pages_and_api(tmp_path):
     pytest.importorskip("pdoc")
-    done = run_python("-W", "error", "scripts/api_reference.py", tmp_path)
+    done = run_python("-W", "error", "scripts/docs_site.py", tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
-    page = (tmp_path / "sfm_shapefit.html").read_text(encoding="utf-8")
+    page = (tmp_path / "api/sfm_shapefit.html").read_text(encoding="utf-8")
     assert all(f'id="{name}"' in page for name in sfm_shapefit.__all__)
+    text = (tmp_path / "search-index.js").read_text(encoding="utf-8")
+    index = json.loads(text.removeprefix("const INDEX = ").rstrip(";\n"))
+    urls = {entry["url"] for entry in index}
+    assert {"glossary.html#glossary", "api/sfm_shapefit.html#locate"} <= urls
+    for url in urls:
+        file, _, anchor = url.partition("#")
+        assert f'id="{anchor}"' in (tmp_path / file).read_text(encoding="utf-8"), url
+    home = (tmp_path / "index.html").read_text(encoding="utf-8")
+    for link in re.findall(r'(?:href|src)="(?!https:|#)([^"#]+)', home):
+        assert (tmp_path / link).is_file(), link
+
+
+def outputs_of(notebook: Path) -> list[object]:
+    """Run the code cells of a notebook in order; return what each ends in, None for a statement."""
+    cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+    scope: dict[str, object] = {"__name__": "__main__"}
+    found = []
+    for cell in cells:
+        if cell["cell_type"] != "code":
+            continue
+        assert cell["outputs"] == [], "outputs are not kept in the repository"
+        body = ast.parse("".join(cell["source"])).body
+        last = body.pop() if isinstance(body[-1], ast.Expr) else None
+        exec(compile(ast.Module(body, []), str(notebook), "exec"), scope)
+        shown = last and eval(compile(ast.Expression(last.value), str(notebook), "eval"), scope)
+        found.append(shown)
+    return found
+
+
+def test_the_notebook_runs_and_ends_in_the_scene(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT / "examples")
+    *_, verdict, _, _, _, scene = outputs_of(ROOT / "examples/courtyard.ipynb")
+    said = capsys.readouterr().out
+    assert "largest coordinate of a center: 0.0" in said
+    assert float(re.search(r"median error (\S+) mm", said).group(1)) < 2.0
+    assert int(re.search(r"(\d+) of 176 pairs contradict", said).group(1)) == 44
+    assert verdict == "good"
+    assert "25 of 25 images" in scene._repr_html_()
+    assert "<iframe" in scene._repr_html_()

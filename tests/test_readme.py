@@ -5,12 +5,12 @@ import re
 import shlex
 from pathlib import Path
 
-import pycolmap
 import pytest
 
+import figure
 from sfm_shapefit.cli import app
 from tests.program import run, run_python, viewing
-from tests.scenes import COURTYARD, RING, ROOT
+from tests.scenes import ROOT
 
 README = ROOT / "README.md"
 PAGES = [README, *sorted((ROOT / "docs").glob("*.md"))]
@@ -57,14 +57,6 @@ def test_every_python_example_of_the_docs_runs(page, number, monkeypatch, capsys
 def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "data_synthetic").symlink_to(ROOT / "data_synthetic")
-    # What the pages take as the user's own: measured positions, one far off, and names to be fixed.
-    truth = pycolmap.Reconstruction(COURTYARD / "truth")
-    rows = [(image.name, *image.projection_center()) for image in truth.images.values()]
-    off = {rows[3][0]: 30.0}
-    lines = [f"{name} {x + 100.0 + off.get(name, 0.0)} {y} {z} 0.05\n" for name, x, y, z in rows]
-    (tmp_path / "gps.csv").write_text("".join(lines))
-    ring = sorted(image.name for image in pycolmap.Reconstruction(RING / "sparse/0").images.values())
-    (tmp_path / "names.txt").write_text("\n".join(ring[:4]))
     for command in commands_of(page):
         arguments = shlex.split(command)
         if arguments[0] == "view":
@@ -76,24 +68,39 @@ def test_every_command_runs_one_after_the_other(page, tmp_path, monkeypatch):
         assert result.exit_code == 0, f"{command}\n{result.output}"
 
 
-def test_the_readme_has_every_command_leads_with_a_light_picture_and_is_read_in_five_minutes():
-    shown = {command.split()[0] for command in commands_of(README)}
-    assert shown == {info.name for info in app.registered_commands if not info.hidden}
+def test_the_readme_is_short_leads_with_light_pictures_and_has_the_commands_that_one_uses():
     text = TEXTS[README]
-    picture = re.match(r"# \w+\n\n!\[[^]]+\]\(([^)]+)\)", text).group(1)
-    assert (ROOT / picture).stat().st_size < 300_000
-    prose = re.sub(r"```.*?```|^    .*$|^\|.*$", "", text, flags=re.DOTALL | re.MULTILINE)
-    assert len(prose.split()) < 5 * 240  # words a minute; tables and code are looked up
+    assert len(text.split()) <= 900
+    pictures = re.findall(r"^!\[[^]]+\]\(([^)]+)\)", text, flags=re.MULTILINE)
+    assert text.split("\n\n")[1].startswith("![")
+    assert sum((ROOT / picture).stat().st_size for picture in pictures) < 300_000
+    assert len({command.split()[0] for command in commands_of(README)}) == 5
+    titles = re.findall(r"^## (.+)$", text, flags=re.MULTILINE)
+    assert re.findall(r"\]\(#(\w+)\)", text) == [title.lower() for title in titles]
+
+
+def test_a_page_has_every_command():
+    shown = {command.split()[0] for command in commands_of(ROOT / "docs/commands.md")}
+    assert shown == {info.name for info in app.registered_commands if not info.hidden}
 
 
 def test_every_file_that_a_page_points_to_exists_and_every_page_is_pointed_to():
     pointed_to = set()
     for page, text in TEXTS.items():
-        targets = {(page.parent / target).resolve() for target in re.findall(r"\]\((?!http)([^)]+)\)", text)}
+        targets = {(page.parent / t).resolve() for t in re.findall(r"\]\((?!http|#)([^)#]+)[^)]*\)", text)}
         scripts = {ROOT / script for script in re.findall(r"(?<![\w/.])((?:scripts|examples)/[\w.]+)", text)}
         assert [path for path in targets | scripts if not path.exists()] == [], page
         pointed_to |= targets
     assert set(PAGES[1:]) <= pointed_to
+    assert set((ROOT / "docs").glob("*.png")) <= pointed_to, "a picture that no page shows"
+
+
+def test_every_picture_is_made_by_a_command_that_a_page_names():
+    """The report's is a screenshot; all others are figures of a script."""
+    named = TEXTS[ROOT / "docs/pictures.md"]
+    for picture in (ROOT / "docs").glob("*.png"):
+        command = re.search(rf"`python scripts/figure.py (\w+) .*--out docs/{picture.name}`", named)
+        assert picture.name == "report.png" or command.group(1) in figure.NAMES, picture.name
 
 
 def strings_of(tree: ast.AST) -> list[str]:
@@ -109,7 +116,9 @@ def strings_of(tree: ast.AST) -> list[str]:
 def test_what_the_table_of_reasons_says_the_program_says():
     sources = (ROOT / "sfm_shapefit").rglob("*.py")
     said = [text for path in sources for text in strings_of(ast.parse(path.read_text(encoding="utf-8")))]
-    table = README.read_text(encoding="utf-8").split("| it says |", 1)[1].split("\n\n", 1)[0]
-    for row in table.splitlines()[2:]:
+    _, *tables = TEXTS[ROOT / "docs/troubleshooting.md"].split("| it says |")
+    rows = [row for table in tables for row in table.split("\n\n", 1)[0].splitlines()[2:]]
+    assert len(rows) > 25
+    for row in rows:
         sentence = re.sub(r"\b(N%?|X|\d+%)(?= |$)", "*", row.split("|")[1].strip())
         assert any(sentence in text for text in said), sentence

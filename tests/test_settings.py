@@ -1,7 +1,9 @@
 """Options: stated once, refused by name, set by keyword; and the public names that take them."""
 
+import csv
 import dataclasses
 import inspect
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -10,7 +12,10 @@ import sfm_shapefit
 from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.locate_options import LocateOptions, MapOptions
-from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.refinement.options import PlacementOptions, Scale
+from sfm_shapefit.results import headline
+from sfm_shapefit.results.columns import columns_of
+from sfm_shapefit.results.tables import CameraRow
 from sfm_shapefit.settings import groups_of, merge_options
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
@@ -154,4 +159,33 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
     del located.timings_s["<script>"]
     assert "&lt;script&gt;" in table
     assert "<script>" not in table
-    assert "num images</th><td>8<" in table
+    assert "8 of 8 images" in table
+    assert "good</b>" in table
+    assert "<iframe sandbox='allow-scripts'" in table
+    assert "method</th><td>newton<" in solved._repr_html_()
+
+
+def test_every_scale_has_its_unit():
+    assert set(headline._UNITS) == {*get_args(Scale), "fixed"} - {"auto"}
+
+
+def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):
+    sfm_shapefit.write_result(located, tmp_path / "out", report=False)
+    for name, rows in (("cameras", located.cameras), ("pairs", located.pairs)):
+        columns = located.table(name)
+        with (tmp_path / f"out/{name}.csv").open(newline="", encoding="utf-8") as stream:
+            written = list(csv.DictReader(stream))
+        assert list(columns) == list(written[0])
+        assert {len(column) for column in columns.values()} == {len(rows)}
+        assert columns["x" if name == "cameras" else "vx"][0] == float(
+            written[0]["x" if name == "cameras" else "vx"]
+        )
+    cameras = located.table("cameras")
+    assert cameras["name"][0] == located.cameras[0].name
+    assert cameras["placed"].dtype == np.bool_
+    assert cameras["degree"].dtype == np.int64
+    unplaced = columns_of([CameraRow(name="a.jpg")], CameraRow, 2)
+    assert list(unplaced)[4:6] == ["x", "y"]
+    assert np.isnan(
+        [unplaced["x"][0], unplaced["trust"][0], unplaced["piece"][0], unplaced["sigma_y"][0]]
+    ).all()

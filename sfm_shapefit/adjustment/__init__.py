@@ -49,6 +49,7 @@ from sfm_shapefit.adjustment.solve import (
     Ending,
     adjust,
     choose_loss_scale_px,
+    frames_not_gained,
     reprojection_errors_px,
 )
 
@@ -68,6 +69,7 @@ __all__ = [
     "adjust",
     "choose_loss_scale_px",
     "estimate_covariances",
+    "frames_not_gained",
     "isotropic_information",
     "reprojection_errors_px",
 ]

@@ -128,6 +128,4 @@ def _turns(problem: AdjustmentProblem, rotations: FloatArray) -> FloatArray:
 
 def _count_observations(problem: AdjustmentProblem) -> IntArray:
     """Return how many observations each frame has, (n,)."""
-    cameras = problem.cameras_seeing
-    frames = cameras if problem.rig is None else problem.rig.frame_of_camera[cameras]
-    return np.bincount(frames, minlength=problem.num_frames).astype(np.int64)
+    return np.bincount(problem.frames_seeing(), minlength=problem.num_frames).astype(np.int64)

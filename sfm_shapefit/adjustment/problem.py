@@ -225,6 +225,11 @@ class AdjustmentProblem:
         """Return which frames are fixed, (n,)."""
         return self.fixed if len(self.fixed) else np.zeros(self.num_frames, np.bool_)
 
+    def frames_seeing(self) -> IntArray:
+        """Return the frame of each observation, (m,)."""
+        cameras = self.cameras_seeing
+        return cameras if self.rig is None else self.rig.frame_of_camera[cameras]
+
     def with_values(
         self, rotations: FloatArray, centers: FloatArray, points: FloatArray, lenses: Sequence[Lens]
     ) -> Self:

@@ -46,6 +46,7 @@ from sfm_shapefit.adjustment.residuals import (
 )
 from sfm_shapefit.adjustment.solve import reprojection_errors_px, values_of
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.geometry import METRIC_SIGMA
 from sfm_shapefit.jit import kernel
 
 _MOST_GROUPS = 64
@@ -73,6 +74,9 @@ class CenterErrors:
     is seen."""
     calibration_px: float
     """Of each smooth field of an image's errors, root of the mean square; 0 where the lenses fit."""
+    scale_sigma: float | None
+    """Relative standard deviation of the scale; None where nothing in the problem tells it. From a tenth on,
+    the covariances leave errors of the scale out: they are then those of the shape, in whatever scale."""
     evidence: float
     """By how many standard deviations smooth errors of the lenses exceed noise; the largest of all."""
 
@@ -113,12 +117,28 @@ def estimate_center_errors(
         ],
         axis=2,
     )
-    moves = system.solve(moved)[:, :3]
+    moves, scale_sigma = system.solve(moved)[:, :3], None
+    if not (system.free[6].any() or problem.is_fixed().any()):
+        scale_sigma, same_scale = _split_scale(problem, system, moves)
+        moves = same_scale if scale_sigma > METRIC_SIGMA else moves
     return CenterErrors(
         covariances=system.by_frame(moves @ moves.transpose(0, 2, 1)),
         calibration_px=calibration_px,
+        scale_sigma=scale_sigma,
         evidence=evidence,
     )
+
+
+def _split_scale(
+    problem: AdjustmentProblem, system: GroundedSystem, moves: FloatArray
+) -> tuple[float, FloatArray]:
+    """Return the standard deviation of the scale, and moves of the nodes (N, 3, s) without its errors."""
+    moving = (system.layout.node_of_frame >= 0) & ~system.unseen
+    nodes = system.layout.node_of_frame[moving]
+    arms = np.zeros(moves.shape[:2])
+    arms[nodes] = problem.centers[moving] - problem.centers[moving].mean(axis=0)
+    scales = np.einsum("na,nas->s", arms, moves) / max(float(np.sum(arms**2)), 1e-300)
+    return float(np.linalg.norm(scales)), moves - arms[:, :, None] * scales
 
 
 def _add_errors_of_priors(

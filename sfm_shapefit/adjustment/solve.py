@@ -3,7 +3,7 @@
 import enum
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,7 @@ from sfm_shapefit.adjustment.residuals import (
     sum_losses,
 )
 from sfm_shapefit.adjustment.schur import eliminate_points, step_points
-from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.laplacian.operators import Workers
@@ -41,6 +41,7 @@ _NEAR = 1e-2  # a step that lowers the cost by less of it is near the minimum, w
 _LEAST_CURVATURE = 0.3  # of the weight of a residual, kept along it there
 _STATIONARY = 1e-6  # gradient norm at which steps that rounding refuses mean a minimum
 _EXACT_PX = 1e-10  # rms residual that is rounding
+_BEHIND_PX = 1e6  # what a point behind its camera counts as where frames are compared
 
 
 class Ending(enum.Enum):
@@ -144,6 +145,28 @@ def reprojection_errors_px(problem: AdjustmentProblem) -> FloatArray:
     """Return how far each observation misses its pixel, (m,); NaN if its point is behind the camera."""
     layout = lay_out(problem, AdjustmentOptions())
     return np.asarray(np.linalg.norm(reprojection_residuals(layout, values_of(problem)), axis=1))
+
+
+def frames_not_gained(before: AdjustmentProblem, after: AdjustmentProblem, loss_scale_px: float) -> BoolArray:
+    """Return which frames (n,) would have less cost at their pose of before, all else as it is after.
+
+    A joint minimum is one for each frame by itself, but only a local one: a frame that few points hold may
+    have been led over a ridge by the others.
+
+    Args:
+        before: a problem at its start.
+        after: the same problem, adjusted, in the same gauge.
+        loss_scale_px: of the Cauchy loss.
+    """
+    returned = replace(after, rotations=before.rotations, centers=before.centers)
+    return _costs_of_frames(returned, loss_scale_px) < _costs_of_frames(after, loss_scale_px)
+
+
+def _costs_of_frames(problem: AdjustmentProblem, loss_scale_px: float) -> FloatArray:
+    """Return the cost of each frame's observations (n,), px^2."""
+    errors_px = np.nan_to_num(reprojection_errors_px(problem), nan=_BEHIND_PX)
+    losses = 0.5 * loss_scale_px**2 * np.log1p((errors_px / loss_scale_px) ** 2)
+    return np.bincount(problem.frames_seeing(), losses, problem.num_frames).astype(np.float64)
 
 
 def choose_loss_scale_px(problem: AdjustmentProblem, scales_px: Sequence[float]) -> float:

@@ -1,14 +1,14 @@
 """What the user sees: errors as one sentence and an exit code, progress on stderr, tables on stdout.
 
 The door to rich. Exit codes: 0 done; 2 wrong usage; 3 bad input; 4 the view graph cannot be solved;
-130 interrupted.
+5 a package is missing; 130 interrupted.
 """
 
 import os
 import signal
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,15 +16,17 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from sfm_shapefit.errors import ShapeFitError, UnsolvableError
+from sfm_shapefit.extras import MissingExtraError
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.stages.clock import Progress
     from sfm_shapefit.commands.warm_up import Tell
+    from sfm_shapefit.results.model_verdict import ModelVerdict
 
 Rows = list[tuple[str, str]]
 """A two-column table: label and what stands beside it."""
 
-EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_INTERRUPTED = 3, 4, 130
+EXIT_INPUT, EXIT_UNSOLVABLE, EXIT_MISSING, EXIT_INTERRUPTED = 3, 4, 5, 130
 NAMES_SHOWN = 8
 SEE_JSON = "see --json"
 
@@ -37,6 +39,9 @@ _NO_MEMORY = ("can't start new thread", "bad_alloc", "failed to map segment", "C
 """How Python, C++ and the dynamic linker say that there is no memory."""
 
 _COMPILING = "compiling kernels, once; they are kept on disk"
+
+_WARNING_STYLE = "bold yellow"
+_GRADE_STYLES = {"good": "bold green", "look": "bold yellow", "do not use": "bold red"}
 
 # Where there is no terminal, so often.
 _SAID_EVERY_S = 2.0
@@ -70,6 +75,8 @@ def report_errors(out: Path | None = None) -> Iterator[None]:
             )
         if isinstance(error, UnsolvableError):
             _fail(str(error), EXIT_UNSOLVABLE)
+        if isinstance(error, MissingExtraError):
+            _fail(str(error), EXIT_MISSING)
         if isinstance(error, ShapeFitError):
             _fail(str(error), EXIT_INPUT)
         if isinstance(error, MemoryError) or any(words in str(error) for words in _NO_MEMORY):
@@ -214,16 +221,41 @@ def _say_stage(stage: str, done: int, total: int) -> None:
 
 
 def print_table(title: str, rows: Rows) -> None:
-    """Print a two-column table on stdout."""
+    """Print a two-column table on stdout; warnings have a color where the terminal has."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     # Text, not markup: names and paths come from strangers, and brackets in them mean nothing.
-    table = Table(title=Text(_encodable(title)), show_header=False, title_justify="left")
+    table = Table(title=Text(_encodable(title), overflow="fold"), show_header=False, title_justify="left")
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
     for label, value in rows:
-        table.add_row(label, Text("\n".join(_encodable(line) for line in value.split("\n"))))
+        style = _WARNING_STYLE if label.strip() == "warning" else ""
+        text = "\n".join(_encodable(line) for line in value.split("\n"))
+        table.add_row(Text(label, style), Text(text, style))
     Console().print(table)
+
+
+def print_ending(verdict: "ModelVerdict", steps: Iterable[str]) -> None:
+    """Print on stdout how good a model is, and what to do next; each step is a line that can be copied."""
+    from rich.console import Console
+    from rich.text import Text
+
+    line = Text("verdict: ").append(_encodable(verdict.statement), _GRADE_STYLES[verdict.grade.value])
+    Console().print(line, soft_wrap=True)
+    print_steps(steps)
+
+
+def print_steps(steps: Iterable[str]) -> None:
+    """Print on stdout what to do next, each step a line that can be copied."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console()
+    for number, step in enumerate(steps):
+        start = "next:    " if number == 0 else "         "
+        console.print(Text(start + _encodable(step)), soft_wrap=True)
 
 
 def print_json(summary: dict[str, Any]) -> None:

@@ -6,12 +6,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, print_json, print_table, report_errors, shorten
+from sfm_shapefit.cli.console import SEE_JSON, Rows, print_json, print_table, report_errors, shorten
 from sfm_shapefit.cli.flags import GroupedCommand, InputPath, Json, ModelArgument, one_path
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.wording import rounded
 
 if TYPE_CHECKING:
-    from sfm_shapefit.evaluation import Evaluation
+    from sfm_shapefit.evaluation import Evaluation, Recall
+    from sfm_shapefit.pose_errors import ErrorSummary
+
+_ROUNDING = 1e-9
+"""Errors in degrees, and in the extent, that are no more than rounding."""
+_WORST_SHOWN = 3
 
 
 @app.command(
@@ -29,8 +35,18 @@ def evaluate_command(
     input_path: InputPath = None,
     threshold: Annotated[
         list[float] | None,
-        typer.Option("--threshold", help="Recall at this position error in REF's units; may be repeated."),
+        typer.Option(
+            "--threshold",
+            metavar="DISTANCE",
+            help="Recall and AUC at this position error in REF's units; may be repeated.",
+        ),
     ] = None,
+    trajectory: Annotated[
+        bool,
+        typer.Option(
+            "--trajectory", help="Also ATE and RPE, as evo defines them, of the images in the order of names."
+        ),
+    ] = False,
     csv: Annotated[
         Path | None, typer.Option("--csv", metavar="FILE", help="Write one row per camera to FILE.")
     ] = None,
@@ -43,7 +59,7 @@ def evaluate_command(
         from sfm_shapefit.commands.evaluate import evaluate
         from sfm_shapefit.results.tables import write_records
 
-        errors = evaluate(source, truth, thresholds=threshold or ())
+        errors = evaluate(source, truth, thresholds=threshold or (), trajectory=trajectory)
         if csv is not None:
             if csv.exists() and csv.suffix.lower() != ".csv":
                 raise InputError(f"{csv} exists and is no .csv file; choose another name")
@@ -56,20 +72,52 @@ def evaluate_command(
 
 def _evaluation_table(errors: "Evaluation") -> Rows:
     """Return the errors in the reference's units."""
-    position, rotation = errors.position, errors.rotation_deg
-    recall = "\n".join(f"{r.recall:.1%} within {r.threshold:.4g}" for r in errors.recalls)
+    smallest = _ROUNDING * errors.extent
+    worst = [
+        f"{row['name']}: {rounded(row['position_error'], smallest)}, {rounded(row['rotation_error_deg'])} deg"
+        for row in errors.worst(_WORST_SHOWN)
+    ]
+    aucs = [f"{100.0 * auc.auc:.1f} at {auc.threshold_deg:g} deg" for auc in errors.relative_pose_aucs]
     return [
         ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
-        *([("missing", shorten(errors.missing))] if errors.missing else []),
+        *([("missing", shorten(errors.missing, SEE_JSON))] if errors.missing else []),
         (
             "position error",
-            f"median {position.median:.4g}, mean {position.mean:.4g}, max {position.max:.4g} "
+            f"{_describe(errors.position, smallest)}\n"
             f"(the reference's cameras extend over {errors.extent:.4g})",
         ),
-        (
-            "rotation error",
-            f"median {rotation.median:.4g}, mean {rotation.mean:.4g}, max {rotation.max:.4g} deg",
-        ),
-        ("recall", recall),
+        ("rotation error", f"{_describe(errors.rotation_deg)} deg"),
+        ("relative pose AUC", ", ".join(aucs)),
+        *_trajectory_rows(errors, smallest),
+        ("within", "\n".join(map(_describe_recall, errors.recalls))),
+        ("worst cameras", "\n".join(worst)),
         *[("warning", warning) for warning in errors.warnings],
+    ]
+
+
+def _describe(error: "ErrorSummary", smallest: float = _ROUNDING) -> str:
+    """Return an error in words; what is no larger than rounding is 0."""
+    return ", ".join(
+        f"{name} {rounded(getattr(error, name), smallest)}" for name in ("median", "mean", "max")
+    )
+
+
+def _describe_recall(recall: "Recall") -> str:
+    """Say how many cameras are within a threshold, and what share of the extent it is."""
+    fraction = recall.fraction_of_extent
+    of_extent = "" if fraction is None else f" ({100.0 * fraction:g}% of the extent)"
+    return (
+        f"{recall.threshold:.4g}{of_extent}: {recall.recall:.1%} of the cameras, AUC {100.0 * recall.auc:.1f}"
+    )
+
+
+def _trajectory_rows(errors: "Evaluation", smallest: float) -> Rows:
+    """Return ATE and RPE, if they were asked for."""
+    found = errors.trajectory
+    if found is None:
+        return []
+    turned = rounded(found.rpe_rotation_deg.rms)
+    return [
+        ("ATE", f"rms {rounded(found.ate.rms, smallest)}, {_describe(found.ate, smallest)}"),
+        ("RPE", f"rms {rounded(found.rpe.rms, smallest)} and {turned} deg, per image"),
     ]

@@ -33,13 +33,38 @@ Database = Annotated[
         help="COLMAP database; by default database.db in MODEL, its parent or grandparent.",
     ),
 ]
+PriorsFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--priors",
+        metavar="FILE",
+        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Scene = Annotated[
     bool, typer.Option("--scene", help="Also write scene.glb and scene.ply, for any 3D viewer.")
 ]
+Images = Annotated[
+    Path | None,
+    typer.Option(
+        "--images", metavar="DIR", help="Folder of the images: small pictures of them are in the report."
+    ),
+]
 
 _SHORT = {"quiet": "-q", "verbose": "-v"}
+
+_METAVARS: dict[Any, str] = {
+    "known_distance": "NAME NAME DISTANCE",
+    "fix": "FILE|solved",
+    "config": "FILE",
+    int: "INTEGER",
+    float: "NUMBER",
+    int | None: "INTEGER",
+    float | None: "NUMBER",
+}
+"""What stands for a flag's value in the help, by the field's name or else by its type."""
 
 _EARLIER_NAMES: dict[str, str] = {}
 """Flags that are taken beside their present names, without standing in any help."""
@@ -53,6 +78,7 @@ class OutputFlags(Settings):
     overwrite: bool = option(False, "Replace an earlier output of this command.")
     report: bool = option(True, "Write report.html: one page that works offline.")
     scene: bool = option(False, "Also write scene.glb and scene.ply, for any 3D viewer.")
+    images: str = option("", "Folder of the images: report.html has small pictures of them, 4 MB at most.")
     json: bool = option(False, "Print one JSON object on stdout and nothing else.")
     strict: bool = option(False, 'End with exit code 4 where the verdict is "do not use"; OUT is written.')
     quiet: bool = option(False, "Print nothing but errors.")
@@ -125,7 +151,12 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
             names += [_SHORT[item.name]] if item.name in _SHORT else []
             shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
             default = "" if item.default in (None, "") or is_switch else f" [default: {shown}]"
-            flagged = typer.Option(*names, help=item.metadata["help"] + default, rich_help_panel=group.title)
+            flagged = typer.Option(
+                *names,
+                help=item.metadata["help"] + default,
+                rich_help_panel=group.title,
+                metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
+            )
             annotation: Any = Annotated[kinds[item.name] | None, flagged]
             kind = inspect.Parameter.KEYWORD_ONLY
             parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
@@ -162,6 +193,8 @@ def _read_toml(path: Path, known: set[str], earlier: dict[str, str]) -> dict[str
     refuse_irregular_file(path)
     try:
         read = tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise typer.BadParameter(f"{path} does not exist") from None
     except (OSError, ValueError, RecursionError) as error:
         raise typer.BadParameter(f"{path} is not a readable TOML file: {error}") from error
     values = {earlier.get(name, name): value for name, value in read.items()}

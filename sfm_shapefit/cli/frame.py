@@ -1,6 +1,7 @@
 """The frame of the commands that make OUT: it is claimed, errors are caught, progress and results shown."""
 
-from collections.abc import Callable, Iterator, Sequence
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,6 +13,7 @@ from sfm_shapefit.cli.console import (
     EXIT_UNSOLVABLE,
     Rows,
     catch_termination,
+    print_ending,
     print_json,
     print_table,
     report_errors,
@@ -21,7 +23,29 @@ from sfm_shapefit.cli.flags import Options, OutputFlags, read_options
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.stages.clock import Progress
+    from sfm_shapefit.kernel_cache import CompileTime
     from sfm_shapefit.results.model_verdict import ModelVerdict
+
+
+_NOTICED_S = 1.0
+"""Seconds of compiling that are worth a word."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Told:
+    """What a command tells of its result."""
+
+    figures: Rows
+    """What everybody should see: how much is placed, how well, what is not and why, warnings."""
+    details: Rows
+    """What `--verbose` adds, before the figures."""
+    verdict: "ModelVerdict"
+    steps: Iterable[str]
+    """What to do next, a line each."""
+    timings_s: dict[str, float]
+    """Seconds per stage."""
+    written: str
+    """Where the output is, and what it holds."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -35,48 +59,114 @@ class Run(Generic[Options]):
     progress: "Progress | None" = None
     shown: Callable[[], None] = field(default=lambda: None)
     is_unusable: bool = False
+    started: float = field(default_factory=time.perf_counter)
+    compiling: "CompileTime | None" = None
+    """What counts the seconds that are spent compiling."""
 
     @property
     def writing(self) -> dict[str, Any]:
         """How the result is written; keywords of `write_result`."""
         flags = self.flags
         how = {"overwrite": flags.overwrite, "report": flags.report, "scene": flags.scene}
-        return how | {"protect": self.protect}
+        return how | {"protect": self.protect, "images": flags.images}
 
-    def show(self, title: str, facts: dict[str, Any], table: Callable[[], Rows]) -> None:
-        """Print the facts as JSON, or a table, or nothing, once the output is complete."""
+    def show(self, title: str, facts: dict[str, Any], told: "Callable[[], Told]") -> None:
+        """Print the facts as JSON, or what is told of them, or nothing, once the output is complete."""
         if self.flags.json:
             self.shown = lambda: print_json(facts)
         elif not self.flags.quiet:
-            self.shown = lambda: print_table(title, table())
+            self.shown = lambda: self._tell(title, told())
+
+    def _tell(self, title: str, told: "Told") -> None:
+        """Print a table, with details if they are wanted, then the verdict and what to do next."""
+        rows = [
+            *(told.details if self.flags.verbose else []),
+            *told.figures,
+            ("time", self._describe_time(told.timings_s)),
+            ("written to", told.written),
+        ]
+        print_table(title, rows)
+        print_ending(told.verdict, told.steps)
+
+    def _describe_time(self, timings_s: dict[str, float]) -> str:
+        """Say how long the command took, how much of it went into compiling, and, in detail, each stage."""
+        total = f"{time.perf_counter() - self.started:.1f} s"
+        compiling = 0.0 if self.compiling is None else self.compiling.seconds
+        if compiling >= _NOTICED_S:
+            total += f", of which {compiling:.0f} s compiling kernels, once"
+        stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
+        return f"{total} ({stages})" if self.flags.verbose else total
 
     def heed(self, verdict: "ModelVerdict") -> None:
         """End with exit code 4, if that was asked for and the model is not to be used."""
         self.is_unusable = self.flags.strict and verdict.is_bad
 
 
+def refuse_swapped(source: Path, target: Path, order: str) -> None:
+    """Refuse an output that is what the command reads: the arguments are swapped.
+
+    Raises:
+        InputError: if OUT is a model that no command of this program wrote, a database or another file.
+    """
+    from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER
+    from sfm_shapefit.errors import InputError
+
+    ours = any((target / marker).exists() for marker in (MARKER, MAP_MARKER))
+    is_model = any((target / f"cameras{suffix}").exists() for suffix in (".bin", ".txt"))
+    if (is_model and not ours) or (target.is_file() and not source.is_file()):
+        model, file = (
+            "holds a model, but OUT is a folder to be made",
+            "is a file, but OUT is a folder to be made",
+        )
+        what = model if is_model else file
+        raise InputError(f"{target} {what}; the order is {order}, so give {target} first")
+
+
 @contextmanager
 def command_run(
-    settings: type[Options], given: dict[str, Any], target: Path, inputs: Sequence[Path | None]
+    settings: type[Options],
+    given: dict[str, Any],
+    target: Path,
+    inputs: Sequence[Path | None],
+    order: str = "MODEL OUT",
 ) -> Iterator[Run[Options]]:
     """Run a command that makes OUT: errors become one sentence and an exit code, and OUT is whole or absent.
 
-    Flags of `settings` and of `OutputFlags` are None where the user says nothing. Inputs stay as they are.
+    The first input is that which stands before OUT, `order` the names of both. Flags of `settings` and of
+    `OutputFlags` are None where the user says nothing. Inputs stay as they are.
     """
+    started = time.perf_counter()
     with report_errors(target):
         from sfm_shapefit.atomic_folder import claimed_output
 
         flags = read_options(OutputFlags, given)
         config = Path(flags.config) if flags.config else None
         options = read_options(settings, given, config)
+        if flags.images:  # now, not when all is computed
+            from sfm_shapefit.report.thumbnails import refuse_no_folder
+
+            refuse_no_folder(Path(flags.images))
         fixed = getattr(options, "fix", "")
-        paths = [*inputs, config, Path(fixed) if fixed else None]
-        run = Run(options=options, flags=flags, protect=[path for path in paths if path is not None])
+        paths = [
+            *inputs,
+            config,
+            Path(fixed) if fixed else None,
+            Path(flags.images) if flags.images else None,
+        ]
+        protect = [path for path in paths if path is not None]
+        run = Run(options=options, flags=flags, protect=protect, started=started)
+        if inputs[0] is not None:
+            refuse_swapped(inputs[0], target, order)
         with claimed_output(target, overwrite=flags.overwrite, protect=run.protect):
             from sfm_shapefit.colmap.quiet import hear_pycolmap
+            from sfm_shapefit.kernel_cache import measure_compilation
 
             catch_termination()
-            with show_progress(not flags.quiet, flags.verbose) as run.progress, hear_pycolmap(flags.verbose):
+            with (
+                measure_compilation() as run.compiling,
+                show_progress(not flags.quiet, flags.verbose) as run.progress,
+                hear_pycolmap(flags.verbose),
+            ):
                 yield run
         run.shown()
         if run.is_unusable:

@@ -1,5 +1,6 @@
 """`sfm-shapefit inspect MODEL`."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,7 @@ from sfm_shapefit.cli.console import (
     Rows,
     catch_termination,
     print_json,
+    print_steps,
     print_table,
     report_errors,
     shorten,
@@ -20,6 +22,7 @@ from sfm_shapefit.cli.console import (
 from sfm_shapefit.cli.flags import Database, GroupedCommand, InputPath, Json, one_path, read_options, takes
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     from sfm_shapefit.commands.inspect import Inspection
@@ -73,10 +76,20 @@ def inspect_command(
         if as_json:
             print_json(found.summary())
         else:
-            what = "nodes" if source.is_file() else "images"
-            print_table(f"{found.num_images} {what} of {source}", _inspection_table(found))
+            what = "node" if _is_graph(source) else "image"
+            print_table(f"{counted(found.num_images, what)} of {source}", _inspection_table(found))
+            if not found.diagnosis.obstacle:
+                command = "place" if what == "node" else "locate"
+                print_steps([f"sfm-shapefit {command} {shlex.quote(str(source))} OUT"])
         if found.diagnosis.obstacle:
             raise UnsolvableError(found.diagnosis.obstacle)
+
+
+def _is_graph(source: Path) -> bool:
+    """Tell a bare graph's file from a model, which may be another program's file."""
+    from sfm_shapefit.formats.models import is_model_file
+
+    return source.is_file() and not is_model_file(source)
 
 
 def _inspection_table(found: "Inspection") -> Rows:
@@ -86,7 +99,8 @@ def _inspection_table(found: "Inspection") -> Rows:
     sizes = ", ".join(map(str, seen.components[:NAMES_SHOWN]))
     sizes += ", ..." if len(seen.components) > NAMES_SHOWN else ""
     pieces = [
-        f"{piece.num_cameras} cameras" + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
+        counted(piece.num_cameras, "camera")
+        + (f", hinged at {', '.join(piece.hinges)}" if piece.hinges else "")
         for piece in seen.pieces
     ]
     left_out = [f"{name}: {reason}" for name, reason in seen.left_out.items()]
@@ -96,11 +110,11 @@ def _inspection_table(found: "Inspection") -> Rows:
         ("pairs", statuses),
         ("points as nodes", found.points),
         ("rigs", found.rigs),
-        ("components", f"{len(seen.components)} ({sizes} cameras)"),
+        ("components", f"{len(seen.components)} (of {sizes} cameras)"),
         *([("rigid pieces", shorten(pieces, SEE_JSON))] if pieces else []),
         *([("not placed", shorten(left_out, SEE_JSON))] if left_out else []),
         *([("weak cameras", shorten(weak, SEE_JSON))] if weak else []),
-        ("wrong pairs", seen.corruption.statement),
+        ("contradicting", seen.corruption.statement),
         *([("solver", f"{seen.plan.solver}: {seen.plan.solver_reason}")] if seen.plan else []),
         *([("finish", seen.plan.finish)] if seen.plan else []),
         *([("will take", found.expected.statement)] if found.expected else []),

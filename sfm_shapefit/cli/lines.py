@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.cli.console import Rows, shorten
 from sfm_shapefit.cli.flags import OutputFlags
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     from sfm_shapefit.colmap.bundle_adjustment import Adjusted
@@ -12,7 +13,7 @@ if TYPE_CHECKING:
 def further_piece_rows(facts: dict[str, Any]) -> Rows:
     """Return a row that says where the further pieces stand, if there are any."""
     lines = [
-        f"{piece['folder']}: {piece['num_placed']} of {piece['num_cameras']} cameras, hinged at "
+        f"{piece['folder']}: {piece['num_placed']} of {counted(piece['num_cameras'], 'camera')}, hinged at "
         f"{', '.join(piece['hinges']) or 'nothing'}, with a scale of its own"
         for piece in facts["pieces"][1:]
         if piece["folder"]
@@ -20,19 +21,19 @@ def further_piece_rows(facts: dict[str, Any]) -> Rows:
     return [("further pieces", shorten(lines))] if lines else []
 
 
-def intrinsics_rows(facts: dict[str, Any], indent: str = "") -> Rows:
+def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     """Return a row on cameras whose intrinsics were in doubt, if there are any."""
     from sfm_shapefit.results.intrinsics import describe_intrinsics
 
     lines = describe_intrinsics(facts["intrinsics"])
-    return [(f"{indent}intrinsics", shorten(lines))] if lines else []
+    return [("intrinsics", shorten(lines))] if lines else []
 
 
-def describe_time(timings_s: dict[str, float], detailed: bool) -> str:
-    """Say how long the command took, and, in detail, each stage."""
-    total = f"{sum(timings_s.values()):.1f} s"
-    stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in timings_s.items())
-    return f"{total} ({stages})" if detailed else total
+def describe_points(facts: dict[str, Any]) -> str:
+    """Say how many points there are, and how far they are off their keypoints."""
+    if not facts["num_points"]:
+        return "none"
+    return f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
 
 
 def describe_adjustment(adjusted: "Adjusted") -> str:

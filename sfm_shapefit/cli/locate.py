@@ -15,18 +15,20 @@ from sfm_shapefit.cli.flags import (
     OutArgument,
     OutputFlags,
     OutputPath,
+    PriorsFile,
     one_path,
     takes,
 )
-from sfm_shapefit.cli.frame import command_run
+from sfm_shapefit.cli.frame import Told, command_run
 from sfm_shapefit.cli.lines import (
     describe_adjustment,
-    describe_time,
+    describe_points,
     further_piece_rows,
     intrinsics_rows,
     name_pictures,
 )
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.result import LocateResult
@@ -46,14 +48,7 @@ def locate_command(
     input_path: InputPath = None,
     output_path: OutputPath = None,
     database: Database = None,
-    priors: Annotated[
-        Path | None,
-        typer.Option(
-            "--priors",
-            metavar="FILE",
-            help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
-        ),
-    ] = None,
+    priors: PriorsFile = None,
     executor: Annotated[
         Literal["serial", "processes", "dask"],
         typer.Option(
@@ -80,56 +75,63 @@ def locate_command(
                 source, database, options=run.options, progress=run.progress, priors=priors, executor=workers
             )
         write_result(found, target, **run.writing)
-        title = f"{len(found.model.names)} images of {source}"
+        title = f"{counted(len(found.model.names), 'image')} of {source}"
         run.heed(found.verdict)
-        run.show(title, found.summary(), lambda: _locate_table(found, target, run.flags))
+        run.show(title, found.summary(), lambda: _tell(found, target, run.flags))
 
 
-def _locate_table(found: "LocateResult", out: Path, flags: OutputFlags) -> Rows:
-    """Return what was placed, what was not and why, how certain it is, and where it is."""
+def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
+    """Say what was placed, what was not and why, how certain it is, and where it is."""
+    from sfm_shapefit.results.headline import headline_of_model, next_steps
+
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
-    points = "none"
-    if facts["num_points"]:
-        points = f"{facts['num_points']}, mean error {facts['mean_reprojection_error_px']:.2f} px"
-    return [
-        ("verdict", found.verdict.statement),
-        ("directions", found.inputs.statement),
-        ("placed", f"{facts['num_placed']} of {facts['num_images']} images"),
-        *([("not placed", shorten(left_out))] if left_out else []),
-        *_group_rows(facts),
-        *further_piece_rows(facts),
-        ("pairs", _describe_pairs(facts)),
-        ("points as nodes", f"{facts['num_points_as_nodes']} tracks helped to place the cameras"),
-        ("centers", found.placement.refined.statement()),
-        *([("adjustment", found.adjustment.statement)] if found.adjustment else []),
-        *intrinsics_rows(facts),
-        ("scale", found.gauge.statement),
-        ("points", points),
-        *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),
-        *[("warning", warning) for warning in found.warnings],
-        ("certificate", found.departure.statement),
-        ("time", describe_time(found.timings_s, flags.verbose)),
-        ("written to", f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),
-    ]
+    return Told(
+        figures=[
+            *headline_of_model(found).rows(),
+            *([("not placed", shorten(left_out))] if left_out else []),
+            *further_piece_rows(facts),
+            *intrinsics_rows(facts),
+            *[("warning", warning) for warning in found.warnings],
+        ],
+        details=[
+            ("directions", found.inputs.statement),
+            *_group_rows(facts),
+            ("pairs", _describe_pairs(facts)),
+            (
+                "points as nodes",
+                f"{counted(facts['num_points_as_nodes'], 'track')} helped to place cameras",
+            ),
+            ("centers", found.placement.refined.statement()),
+            *([("adjustment", found.adjustment.statement)] if found.adjustment else []),
+            ("scale", found.gauge.statement),
+            ("points", describe_points(facts)),
+            *([("bundle adjustment", describe_adjustment(found.adjusted))] if found.adjusted else []),
+            ("certificate", found.departure.statement),
+        ],
+        verdict=found.verdict,
+        steps=next_steps(found, out, report=flags.report),
+        timings_s=found.timings_s,
+        written=f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
+    )
 
 
 def _group_rows(facts: dict[str, Any]) -> Rows:
     groups = facts["rigid_groups"]
     if groups is None:
         return []
-    fixed = f", {groups['num_fixed']} cameras fixed" if groups["num_fixed"] else ""
+    fixed = f", {counted(groups['num_fixed'], 'camera')} fixed" if groups["num_fixed"] else ""
     inner = f"; {groups['num_inner_pairs']} pairs inside them give no constraint"
     return [("rigid groups", f"{groups['num_placed']} of {groups['num_groups']} placed{fixed}{inner}")]
 
 
 def _describe_pairs(facts: dict[str, Any]) -> str:
+    """Say what became of the pairs, in the words of `inspect`."""
+    from sfm_shapefit.directions.pair_directions import DirectionStatus
+
     counts = dict(facts["pairs"])
     contradicting, usable = counts.pop("outlier"), counts.pop("usable")
-    others = "".join(f", {count} {status.replace('_', ' ')}" for status, count in counts.items())
-    filtered = (
-        f", {facts['num_pairs_filtered']} left out by the filter" if facts["num_pairs_filtered"] else ""
-    )
-    return (
-        f"{facts['num_pairs']}: {usable} usable ({contradicting} contradict the solution{filtered}){others}"
-    )
+    filtered = facts["num_pairs_filtered"]
+    of_them = f", {filtered} left out by the filter" if filtered else ""
+    others = [f"{count} {DirectionStatus[status.upper()].value}" for status, count in counts.items()]
+    return "\n".join([f"{usable} usable ({contradicting} contradict the solution{of_them})", *others])

@@ -7,10 +7,19 @@ import typer
 
 from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import Rows, shorten
-from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, OutputPath, one_path, takes
-from sfm_shapefit.cli.frame import command_run
-from sfm_shapefit.cli.lines import describe_adjustment, describe_time, intrinsics_rows
+from sfm_shapefit.cli.flags import (
+    GroupedCommand,
+    OutArgument,
+    OutputFlags,
+    OutputPath,
+    PriorsFile,
+    one_path,
+    takes,
+)
+from sfm_shapefit.cli.frame import Told, command_run
+from sfm_shapefit.cli.lines import describe_adjustment, describe_points, intrinsics_rows
 from sfm_shapefit.locate_options import MapOptions
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.map_result import MapResult
@@ -31,42 +40,59 @@ def map_command(
     *,
     database_path: Annotated[Path | None, typer.Option("--database_path", hidden=True)] = None,
     output_path: OutputPath = None,
+    priors: PriorsFile = None,
     **given: Any,
 ) -> None:
     """Average rotations from the matches of DATABASE, then locate; write the models to OUT/0, OUT/1, ..."""
     source = one_path(database, database_path, "DATABASE")
     target = one_path(out, output_path, "OUT")
-    with command_run(MapOptions, given, target, [source]) as run:
+    with command_run(MapOptions, given, target, [source, priors], "DATABASE OUT") as run:
         from sfm_shapefit.commands.map import map_database
         from sfm_shapefit.commands.write import write_result
 
-        found = map_database(source, run.options, progress=run.progress)
+        found = map_database(source, run.options, progress=run.progress, priors=priors)
         write_result(found, target, **run.writing)
-        title = f"{found.num_images} images of {source}"
+        title = f"{counted(found.num_images, 'image')} of {source}"
         run.heed(found.models[0].located.verdict)
-        run.show(title, found.summary(), lambda: _map_table(found, target, run.flags))
+        run.show(title, found.summary(), lambda: _tell(found, target, run.flags))
 
 
-def _map_table(found: "MapResult", out: Path, flags: OutputFlags) -> Rows:
-    """Return what each model has, what was left out, and where it is."""
-    rows: Rows = [("pairs", f"{found.num_pairs} with a relative rotation")]
+def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
+    """Say what each model has, what was left out, and where it is."""
+    from sfm_shapefit.results.headline import headline_of_model, next_steps
+
+    several = len(found.models) > 1
+    figures: Rows = []
+    details: Rows = [("pairs", f"{counted(found.num_pairs, 'pair')} with a relative rotation")]
     for number, model in enumerate(found.models):
         located = model.located
-        rows += [
-            (f"model {number}", located.verdict.statement),
-            ("  placed", f"{int(located.kept.sum())} of {len(model.names)} images placed"),
-            ("  rotations", model.averaging.statement),
-            ("  points", str(located.reconstruction.num_points3D())),
-            *intrinsics_rows(located.summary(), "  "),
-            ("  scale", located.gauge.statement),
-            *([("  bundle adjustment", describe_adjustment(located.adjusted))] if located.adjusted else []),
-            *[("  warning", warning) for warning in located.warnings],
+        title = [(f"model {number}", located.verdict.statement)] if several else []
+        figures += [
+            *title,
+            *headline_of_model(located).rows(),
+            ("reprojection error", describe_points(located.summary())),
+            *intrinsics_rows(located.summary()),
+            *[("warning", warning) for warning in located.warnings],
+        ]
+        details += [
+            *title,
+            ("rotations", model.averaging.statement),
+            ("centers", located.placement.refined.statement()),
+            ("scale", located.gauge.statement),
+            *([("bundle adjustment", describe_adjustment(located.adjusted))] if located.adjusted else []),
+            ("certificate", located.departure.statement),
         ]
     left_out = [f"{name}: {reason}" for name, reason in found.left_out.items()]
-    return [
-        *rows,
-        *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
-        *[("warning", warning) for warning in found.warnings],
-        ("time", describe_time(found.timings_s, flags.verbose)),
-        ("written to", f"{out}: models in {', '.join(str(k) for k in range(len(found.models)))}, map.json"),
-    ]
+    return Told(
+        figures=[
+            *figures,
+            *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
+            *[("warning", warning) for warning in found.warnings],
+        ],
+        details=details,
+        verdict=found.models[0].located.verdict,
+        steps=next_steps(found.models[0].located, out / "0", report=flags.report),
+        timings_s=found.timings_s,
+        written=f"{out}: {'models' if several else 'a model'} in "
+        f"{', '.join(str(k) for k in range(len(found.models)))}, map.json",
+    )

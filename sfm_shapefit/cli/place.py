@@ -1,16 +1,18 @@
 """`sfm-shapefit place GRAPH OUT`, or by its other name `solve`."""
 
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import Rows, shorten
+from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
-from sfm_shapefit.cli.frame import command_run
-from sfm_shapefit.cli.lines import describe_time, further_piece_rows, name_pictures
+from sfm_shapefit.cli.frame import Told, command_run
+from sfm_shapefit.cli.lines import further_piece_rows, name_pictures
 from sfm_shapefit.refinement.options import PlacementOptions
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     from sfm_shapefit.results.result import GraphResult
@@ -66,7 +68,7 @@ def place_command(
     """Place the nodes of a bare view GRAPH of directions, or of relative poses; write tables to OUT."""
     source = one_path(graph, None, "GRAPH")
     target = one_path(out, None, "OUT")
-    with command_run(PlacementOptions, given, target, [source, rotations]) as run:
+    with command_run(PlacementOptions, given, target, [source, rotations], "GRAPH OUT") as run:
         from sfm_shapefit.commands.place import place_graph_file
         from sfm_shapefit.commands.write import write_result
         from sfm_shapefit.results.exports import export_files
@@ -81,36 +83,39 @@ def place_command(
         )
         files = export_files(found, g2o=g2o, onedsfm=onedsfm)
         write_result(found, target, further_files=files, **run.writing)
-        title = f"{found.placement.graph.num_nodes} nodes of {source}"
+        title = f"{counted(found.placement.graph.num_nodes, 'node')} of {source}"
         run.heed(found.verdict)
-        run.show(title, found.summary(), lambda: _place_table(found, target, run.flags))
+        run.show(title, found.summary(), lambda: _tell(found, target, run.flags))
 
 
-def _place_table(found: "GraphResult", out: Path, flags: OutputFlags) -> Rows:
-    """Return what was placed, what was not and why, and how certain it is."""
+def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
+    """Say what was placed, what was not and why, and how certain it is."""
+    from sfm_shapefit.results.headline import headline_of_graph
+
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
-    return [
-        ("verdict", found.verdict.statement),
-        ("directions", found.statement),
-        ("dimension", str(placement.graph.dimension)),
-        ("placed", f"{len(placement.cameras)} of {placement.graph.num_nodes} nodes"),
-        *([("not placed", shorten(left_out))] if left_out else []),
-        *further_piece_rows(facts),
-        (
-            "pairs",
-            f"{placement.num_pairs}, of which {len(placement.rejected_pairs)} contradict the solution"
-            + (
-                f" and {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
-            ),
-        ),
-        ("residuals", _describe_residuals(facts["residuals_deg"])),
-        ("locations", placement.refined.statement()),
-        *[("warning", warning) for warning in facts["warnings"]],
-        ("certificate", found.departure.statement),
-        ("time", describe_time(found.timings_s, flags.verbose)),
-        ("written to", f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}"),
-    ]
+    rejected = counted(len(placement.rejected_pairs), "pair")
+    filtered = f", {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
+    return Told(
+        figures=[
+            *headline_of_graph(found).rows(),
+            *([("not placed", shorten(left_out))] if left_out else []),
+            *further_piece_rows(facts),
+            *[("warning", warning) for warning in facts["warnings"]],
+        ],
+        details=[
+            ("directions", found.statement),
+            ("dimension", str(placement.graph.dimension)),
+            ("pairs", f"{placement.num_pairs:,}: {rejected} contradict the solution{filtered}"),
+            ("residuals", _describe_residuals(facts["residuals_deg"])),
+            ("locations", placement.refined.statement()),
+            ("certificate", found.departure.statement),
+        ],
+        verdict=found.verdict,
+        steps=[f"open {shlex.quote(str(out / 'report.html'))}"] if flags.report else [],
+        timings_s=found.timings_s,
+        written=f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
+    )
 
 
 def _describe_residuals(found: dict[str, float]) -> str:

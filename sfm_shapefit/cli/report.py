@@ -1,5 +1,6 @@
 """`sfm-shapefit report OUT` and `sfm-shapefit view OUT`: what an earlier run found, to be looked at."""
 
+import shlex
 import time
 from pathlib import Path
 from typing import Annotated
@@ -7,8 +8,8 @@ from typing import Annotated
 import typer
 
 from sfm_shapefit.cli.app import app
-from sfm_shapefit.cli.console import report_errors
-from sfm_shapefit.cli.flags import GroupedCommand, Scene, one_path
+from sfm_shapefit.cli.console import print_steps, print_table, report_errors
+from sfm_shapefit.cli.flags import GroupedCommand, Images, Scene, one_path
 
 Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder that locate or solve wrote.")]
 
@@ -19,7 +20,7 @@ Output = Annotated[Path | None, typer.Argument(metavar="OUT", help="A folder tha
     short_help="Make report.html again from the other files of OUT.",
     epilog="Example: sfm-shapefit report out --scene",
 )
-def report_command(out: Output = None, *, scene: Scene = False) -> None:
+def report_command(out: Output = None, *, scene: Scene = False, images: Images = None) -> None:
     """Write OUT/report.html anew from the other files of OUT."""
     folder = one_path(out, None, "OUT")
     with report_errors():
@@ -27,12 +28,20 @@ def report_command(out: Output = None, *, scene: Scene = False) -> None:
         from sfm_shapefit.report.mesh import write_meshes
         from sfm_shapefit.report.page import write_report
         from sfm_shapefit.report.read_back import read_output
+        from sfm_shapefit.report.sentences import shorten
+        from sfm_shapefit.report.thumbnails import thumbnails_of
 
         drawn, facts = read_output(folder)
+        pictures = thumbnails_of(drawn, images or "")
+        if pictures is not None and not pictures:
+            raise InputError(f"{images} has none of the images, such as {shorten(drawn.cameras.names[0])}")
         try:
-            write_report(drawn, facts, folder / "report.html")
+            write_report(drawn, facts, folder / "report.html", pictures)
             if scene:
                 write_meshes(drawn, folder)
+            names = ["report.html", *(["scene.glb", "scene.ply"] if scene else [])]
+            print_table(str(folder), [("written", ", ".join(names))])
+            print_steps([f"open {shlex.quote(str(folder / 'report.html'))}"])
         except OSError as error:
             what = f"{folder} cannot be written ({error.strerror})"
             raise InputError(f"{what}; copy it elsewhere first") from error

@@ -32,6 +32,7 @@ from sfm_shapefit.adjustment import (
     AdjustmentProblem,
     adjust,
     choose_loss_scale_px,
+    frames_not_gained,
     reprojection_errors_px,
 )
 from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
@@ -42,6 +43,7 @@ from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import (
+    KnownCenters,
     add_points,
     collect_tracks,
     read_frames,
@@ -86,6 +88,16 @@ UNREFINED = RefinedLenses({}, ())
 """Where no lens was free."""
 
 
+class Uncertainty(NamedTuple):
+    """How well an adjustment knows centers and scale, see `adjustment.shared_errors`."""
+
+    covariances: Mapping[int, FloatArray] = {}
+    """(3, 3) of the center of each image by its id, in squared units of the seed; an image of a rig has its
+    frame's. Empty where they are not known."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale; None where it is not known, or nothing tells the scale."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Adjusted:
     """A bundle adjustment's answer and how it went."""
@@ -100,9 +112,8 @@ class Adjusted:
     """Whether the last solve met its tolerance within its limit of 100 steps."""
     iterations: int
     """Steps of all solves together."""
-    covariances: Mapping[int, FloatArray]
-    """(3, 3) of the center of each image by its id, in squared units of the seed, see
-    `adjustment.shared_errors`; an image of a rig has its frame's. Empty with Ceres, and for large models."""
+    uncertainty: Uncertainty
+    """Nothing is known with Ceres, and of large models."""
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
 
@@ -117,8 +128,7 @@ class AdjustedPlacement:
     """How the given rotations were treated."""
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
-    covariances: Mapping[int, FloatArray]
-    """As of `Adjusted`."""
+    uncertainty: Uncertainty
     lenses: RefinedLenses = UNREFINED
     """What became of lenses that were free."""
 
@@ -141,23 +151,17 @@ class AdjustedPlacement:
         )
 
 
-class GivenRotations(NamedTuple):
-    """The rotations of a model, and how an adjustment treats them."""
+class GivenPoses(NamedTuple):
+    """What is known of poses and lenses beside the pixels, and how an adjustment treats it."""
 
-    weight: RotationWeight
-    model: pycolmap.Reconstruction
-
-
-class Given(NamedTuple):
-    """What was given beside a seed, and how an adjustment treats it."""
-
-    rotations: GivenRotations | None = None
-    """None: all rotations are free."""
-    lenses: FreeLenses | None = None
-    """None: intrinsics stay what they are, to the bit."""
-
-
-NOTHING_GIVEN = Given()
+    weight: RotationWeight = _FREE
+    """Of the model's rotations."""
+    model: pycolmap.Reconstruction | None = None
+    """Whose rotations were given; None: those of the seed."""
+    centers: KnownCenters | None = None
+    """Measured otherwise, which pull at the frames."""
+    lenses: FreeLenses = ALL_HELD
+    """Those that may change; all others stay what they are, to the bit."""
 
 
 def bundle_adjust(
@@ -167,7 +171,7 @@ def bundle_adjust(
     *,
     adjuster: Adjuster = "own",
     fixed_frames: Collection[int] = (),
-    given: Given = NOTHING_GIVEN,
+    given: GivenPoses | None = None,
 ) -> Adjusted:
     """Adjust poses and points together, starting from the poses of `seed`, which is not changed.
 
@@ -177,34 +181,34 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: rotations that were given, all of which are free with Ceres, and lenses that may change.
+        given: what is known of poses, and how it is treated; nothing if None, and with Ceres. Lenses that may
+            change are free with both.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
-        frames and rigs do not hold stays near the seed's: by our own, the centers' best similarity to the
-        seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs stay what they
-        are, and intrinsics that are not free to the bit.
+        frames, rigs and known centers do not hold stays near the seed's: by our own, the centers' best
+        similarity to the seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs
+        stay what they are, and intrinsics that are not free to the bit.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or Ceres diverges.
     """
-    structure_options = structure_options or StructureOptions()
+    structure_options, given = structure_options or StructureOptions(), given or GivenPoses()
     if adjuster == "ceres":
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
         unfiltered, iterations, converged = adjust_by_ceres(
             start, tracks, structure_options, fixed_frames, given.lenses
         )
-        covariances: Mapping[int, FloatArray] = {}
-        doubts = {} if given.lenses is None else given.lenses.doubts
-        refined = RefinedLenses(dict.fromkeys(doubts, math.nan), ())
+        uncertainty = Uncertainty()
+        refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
     else:
-        run = _Run(seed, tracks, structure_options, fixed_frames, given.lenses)
-        if given.rotations is not None:
-            run.weight = given.rotations.weight
-            run.given = rotations_of_frames(given.rotations.model, run.frames.frame_ids)
+        run = _Run(seed, tracks, structure_options, fixed_frames, given)
+        run.weight = given.weight
+        if given.model is not None:
+            run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
-        iterations, converged, covariances = run.iterations, run.converged, run.covariances(last)
+        iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
         refined = run.refined
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
@@ -213,7 +217,7 @@ def bundle_adjust(
         final_error_px=answer.compute_mean_reprojection_error(),
         converged=converged,
         iterations=iterations,
-        covariances=covariances,
+        uncertainty=uncertainty,
         lenses=refined,
     )
 
@@ -224,7 +228,7 @@ def adjust_thinly(
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
-    lenses: FreeLenses | None = None,
+    lenses: FreeLenses = ALL_HELD,
     thorough: bool = False,
 ) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
@@ -237,8 +241,8 @@ def adjust_thinly(
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None. Observations may miss by four times their limit.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        lenses: those that change with the poses; none if None. One whose focal length the points leave open
-            gets what was given back, and the poses are adjusted again.
+        lenses: those that change with the poses. One whose focal length the points leave open gets what was
+            given back, and the poses are adjusted again.
         thorough: whether all points follow where a lens has changed: a shape bends with a focal length that
             few points leave a thousandth off. Up to 2,000 frames.
 
@@ -248,7 +252,8 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, lenses)
+    given = GivenPoses(lenses=lenses)
+    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, given)
     adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
     if thorough and run.lenses.doubts and adjusted.num_frames <= _MOST_FRAMES:
         _, _, adjusted = run.adjust_by_all_points()
@@ -257,7 +262,7 @@ def adjust_thinly(
         reconstruction=poses,
         weight=_FREE,
         errors=None,
-        covariances=run.covariances(adjusted),
+        uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
     )
 
@@ -269,7 +274,7 @@ def adjust_placement(
     weight: RotationWeight | None,
     *,
     fixed_frames: Collection[int] = (),
-    lenses: FreeLenses | None = None,
+    given: GivenPoses | None = None,
 ) -> AdjustedPlacement:
     """Adjust placed cameras whose rotations were given, on all tracks at once.
 
@@ -279,12 +284,12 @@ def adjust_placement(
         structure_options: filters.
         weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        lenses: as in `adjust_thinly`.
+        given: centers measured otherwise, which pull at the frames, and lenses that may change.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run, errors = _Run(seed, tracks, structure_options, fixed_frames, lenses), None
+    run, errors = _Run(seed, tracks, structure_options, fixed_frames, given or GivenPoses()), None
     if run.lenses.doubts:  # points are found, and rotations judged, with the lenses that come out
         run.repeat_with_known_lenses(run.adjust_twice_thinly)
         run.frames = replace(run.frames, rotations=run.start.rotations)
@@ -297,13 +302,16 @@ def adjust_placement(
         weight = errors.weight()
     run.weight = weight
     adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
-    run.judge_lenses(adjusted)
+    if run.lenses.doubts:
+        run.judge_lenses(adjusted)
+    else:
+        adjusted = run.return_frames(problem, adjusted)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
         reconstruction=poses,
         weight=weight,
         errors=errors,
-        covariances=run.covariances(adjusted),
+        uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
     )
 
@@ -317,11 +325,10 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
-        lenses: FreeLenses | None = None,
+        given: GivenPoses,
     ) -> None:
-        self.lenses = lenses or ALL_HELD
-        self.refined = UNREFINED
-        self.start = self.frames = read_frames(seed, fixed_frames)
+        self.lenses, self.refined = given.lenses, UNREFINED
+        self.start = self.frames = read_frames(seed, fixed_frames, given.centers)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
@@ -425,19 +432,28 @@ class _Run:
         self.converged = adjusted.converged
         return adjusted.problem
 
-    def covariances(self, problem: AdjustmentProblem) -> dict[int, FloatArray]:
-        """Return the covariance of the center of each image by its id, at the optimum last solved for."""
+    def return_frames(self, before: AdjustmentProblem, after: AdjustmentProblem) -> AdjustmentProblem:
+        """Put the frames back that gained nothing by moving, and return the problem with them."""
+        returned = frames_not_gained(before, after, self.loss_scale_px)
+        rotations = np.where(returned[:, None, None], before.rotations, after.rotations)
+        centers = np.where(returned[:, None], before.centers, after.centers)
+        self.frames = replace(self.frames, rotations=rotations, centers=centers)
+        return replace(after, rotations=rotations, centers=centers)
+
+    def uncertainty(self, problem: AdjustmentProblem) -> Uncertainty:
+        """Return how well centers and scale are known at the optimum last solved for."""
         if problem.num_frames > _MOST_FRAMES:
-            return {}
+            return Uncertainty()
         options = AdjustmentOptions(
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
         try:
             found = estimate_center_errors(problem, options, self.weight.open_rad)
         except UnsolvableError:
-            return {}
+            return Uncertainty()
         of_camera = found.covariances[self.frames.frame_of_camera]
-        return {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
+        by_image = {self.frames.image_ids[k]: of_camera[c] for c, k in enumerate(self.frames.images.tolist())}
+        return Uncertainty(by_image, found.scale_sigma)
 
     def choose_scale(self, problem: AdjustmentProblem) -> float:
         """Return the scale of the last loss that the errors of a problem call for, in pixel thresholds."""

@@ -34,7 +34,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.errors import InputError
-from sfm_shapefit.formats.lines import refuse_irregular_file
+from sfm_shapefit.formats.lines import refuse_database, refuse_irregular_file
 from sfm_shapefit.jit import inner_kernel, kernel
 
 REQUIRED_FILES = ("cameras", "images", "points3D")
@@ -97,6 +97,7 @@ def model_suffix(folder: Path) -> str:
     """
     try:
         if folder.exists() and not folder.is_dir():
+            refuse_database(folder)
             raise InputError(f"{folder} is a file; give the folder that holds cameras, images and points3D")
         present = {entry.name for entry in folder.iterdir()}
     except FileNotFoundError:

@@ -5,14 +5,17 @@ its keypoints in "world" axes are rays in camera axes. Intrinsics are those of t
 COLMAP's guess (focal length 1.2 times the larger side) where `prior_focal_length` is not set.
 """
 
+import itertools
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
+from sfm_shapefit.colmap.database_rigs import DatabaseRigs, read_rigs
 from sfm_shapefit.errors import InputError
 
 # COLMAP's ids are 32-bit, and this one is none.
@@ -27,8 +30,16 @@ class UnposedImages:
 
     reconstruction: pycolmap.Reconstruction
     """All cameras and images; every rotation is the identity, every center the origin."""
-    has_rigs: bool
-    """Whether the database ties several cameras into a rig; the model here does not."""
+    rigs: DatabaseRigs
+    """Which of the images were taken together; the model here does not have them."""
+
+    def frames(self, image_ids: list[int]) -> tuple[IntArray, FloatArray]:
+        """Return the frame of each image (n,), 0, 1, ..., and the sensor_from_rig of its camera (n, 3, 3)."""
+        known, places = self.reconstruction, self.rigs.place_of_image
+        frame_ids = [places[i].frame_id if i in places else i for i in image_ids]
+        sensors = [self.rigs.sensor_from_rig(known.image(i)).rotation.matrix() for i in image_ids]
+        _, labels = np.unique(frame_ids, return_inverse=True)
+        return labels.ravel().astype(np.int64), np.array(sensors)
 
 
 def read_images(path: Path) -> UnposedImages:
@@ -42,9 +53,6 @@ def read_images(path: Path) -> UnposedImages:
     cameras, images = (
         readonly_rows(path, table, {columns: f"SELECT {', '.join(columns)} FROM {table} ORDER BY 1"})
         for table, columns in (("cameras", camera_columns), ("images", image_columns))
-    )
-    has_rigs = bool(
-        readonly_rows(path, "rig_sensors", {("rig_id",): "SELECT rig_id FROM rig_sensors LIMIT 1"})
     )
     if len(images) < 2:
         raise InputError(
@@ -68,22 +76,77 @@ def read_images(path: Path) -> UnposedImages:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    return UnposedImages(reconstruction=model, has_rigs=has_rigs)
+    return UnposedImages(reconstruction=model, rigs=read_rigs(path, model))
 
 
 def pose_at_origin(
-    images: pycolmap.Reconstruction, image_ids: list[int], rotations: FloatArray
+    images: UnposedImages, image_ids: list[int], rotations: FloatArray
 ) -> pycolmap.Reconstruction:
-    """Return a new model of some images with rotations (k, 3, 3) cam_from_world, and all centers 0."""
+    """Return a new model of k images with rotations (k, 3, 3) cam_from_world, all frames at the origin.
+
+    Images of a rig are in the frames of that rig, whose rotation is that of their first image.
+    """
+    known, rigs = images.reconstruction, images.rigs
     model = pycolmap.Reconstruction()
-    for camera_id in sorted({images.image(i).camera_id for i in image_ids}):
-        model.add_camera_with_trivial_rig(images.camera(camera_id))
-    for image_id, rotation in zip(image_ids, rotations, strict=True):
-        known = images.image(image_id)
-        image = pycolmap.Image(name=known.name, camera_id=known.camera_id, image_id=image_id)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.zeros(3))
-        model.add_image_with_trivial_frame(image, pose)
+    rig_ids = _add_cameras(model, images, image_ids)
+    members: dict[int, list[pycolmap.Image]] = {}
+    for image_id in image_ids:
+        image = known.image(image_id)
+        bare = pycolmap.Image(name=image.name, camera_id=image.camera_id, image_id=image_id)
+        place = rigs.place_of_image.get(image_id)
+        members.setdefault(image_id if place is None else place.frame_id, []).append(bare)
+    rotation_of = dict(zip(image_ids, rotations, strict=True))
+    for frame_id, together in members.items():
+        first = together[0]
+        rig_from_sensor = rigs.sensor_from_rig(first).rotation.inverse()
+        rotation = rig_from_sensor * pycolmap.Rotation3d(rotation_of[first.image_id])
+        pose = pycolmap.Rigid3d(rotation, np.zeros(3))
+        place = rigs.place_of_image.get(first.image_id)
+        if place is None:
+            model.add_image_with_trivial_frame(first, pose)
+        else:
+            _add_frame(model, pycolmap.Frame(frame_id=frame_id, rig_id=rig_ids[place.rig_id]), together, pose)
     return model
+
+
+def _add_cameras(
+    model: pycolmap.Reconstruction, images: UnposedImages, image_ids: list[int]
+) -> dict[int, int]:
+    """Add the cameras of some images and their rigs; return the ids that these got."""
+    known, rigs = images.reconstruction, images.rigs
+    used = {rigs.place_of_image[i].rig_id for i in image_ids if i in rigs.place_of_image}
+    in_rigs = {camera_id for rig_id in used for camera_id in rigs.camera_ids(rig_id)}
+    for camera_id in sorted({known.image(i).camera_id for i in image_ids} - in_rigs):
+        model.add_camera_with_trivial_rig(known.camera(camera_id))
+    for camera_id in sorted(in_rigs):
+        model.add_camera(known.camera(camera_id))
+    rig_ids = _free_ids(used, model.rigs)
+    for rig_id in sorted(used):
+        model.add_rig(rigs.renumbered(rig_id, rig_ids[rig_id]))
+    return rig_ids
+
+
+def _add_frame(
+    model: pycolmap.Reconstruction,
+    frame: pycolmap.Frame,
+    images: list[pycolmap.Image],
+    pose: pycolmap.Rigid3d,
+) -> None:
+    """Add a frame of a rig at a pose, and its images."""
+    for image in images:
+        frame.add_data_id(image.data_id)
+        image.frame_id = frame.frame_id
+    frame.rig_from_world = pose
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    model.register_frame(frame.frame_id)
+
+
+def _free_ids(wanted: set[int], taken: Collection[int]) -> dict[int, int]:
+    """Return an id for each of the wanted ones: itself unless it is taken."""
+    free = (i for i in itertools.count(1) if i not in taken and i not in wanted)
+    return {i: next(free) if i in taken else i for i in sorted(wanted)}
 
 
 def rotations_of(model: pycolmap.Reconstruction, image_ids: list[int]) -> tuple[FloatArray, BoolArray]:

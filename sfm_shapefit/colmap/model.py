@@ -36,6 +36,9 @@ UInt64Array = npt.NDArray[np.uint64]
 PYCOLMAP_ERRORS = (ValueError, IndexError, KeyError, RuntimeError, MemoryError)
 """What pycolmap raises on bad data."""
 
+_ONE_TO_ONE = ("SIMPLE_PINHOLE", "PINHOLE")
+# By how much a pixel may miss itself over its ray and back; solving for the ray leaves 1e-8.
+_ROUND_TRIP_PX = 0.01
 # Sums of squares of larger coordinates overflow; these count as not finite.
 _LARGEST_COORDINATE = 1e100
 _POINT3D_ID = attrgetter("point3D_id")
@@ -196,9 +199,25 @@ def world_rays(model: PosedModel, image: int, xy: FloatArray) -> FloatArray:
     Returns:
         (k, 3) unit vectors; rows of NaN for pixels that the camera model maps to no ray.
     """
-    camera = model.camera(image)
-    rays = np.asarray(camera.cam_ray_from_img(np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2)))
+    rays = camera_rays(model.camera(image), np.ascontiguousarray(xy, dtype=np.float64).reshape(-1, 2))
     return normalized(rays @ model.rotations[image])
+
+
+def camera_rays(camera: pycolmap.Camera, xy: FloatArray) -> FloatArray:
+    """Return the unit rays (k, 3) of pixels (k, 2) in camera axes; NaN for those that are no image of a ray.
+
+    pycolmap folds rays of a fisheye beyond 90 degrees back: 58 degrees where 90.3 is right. Such a ray has
+    its image elsewhere, by which it is told.
+    """
+    rays = np.asarray(camera.cam_ray_from_img(xy), dtype=np.float64).reshape(-1, 3)
+    if len(rays) == 0 or camera.model_name in _ONE_TO_ONE:
+        return rays
+    with np.errstate(invalid="ignore"):
+        ahead = rays[:, 2] > 0.0
+        back = np.asarray(camera.img_from_cam(rays), dtype=np.float64).reshape(-1, 2)
+        false = ahead & ~(np.abs(back - xy).max(axis=1) <= _ROUND_TRIP_PX)
+    rays[false] = np.nan
+    return rays
 
 
 def track_matches(model: PosedModel, max_matches_per_batch: int = 2_000_000) -> Iterator[MatchBatch]:

@@ -19,7 +19,7 @@ from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, text_of
-from sfm_shapefit.placement.gauge import PositionPriors
+from sfm_shapefit.placement.gauge import Datum, PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
 _SENSOR_IS_CAMERA = 0
@@ -128,13 +128,14 @@ def _priors(
     """Return priors in Cartesian axes."""
     cameras = sorted(found)
     positions, covariances = (np.array([found[k][part] for k in cameras]) for part in (0, 1))
-    statement = source
+    statement, datum = source, None
     if geodetic:
         if (np.abs(positions[:, 0]) > 90.0).any() or (np.abs(positions[:, 1]) > 360.0).any():
             raise InputError(f"{source}: a latitude or longitude is out of range; give degrees")
-        latitude, longitude, altitude = np.median(positions, axis=0).tolist()
+        datum = Datum(*np.median(positions, axis=0).tolist())
         transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-        positions = np.asarray(transform.ellipsoid_to_enu(positions, latitude, longitude, altitude))
+        positions = np.asarray(transform.ellipsoid_to_enu(positions, *datum))
+        latitude, longitude, altitude = datum
         statement += (
             f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
@@ -143,4 +144,5 @@ def _priors(
         positions=positions,
         covariances=covariances,
         statement=statement,
+        datum=datum,
     )

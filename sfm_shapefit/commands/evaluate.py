@@ -16,20 +16,23 @@ def evaluate(
     reference: "pycolmap.Reconstruction | Path | str",
     *,
     thresholds: Sequence[float] = (),
+    trajectory: bool = False,
 ) -> Evaluation:
     """Return position and rotation errors of a model against a reference, after robust alignment.
 
     Args:
         reconstruction, reference: reconstructions or model folders; cameras are matched by name.
-        thresholds: position errors, in the reference's units, at which recall is wanted too.
+        thresholds: position errors, in the reference's units, at which recall and its AUC are wanted too.
+        trajectory: whether ATE and RPE are wanted, of the common images in the order of their names.
 
     Returns:
         `position` and `rotation_deg`, each with median, mean, rms and max, in the reference's units and in
-        degrees; `recalls`, `rows()` per camera, names of `missing` ones, and warnings.
+        degrees; `relative_pose_aucs`, `recalls`, `trajectory`, the `worst()` cameras, `rows()` per camera,
+        names of `missing` ones, and warnings.
 
     Raises:
         InputError: if a model cannot be read, or they have fewer than three cameras in common.
     """
     models = read_model(reconstruction), read_model(reference)
     poses, truth = (CameraPoses(model.names, model.rotations, model.centers) for model in models)
-    return evaluate_poses(poses, truth, thresholds)
+    return evaluate_poses(poses, truth, thresholds, trajectory=trajectory)

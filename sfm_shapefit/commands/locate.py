@@ -3,7 +3,7 @@
 Each stage is one function from values to a new value; the input is never changed.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from contextlib import suppress
 from pathlib import Path
@@ -11,10 +11,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
+from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import Given, GivenRotations
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, Uncertainty
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.commands.stages.adjustment import adjust_placed, turned_deg, with_covariances
+from sfm_shapefit.commands.stages.adjustment import (
+    adjust_placed,
+    pull_cameras,
+    turned_deg,
+    weight_of_rotations,
+    with_uncertainty,
+)
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
@@ -33,10 +41,9 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.placement.gauge import PositionPriors
+from sfm_shapefit.placement.gauge import PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
@@ -116,10 +123,10 @@ class Locating(NamedTuple):
     centers: FloatArray | None = None
     """(n, 3) where an adjustment has the images, in any scale and from any origin; NaN for those it lacks.
     None if there was no adjustment."""
-    covariances: Mapping[int, FloatArray] | None = None
-    """(3, 3) of these centers by image id, in their squared units."""
+    uncertainty: Uncertainty = Uncertainty()
+    """Of these centers, in their units."""
     intrinsics: Intrinsics = NO_DOUBTS
-    """Which of them are in doubt, and what became of them so far."""
+    """Which of the images' are in doubt, and what became of them so far."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -140,36 +147,40 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             placement = move_cameras(placement, placed, options)
             there = np.isfinite(centers).all(axis=1)
             scale = median_spread(centers[there]) / median_spread(placed[there])
-            placement = with_covariances(placement, model, known.covariances or {}, scale)
-        rule = GaugeRule(model, rigid, options, known.priors)
+            placement = with_uncertainty(placement, model, known.uncertainty, scale)
+        given = GivenPoses(lenses=known.intrinsics.free)
+        located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
+        pulls = known.priors is not None and options.refine_with_priors
+        if known.priors is not None and pulls:
+            located = pull_cameras(model, located, known.priors, options)
+            placement = located.placement
     adjustment, intrinsics = None, known.intrinsics
-    given = Given(lenses=intrinsics.free)
-    if known.centers is None and options.adjusts_cameras(len(placement.cameras)):
+    is_adjusted = known.centers is not None and not pulls
+    if not is_adjusted and options.adjusts_cameras(len(placement.cameras)):
+        weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
-            located = _choose(placement, rule)._replace(given=given)
-            after = adjust_placed(source, directions, located, options, clock)
+            after = adjust_placed(source, directions, located, options, clock, weight)
             source, directions, placement, adjustment = after
             intrinsics = intrinsics.after(adjustment.lenses)
-            given = Given(GivenRotations(adjustment.weight, model.reconstruction), intrinsics.free)
+            given = located.given._replace(
+                weight=adjustment.weight, model=model.reconstruction, lenses=intrinsics.free
+            )
+            located = located._replace(given=given)
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
         focal_doubts = question_focal_lengths(source, directions, options)
         placement = doubt_cameras(placement, directions, relative, source.model, options)
-        located = _choose(placement, rule)._replace(given=given)
-        if known.priors is not None and options.refine_with_priors:
-            placement, gauge = pull_to_priors(placement, located.gauge, known.priors, options)
-            placement = doubt_cameras(placement, directions, relative, source.model, options)
-            kept = select_trusted(placement, options.min_trust)
-            located = Located(placement, kept, gauge, rigid.fixed, rule)
+        located = _judge_again(located, placement, options.min_trust)
     with clock("further pieces"):
         further = place_further_pieces(source, placement, options)
     seeded = build_seeded_model(source, located, options, clock, known.executor)
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
-        placement = with_covariances(placement, model, seeded.adjusted.covariances, scale)
+        placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
         intrinsics = intrinsics.after(seeded.adjusted.lenses)
-    located = located._replace(placement=placement, gauge=seeded.gauge)
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
+    gauge = tell_scale(seeded.gauge, placement.scale_sigma)
+    located = located._replace(placement=placement, gauge=gauge)
     warnings = (
         *focal_warnings(source.model, focal_doubts, intrinsics.refined.undetermined),
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
@@ -185,7 +196,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
         agreeing_observations=seeded.agreeing_observations,
-        gauge=seeded.gauge,
+        gauge=gauge,
         adjusted=seeded.adjusted,
         adjustment=adjustment,
         turned_deg=None if adjustment is None else turned_deg(model.rotations, source.model.rotations),
@@ -204,6 +215,16 @@ def _choose(placement: Placement, rule: GaugeRule) -> Located:
     kept = select_trusted(placement, rule.options.min_trust) | fixed[placement.cameras]
     gauge = rule.choose(placement.cameras[kept], placement.locations[kept], placement.unit)
     return Located(placement, kept, gauge, fixed, rule)
+
+
+def _judge_again(located: Located, placement: Placement, min_trust: float) -> Located:
+    """Return what is in the output by the trust of another placement, in a gauge that is found anew.
+
+    Where priors hold the gauge it stays.
+    """
+    if located.given.centers is not None or located.rule is None:
+        return located._replace(placement=placement, kept=select_trusted(placement, min_trust))
+    return _choose(placement, located.rule)._replace(given=located.given)
 
 
 def _collect_warnings(

@@ -11,11 +11,12 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
@@ -24,23 +25,23 @@ from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
-from sfm_shapefit.commands.stages.gauge_choice import read_priors
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
-from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
+from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
-
-if TYPE_CHECKING:
-    import pycolmap
+from sfm_shapefit.wording import counted
 
 # A model is warned of if a smaller share of its pairs agrees with its rotations (castle-P30: 0.97, lego100:
 # 0.89), an image if a smaller share of its own does.
@@ -54,15 +55,19 @@ def map_database(
     options: MapOptions | None = None,
     *,
     progress: Progress | None = None,
+    priors: Path | str | None = None,
     **overrides: Any,
 ) -> MapResult:
     """Place the images of a COLMAP database: average rotations, then `locate`, for each component.
 
     Args:
-        database: with keypoints and two-view geometries; it is never changed. Intrinsics are the database's.
+        database: with keypoints and two-view geometries, or the folder that holds it as database.db; it is
+            never changed. Intrinsics are the database's.
         options: settings, see `help(MapOptions)`; defaults if None.
         **overrides: single options by name: `map_database(database, bundle_adjust=True)`.
         progress: called as stages advance.
+        priors: a table of position priors, as of `locate`. Components with fewer than two keep the scale
+            "unit".
 
     Returns:
         `models`, most cameras first, each with `located` (see `locate`), the rotations it started from and
@@ -73,11 +78,13 @@ def map_database(
         UnsolvableError: if no component of three images or more can be placed.
     """
     options = merge_options(options, MapOptions, overrides)
-    path, clock = Path(database), Clock(progress) if progress else Clock()
+    path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     with clock("read"):
         images = read_images(path)
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
-    run = _Run(options, clock, path, intrinsics, unposed)
+        inputs = choose_inputs(images.reconstruction, path, options.directions)
+        positions = read_priors(unposed, inputs, options, priors)
+    run = _Run(options, clock, path, images, unposed, intrinsics, positions)
     relative = run.measure()
     if options.adjust and intrinsics.free.doubts:
         known = run.refine_intrinsics(relative)
@@ -86,21 +93,26 @@ def map_database(
             relative = run.measure()
     scores = score_triplets(unposed.num_images, relative).tolist()
     run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
-    models, reasons = [], dict.fromkeys(range(unposed.num_images), _UNMATCHED)
-    for members, averaging in run.average_components(relative, reasons):
+    frame_of_image, _ = images.frames(unposed.image_ids.tolist())
+    models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
+    for frames, members, averaging in run.average_images(relative, reasons):
         try:
             found = run.locate_component(members, averaging)
         except UnsolvableError as error:
-            reasons |= dict.fromkeys(members.tolist(), f"its component cannot be placed: {error}")
+            reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
         models.append(MappedModel(located=found, averaging=averaging, names=names))
-        for k in members.tolist():
+        for k in frames.tolist():
             del reasons[k]
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
-    left_out = {unposed.names[k]: reason for k, reason in sorted(reasons.items())}
+    left_out = {
+        name: reasons[frame]
+        for name, frame in zip(unposed.names, frame_of_image.tolist(), strict=True)
+        if frame in reasons
+    }
     return MapResult(
         database=path,
         options=options,
@@ -113,16 +125,31 @@ def map_database(
     )
 
 
+def database_in(path: Path) -> Path:
+    """Return the database of a folder, which is its database.db; any other path is that of a database.
+
+    Raises:
+        InputError: if the folder has none.
+    """
+    if not path.is_dir():
+        return path
+    if not (path / "database.db").is_file():
+        raise InputError(f"{path} is a folder without a database.db; give the database file itself")
+    return path / "database.db"
+
+
 class _Run(NamedTuple):
     """What all components of a run have in common; the clock adds up the time that they take."""
 
     options: MapOptions
     clock: Clock
     database: Path
-    intrinsics: Intrinsics
-    """Which of them are in doubt."""
+    images: UnposedImages
     unposed: PosedModel
     """The images as a model."""
+    intrinsics: Intrinsics
+    """Which of theirs are in doubt."""
+    priors: PositionPriors | None
     triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
     """Of the pairs with a relative rotation."""
 
@@ -140,29 +167,38 @@ class _Run(NamedTuple):
         ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
         in several components the one with most images counts.
         """
-        found: dict[int, tuple[float, ...]] = {}
-        for members, averaging in self.average_components(relative, {}):
-            image_ids = self.unposed.image_ids[members].tolist()
-            model = _pose(self.unposed.reconstruction, image_ids, averaging.rotations)
-            inputs = choose_inputs(model.reconstruction, self.database, self.options.directions)
-            with open_source(model, inputs, self.options) as source, suppress(UnsolvableError):
+        found: dict[int, list[float]] = {}
+        for _, members, averaging in self.average_images(relative, {}):
+            options = self._options_of(members, has_priors=False)
+            model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
+            inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+            rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
+            with open_source(model, inputs, options) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
-                    adjusted = adjust_first_placement(
-                        source, self.options, self.clock, self.intrinsics.free, thorough=False
-                    ).adjusted
-                for camera in adjusted.lenses.sigmas:
-                    found.setdefault(camera, tuple(adjusted.reconstruction.camera(camera).params))
+                    free = self.intrinsics.free
+                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
+                found = first.parameters() | found
         return with_parameters(self.unposed, found)
 
-    def average_components(
+    def average_images(
         self, relative: RelativeRotations, reasons: dict[int, str]
-    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
-        """Yield the images of each component that got rotations, ascending, and those rotations.
+    ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
+        """Yield the frames of each component, and its images with their rotations."""
+        frame_of_image, sensor_rotations = self.images.frames(self.unposed.image_ids.tolist())
+        of_frames = relative_rotations_of_frames(relative, frame_of_image, sensor_rotations)
+        for frames, averaged in self.average_components(int(frame_of_image.max()) + 1, of_frames, reasons):
+            members = np.flatnonzero(np.isin(frame_of_image, frames))
+            places = np.searchsorted(frames, frame_of_image[members])
+            yield frames, members, averaged.turned(places, sensor_rotations[members])
 
-        Why an image belongs to none is written to `reasons`.
+    def average_components(
+        self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
+    ) -> Iterator[tuple[IntArray, AveragedRotations]]:
+        """Yield the frames of each component that got rotations, ascending, and those rotations.
+
+        Why a frame belongs to none is written to `reasons`.
         """
-        num_images = self.unposed.num_images
-        waiting = _group_images(num_images, relative.pairs)
+        waiting = _group_frames(num_frames, relative.pairs)
         while waiting:
             members = waiting.pop(0)
             if len(members) < self.options.min_model_size:
@@ -188,7 +224,7 @@ class _Run(NamedTuple):
             reasons |= dict.fromkeys(left.tolist(), "its relative rotations contradict those of the others")
             if len(left) < len(members):
                 rest = inside.pairs[np.isin(inside.pairs, left).all(axis=1)]
-                among = _group_images(num_images, rest)
+                among = _group_frames(num_frames, rest)
                 waiting = [*waiting, *(group for group in among if len(group) > 1)]
             kept = answer.registered
             if kept.sum() >= self.options.min_model_size:
@@ -197,30 +233,26 @@ class _Run(NamedTuple):
     def locate_component(self, members: IntArray, averaging: AveragedRotations) -> LocateResult:
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
-        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
-        known = self.options.known_distance
-        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
-            # The known distance belongs to another component.
-            known, settings["known_distance"] = None, None
-            settings["scale"] = "auto"
-        if known is None and settings["scale"] in ("auto", "input"):
-            # There is no input whose scale could be taken.
-            settings["scale"] = "unit"
-        options = LocateOptions(**settings)
-        model = _pose(self.unposed.reconstruction, image_ids, averaging.rotations)
+        priors = None if self.priors is None else self.priors.of(members)
+        if priors is not None and len(priors.cameras) < FEWEST_PRIORS:
+            priors = None
+        options = self._options_of(members, has_priors=priors is not None)
+        model = self._pose(image_ids, averaging.rotations)
         inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+        rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
-            source, centers, covariances, intrinsics = averaged, None, None, self.intrinsics
+            source, centers, uncertainty = averaged, None, Uncertainty()
+            intrinsics = self.intrinsics
             if self.options.adjust:
                 with self.clock("first placement"):
-                    first = adjust_first_placement(averaged, options, self.clock, intrinsics.free)
-                centers, covariances = first.centers, first.adjusted.covariances
+                    rule = GaugeRule(model, rigid, options, priors)
+                    first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
+                centers, uncertainty = first.centers, first.adjusted.uncertainty
                 intrinsics = intrinsics.after(first.adjusted.lenses)
-                source = averaged.turned(_pose(first.adjusted.reconstruction, image_ids, first.rotations))
-            priors = read_priors(source.model, inputs, options, None)
-            rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
+                source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
+                rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
             locating = Locating(
-                inputs, rigid, priors, centers=centers, covariances=covariances, intrinsics=intrinsics
+                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics
             )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
@@ -228,15 +260,39 @@ class _Run(NamedTuple):
         scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
         return replace(found, triplet_scores=scores)
 
+    def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
+        """Return the options of one component, whose scale is what is known of its own images."""
+        settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
+        known = self.options.known_distance
+        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
+            # The known distance belongs to another component.
+            known, settings["known_distance"] = None, None
+            settings["scale"] = "auto"
+        if not has_priors:
+            settings["refine_with_priors"] = False
+        has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
+        if (
+            known is None
+            and not has_priors
+            and not has_rigs
+            and settings["scale"] in ("auto", "input", "prior")
+        ):
+            # There is no input whose scale could be taken.
+            settings["scale"] = "unit"
+        return LocateOptions(**settings)
 
-def _pose(images: "pycolmap.Reconstruction", image_ids: list[int], rotations: FloatArray) -> PosedModel:
-    """Return some images of a model with these rotations and all centers 0."""
-    return read_model(pose_at_origin(images, image_ids, rotations))
+    def _pose(
+        self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None
+    ) -> PosedModel:
+        """Return images with these rotations and all centers 0, and parameters that were found of cameras."""
+        known = with_parameters(self.unposed, found or {})
+        images = replace(self.images, reconstruction=known.reconstruction)
+        return read_model(pose_at_origin(images, image_ids, rotations))
 
 
-def _group_images(num_images: int, pairs: IntArray) -> list[IntArray]:
-    """Return the connected components, ascending, the largest first; single images are components too."""
-    labels = connected_components(num_images, pairs)
+def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
+    """Return the connected components, ascending, the largest first; single frames are components too."""
+    labels = connected_components(num_frames, pairs)
     groups = np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels))[:-1])
     return sorted(groups, key=lambda group: (-len(group), int(group[0])))
 
@@ -255,8 +311,12 @@ def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int,
 
 def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[str, str]) -> Iterator[str]:
     """Yield what the user should know, a sentence each."""
-    if images.has_rigs:
-        yield "the database's rigs are not used: every camera is placed on its own"
+    if images.rigs.uncalibrated:
+        yield (
+            f"{len(images.rigs.uncalibrated)} rigs of the database are not used, rig "
+            f"{images.rigs.uncalibrated[0]} for one, because a sensor has no pose in them or an image no "
+            "frame: their cameras are placed one by one"
+        )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements
         if share < _ALARMING_SHARE:
@@ -268,9 +328,10 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
         if len(doubtful):
             worst = model.names[int(doubtful[np.argmin(agreements[doubtful])])]
             yield (
-                f"model {number}: most pairs of {len(doubtful)} images contradict their averaged rotations, "
-                f"above all those of {worst}"
+                f"model {number}: most pairs of {counted(len(doubtful), 'image')} contradict their averaged "
+                f"rotations, above all those of {worst}"
             )
     if left_out:
         name, reason = next(iter(left_out.items()))
-        yield f"{len(left_out)} images are in no model, {name} for one: {reason}"
+        many = f"{len(left_out)} images are in no model, {name} for one"
+        yield f"{many if len(left_out) > 1 else f'{name} is in no model'}: {reason}"

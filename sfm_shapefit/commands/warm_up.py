@@ -20,7 +20,16 @@ from pathlib import Path
 from typing import Any
 
 from sfm_shapefit.errors import ShapeFitError
-from sfm_shapefit.kernel_cache import PACKAGE, hear_of_kernels, here, is_noted, made_for, note, on_miss
+from sfm_shapefit.kernel_cache import (
+    PACKAGE,
+    counted_as_compiling,
+    hear_of_kernels,
+    here,
+    is_noted,
+    made_for,
+    note,
+    on_miss,
+)
 
 Tell = Callable[[int, int], None]
 """Called with the number of kernels that are ready and of all that will be."""
@@ -29,14 +38,16 @@ NEEDED = (
     "solve_dense",
     "start_by_lud",
     "measure_pairs",
-    "find_pieces",
+    "adjust_bundle",
     "judge_placement",
+    "find_pieces",
     "refine_in_angles",
     "locate_model",
 )
 """Examples of what `locate`, `map`, `place` and `inspect` do in most runs.
 
-Parts come first, so that no two processes compile the same kernels, then the whole.
+Parts come first, so that no two processes compile the same kernels, and of them those that take longest; then
+the whole.
 """
 FURTHER = (
     "place_graph",
@@ -44,8 +55,7 @@ FURTHER = (
     "solve_by_splitting",
     "locate_rigs",
     "solve_iteratively",
-    "adjust_bundles",
-    "adjust_few_tracks",
+    "adjust_sparsely",
     "place_long_graph",
     "locate_from_tracks",
     "place_flat_graph",
@@ -58,8 +68,8 @@ FURTHER = (
 )
 """Examples of the rest."""
 
-# The kernels of these rooms are compiled by further examples only.
-_ROOMS_OF_FURTHER = ("adjustment", "baselines", "rotations", "synthetic", "theory.py")
+# Kernels of these rooms are compiled by further examples only, all but one.
+_ROOMS_OF_FURTHER = ("baselines", "rotations", "synthetic", "theory.py")
 # Each process takes 300 MB.
 _MOST_PROCESSES = 8
 _KERNEL = re.compile(r"^@kernel\s+def (\w+)", re.MULTILINE)
@@ -119,7 +129,7 @@ def compile_together(tell: Tell, say: Callable[[str], None]) -> Iterator[None]:
         missing = not_done(NEEDED)
         if missing and num_cores() > 1:
             # Where no process can be started, as where memory is short, all is compiled here.
-            with suppress(OSError, MemoryError):
+            with suppress(OSError, MemoryError), counted_as_compiling():
                 warm_up(missing, tell)
 
     with on_miss(act):

@@ -14,6 +14,7 @@ from sfm_shapefit.colmap.seed import write_model
 from sfm_shapefit.report.mesh import write_meshes
 from sfm_shapefit.report.page import write_report
 from sfm_shapefit.report.read_back import draw_result
+from sfm_shapefit.report.thumbnails import thumbnails_of
 from sfm_shapefit.results.map_result import MapResult
 from sfm_shapefit.results.result import FurtherPiece, GraphResult, LocateResult
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
@@ -32,6 +33,7 @@ class WriteOptions(Settings):
     )
     report: bool = option(True, "Write report.html, one page that explains the result and works offline.")
     scene: bool = option(False, "Write scene.glb and scene.ply, cameras and points for any 3D viewer.")
+    images: Path | str = option("", "Folder of the images, of which report.html is to have small pictures.")
 
 
 def write_result(
@@ -100,6 +102,6 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     if options.report or options.scene:
         drawing = draw_result(found)
         if options.report:
-            write_report(drawing, facts, folder / "report.html")
+            write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))
         if options.scene:
             write_meshes(drawing, folder)

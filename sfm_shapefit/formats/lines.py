@@ -13,6 +13,7 @@ from sfm_shapefit.errors import InputError
 
 # Longer numbers are words: Python refuses to convert very long ones.
 _IS_INTEGER = re.compile(r"-?[0-9]{1,40}")
+_DATABASE = b"SQLite format 3\0"
 UNIT_TOLERANCE = 1e-3
 """By how much the length of a quaternion or direction, or R R^T, may be off: a few printed digits pass."""
 
@@ -33,6 +34,30 @@ def refuse_irregular_file(path: Path) -> None:
         raise InputError(f"{path} cannot be read: it is a pipe or a device; give an ordinary file")
 
 
+def is_database(path: Path) -> bool:
+    """Tell whether a path is a file that begins as a database of SQLite does."""
+    if not path.is_file():
+        return False
+    try:
+        with path.open("rb") as stream:
+            return stream.read(len(_DATABASE)) == _DATABASE
+    except OSError:
+        return False
+
+
+def refuse_database(path: Path) -> None:
+    """Refuse a database where a model or a text file is wanted.
+
+    Raises:
+        InputError: if it is one; it says which command takes it.
+    """
+    if is_database(path):
+        raise InputError(
+            f"{path} is a database: `sfm-shapefit map` makes a model from it alone; the other commands take "
+            "the model's folder, and the database by --database"
+        )
+
+
 def text_of(file: Path) -> str:
     """Return what an ordinary text file holds.
 
@@ -40,8 +65,11 @@ def text_of(file: Path) -> str:
         InputError: if it is none, is missing, cannot be read, or is no UTF-8.
     """
     refuse_irregular_file(file)
+    refuse_database(file)
     try:
         return file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError(f"{file} does not exist") from None
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is not a readable text file ({error})") from error
 

@@ -249,7 +249,8 @@ def _corruption(pairs: ViewGraph, scores: FloatArray | None) -> Corruption:
     return Corruption(
         share=share,
         num_checked=checked,
-        statement=f"about {share:.0%}, judged by the triangles of {checked} of {pairs.num_edges} pairs",
+        statement=f"about {share:.0%} of the usable pairs, judged by the triangles of {checked} of "
+        f"{pairs.num_edges}",
     )
 
 

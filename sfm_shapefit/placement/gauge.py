@@ -6,7 +6,7 @@ whole model onto their axes.
 """
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     MEDIAN_NORMAL_LENGTH,
+    METRIC_SIGMA,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
@@ -28,13 +29,21 @@ _CAP_OF_SIZE = 0.5
 _ROUGH = 0.1
 # A smaller spread of centers, relative to their distance from the origin, counts as none.
 _COINCIDENT = 1e-9
-_FEWEST_PRIORS = 2
+FEWEST_PRIORS = 2
 _PRIORS_FOR_AXES = 3
 # A spread across a line of fewer residuals than this says nothing of the turn about the line.
 _FLAT = 5.0
 # The weight of a prior is half at so many standard deviations.
 _KERNEL_WIDTH = 3.0
 _REWEIGHTINGS = 20
+
+
+class Datum(NamedTuple):
+    """A point on Earth: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,6 +61,10 @@ class Gauge:
     after `similarity`; None where the axes are the input's."""
     warning: str = ""
     """Why the scale may be rough, if it may."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, where that is measured and its error known."""
+    datum: Datum | None = None
+    """Where the output's origin is on Earth, if priors on Earth set it."""
 
     def apply(self, locations: FloatArray) -> FloatArray:
         """Map the solver's locations (n, 3) to the output's units and axes."""
@@ -71,15 +84,14 @@ class PositionPriors:
     """(k, 3, 3), in the positions' units squared; NaN where unknown."""
     statement: str
     """Where they come from, and what their axes are."""
+    datum: Datum | None = None
+    """Where their origin is on Earth, if that is known."""
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
-        return PositionPriors(
-            cameras=places,
-            positions=self.positions[rows],
-            covariances=self.covariances[rows],
-            statement=self.statement,
+        return replace(
+            self, cameras=places, positions=self.positions[rows], covariances=self.covariances[rows]
         )
 
 
@@ -92,7 +104,7 @@ def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
         locations: (n, 3) the solver's answer.
         input_centers: (n, 3) the input's centers of the same cameras, in the same axes.
     """
-    if _coincide(input_centers):
+    if coincide(input_centers):
         return unit_gauge(locations, "the input's centers coincide, so the scale is free; ")
     size = median_spread(input_centers)
     similarity = fit_similarity_l1(locations, input_centers, rotate=False, cap=_CAP_OF_SIZE * size)
@@ -125,7 +137,7 @@ def metric_gauge(
     shifts = input_centers - scale * locations
     if fixed.any():
         shift, origin = shifts[fixed].mean(axis=0), "origin of the fixed cameras"
-    elif not _coincide(input_centers):
+    elif not coincide(input_centers):
         shift, origin = np.median(shifts, axis=0), "origin of the input's centers"
     else:
         shift, origin = -scale * locations.mean(axis=0), "centroid at the origin"
@@ -189,7 +201,7 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
     """
-    if len(priors.cameras) < _FEWEST_PRIORS:
+    if len(priors.cameras) < FEWEST_PRIORS:
         raise InputError(
             f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
@@ -214,10 +226,25 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
         axes=found.rotation if turns else None,
         statement=_prior_statement(priors, found, weights, level, turns=turns),
         warning=_prior_warning(level, size, turns=turns),
+        datum=priors.datum if turns else None,
     )
 
 
-def _coincide(centers: FloatArray) -> bool:
+def tell_scale(gauge: Gauge, sigma: float | None) -> Gauge:
+    """Return the gauge with the relative standard deviation of a scale that was measured, and says it."""
+    if sigma is None or gauge.scale not in ("rig", "prior"):
+        return gauge
+    statement = f"{gauge.statement}; the scale is known to {100.0 * sigma:.2g} %"
+    warning = gauge.warning
+    if sigma > METRIC_SIGMA:
+        warning = (
+            f"the scale is known to {100.0 * sigma:.2g} % only, so it is not metric: the offsets that tell "
+            "it are too short for this scene"
+        )
+    return replace(gauge, statement=statement, warning=warning, scale_sigma=sigma)
+
+
+def coincide(centers: FloatArray) -> bool:
     """Return whether centers (n, 3) are one point to rounding."""
     return bool(np.ptp(centers, axis=0).max() <= _COINCIDENT * max(1.0, float(np.abs(centers).max())))
 

@@ -64,6 +64,8 @@ class Placement(Displayed):
     adjusted_covariances: FloatArray | None = None
     """(k, 3, 3) of the centers of `cameras` where an adjustment has them, squared solver's units; NaN where
     they are not known, None without an adjustment."""
+    scale_sigma: float | None = None
+    """Relative standard deviation of the scale, where an adjustment knows it."""
 
     @property
     def graph(self) -> ViewGraph:
@@ -247,6 +249,7 @@ def replace_locations(
         assessment=assessment,
         second_configuration=second,
         adjusted_covariances=None,
+        scale_sigma=None,
     )
 
 

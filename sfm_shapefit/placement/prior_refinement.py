@@ -1,6 +1,7 @@
 """Position priors that pull the cameras: opt-in, after they have set scale, origin and axes."""
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +17,22 @@ PULLED = "; the priors moved cameras by "
 """What the statement of the gauge goes on with, before how far."""
 
 
+class Pulled(NamedTuple):
+    """A placement after position priors pulled at it."""
+
+    placement: Placement
+    """Refined on directions and priors together, and judged anew."""
+    gauge: Gauge
+    """That of before; its statement says by how much the priors moved cameras."""
+    anchors: Anchors
+    """The priors by the placement's cameras, in its gauge but for the axes, which are the input's; each has
+    the weight that it ended with: a wrong one has none."""
+
+
 def pull_to_priors(
     placement: Placement, gauge: Gauge, priors: PositionPriors, options: PlacementOptions
-) -> tuple[Placement, Gauge]:
-    """Return the placement refined on directions and priors together and judged anew, and its gauge.
+) -> Pulled:
+    """Return the placement refined on directions and priors together.
 
     A camera that the refinement had thrown out of the scene and put back stays undetermined, unless a prior
     holds it where it is now.
@@ -49,9 +62,10 @@ def pull_to_priors(
         locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
         reset_nodes=np.setdiff1d(refined.reset_nodes, held),
     )
-    return (
+    return Pulled(
         replace_locations(placement, kept, options),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),
+        anchors.weighted(moved),
     )
 
 

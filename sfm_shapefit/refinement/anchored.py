@@ -54,6 +54,11 @@ class Anchors(NamedTuple):
         off = self.off(t)
         return np.asarray(np.einsum("ka,kab,kb->k", off, self.information, off))
 
+    def weighted(self, t: FloatArray) -> "Anchors":
+        """Return the anchors of plain squares whose pull at locations (n, d) is that of these."""
+        weights = 1.0 / (1.0 + (self.chi2(t) / KERNEL_WIDTH**2) ** 2)
+        return self._replace(information=weights[:, None, None] * self.information)
+
 
 def refine_anchored(
     graph: ViewGraph,
@@ -113,8 +118,7 @@ class _AnchoredTerms(AngularTerms):
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
         blocks, damped, gradient = self.linearize(t)
-        weights = 1.0 / (1.0 + (self._anchors.chi2(t) / KERNEL_WIDTH**2) ** 2)
-        own = weights[:, None, None] * self._anchors.information
+        own = self._anchors.weighted(t).information
         pull = np.einsum("kab,kb->ka", own, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
         return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right

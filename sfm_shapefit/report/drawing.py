@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.results.tables import CameraRow, PairRow
 
@@ -35,6 +35,8 @@ _FRUSTUM_SHARE = 0.4
 _FRUSTUM_OF_EXTENT = (0.008, 0.05)
 # Half a picture's side over its focal length is limited to these, since a fisheye has no pyramid.
 _HALF_SIZES = (0.15, 1.2)
+# Fewer common centers fix no similarity.
+_FEWEST_FITTED = 3
 # "The pictures' y axes point down" has this weight beside "their x axes are level".
 _UPRIGHT = 0.1
 
@@ -58,6 +60,8 @@ class Poses:
     """(n, 3)"""
     half_sizes: FloatArray
     """(n, 2) half the width and height of the picture at distance 1, limited to what can be drawn."""
+    focal_lengths_px: FloatArray
+    """(n,)"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,10 +77,16 @@ class Cameras:
     trust: FloatArray
     centers: FloatArray
     """(n, 3)"""
-    sigmas: FloatArray
-    """(n,) largest standard deviation over the axes, in the output's units; NaN where it is not known."""
+    axis_sigmas: FloatArray
+    """(n, 3) standard deviations along the axes, in the output's units; NaN where they are not known."""
     poses: Poses
     """Rotations in the output's axes, pictures; `poses.centers` are the input's, in its own."""
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """(n,) largest standard deviation over the axes; NaN where it is not known."""
+        largest = np.where(np.isnan(self.axis_sigmas), -np.inf, self.axis_sigmas).max(axis=1)
+        return np.where(np.isfinite(largest), largest, np.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -98,6 +108,24 @@ class Pairs:
     input_deg: FloatArray
     """(m,) at the input's centers; NaN where those mean nothing."""
     reasons: tuple[str, ...]
+
+    def per_camera(self, num_cameras: int) -> tuple[IntArray, FloatArray]:
+        """Return how many pairs of each camera agree, and the median residual of its pairs, NaN of none."""
+        ends = self.cameras.ravel()
+        agrees = np.repeat(self.classes == PairClass.AGREES, 2)
+        residuals = np.repeat(self.residuals_deg, 2)
+        known = np.isfinite(residuals)
+        order = np.lexsort((residuals[known], ends[known]))
+        ordered, first = (
+            residuals[known][order],
+            np.searchsorted(ends[known][order], np.arange(num_cameras + 1)),
+        )
+        counts = np.diff(first)
+        medians = np.full(num_cameras, np.nan)
+        some = counts > 0
+        low, high = first[:-1] + (counts - 1) // 2, first[:-1] + counts // 2
+        medians[some] = (ordered[low[some]] + ordered[high[some]]) / 2
+        return np.bincount(ends[agrees], minlength=num_cameras), medians
 
     def worst_first(self) -> IntArray:
         """Return the rows, those that contradict the solution most first, those without a direction last."""
@@ -135,6 +163,18 @@ class Drawing:
     """Whether the input's centers are in the output's units, so that both can be drawn together."""
     history: tuple[tuple[int, float, float | None], ...] = ()
     """Iteration, objective and bound of the convex solve, as far as they were recorded."""
+
+    def shifts(self) -> FloatArray:
+        """(n,) how far cameras stand from where the input has them; NaN where the two cannot be compared."""
+        if not self.input_is_aligned:
+            return np.full(len(self.cameras.names), np.nan)
+        distances: FloatArray = np.linalg.norm(self.cameras.centers - self.cameras.poses.centers, axis=1)
+        return distances
+
+    @property
+    def noun(self) -> str:
+        """What a camera is called: a bare graph has nodes."""
+        return "camera" if np.isfinite(self.cameras.poses.rotations).any() else "node"
 
     @property
     def extent(self) -> float:
@@ -189,6 +229,7 @@ def poses_of(model: "PosedModel | None", names: Sequence[str]) -> Poses:
             sizes[camera_id] = camera.width / focal_length, camera.height / focal_length
         found.rotations[row], found.centers[row] = model.rotations[k], model.centers[k]
         found.half_sizes[row] = np.clip(sizes[camera_id], *_HALF_SIZES)
+        found.focal_lengths_px[row] = model.focal_lengths_px[k]
     return found
 
 
@@ -206,6 +247,20 @@ def frustum_corners(drawing: Drawing, rows: IntArray, centers: FloatArray) -> Fl
     rotations = drawing.cameras.poses.rotations[rows]
     corners: FloatArray = centers[:, None, :] + drawing.frustum_depth * in_camera @ rotations
     return corners
+
+
+def input_centers(drawing: Drawing) -> FloatArray | None:
+    """Return the input's centers (n, 3) in the output's units and axes, brought there by a fit if need be.
+
+    None where the input has no centers, or they all coincide.
+    """
+    before, after = drawing.cameras.poses.centers, drawing.cameras.centers
+    common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+    if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
+        return None
+    if drawing.input_is_aligned:
+        return before
+    return fit_similarity_l1(before[common], after[common]).apply(before)
 
 
 def view_axes(rotations: FloatArray) -> FloatArray:
@@ -238,14 +293,17 @@ def _unknown_poses(n: int) -> Poses:
         rotations=np.full((n, 3, 3), np.nan),
         centers=np.full((n, 3), np.nan),
         half_sizes=np.full((n, 2), np.nan),
+        focal_lengths_px=np.full(n, np.nan),
     )
 
 
 def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
-    centers = np.full((len(rows), 3), np.nan)
+    centers, sigmas = np.full((len(rows), 3), np.nan), np.full((len(rows), 3), np.nan)
     for k, row in enumerate(rows):
         if row.center:
             centers[k] = [*row.center, 0.0, 0.0][:3]
+        if row.sigma:
+            sigmas[k] = [*row.sigma, 0.0, 0.0][:3]
     return Cameras(
         names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
@@ -254,7 +312,7 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
         degrees=np.array([row.degree for row in rows], dtype=np.int64),
         trust=np.array([row.trust for row in rows], dtype=np.float64),
         centers=centers,
-        sigmas=np.array([max(row.sigma, default=np.nan) for row in rows], dtype=np.float64),
+        axis_sigmas=sigmas,
         poses=poses,
     )
 

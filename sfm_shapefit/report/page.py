@@ -1,8 +1,8 @@
-"""report.html: one file that works offline, with plotly.js inside. The door to plotly.
+"""report.html: one file that works offline.
 
-Python says what is true, as one JSON value; `page/page.js` draws it. Three things keep names, which come from
-strangers, from doing anything: the JSON has no "<", the script sets text and never HTML, and the page's own
-security policy lets no script run but the two whose hashes it names, and nothing be fetched.
+Python says what is true, as one JSON value; the scripts in `assets` draw it. Three things keep names, which
+come from strangers, from doing anything: the JSON has no "<", the script sets text and never HTML, and the
+page's own security policy lets no script run but the one whose hash it names, and nothing be fetched.
 
 The file stays small enough to be opened anywhere: numbers are base64 of float32, points are thinned, and of
 more than `MAX_PAIRS` pairs the worst are listed and drawn. Histogram and matrix count all of them.
@@ -14,7 +14,7 @@ import html
 import json
 import re
 from collections.abc import Sequence
-from functools import cache
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,19 +23,22 @@ import numpy as np
 import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, PairClass, frustum_corners
-from sfm_shapefit.report.sentences import Hint, first_looks, shorten, summary_sentences
-from sfm_shapefit.results.tables import IN_MEMORY
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
+from sfm_shapefit.report.headline import banner, input_of, scene_name, tiles
+from sfm_shapefit.report.sentences import (
+    Hint,
+    expert_sentences,
+    first_looks,
+    shorten,
+    summary_sentences,
+)
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
-# The chart of trust has at most so many bars.
-_MAX_BARS = 400
-# The box around the drawing has a margin of this share of its largest side, and no side is smaller than the
-# other share of it.
-_MARGIN = 0.03
-_FLATTEST = 0.02
+# Only cameras of less trust are in the chart of trust.
+_HIGH_TRUST = 0.95
 # So many hinges are named per piece.
 _MAX_HINGES = 20
 # The objectives of the first iterations may be far out of scale.
@@ -44,28 +47,40 @@ _AXES = "xyz"
 _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
 
-def write_report(drawing: Drawing, facts: dict[str, Any], path: Path) -> None:
-    """Write the report of a result; the facts are those of locate.json."""
-    path.write_text(report_html(drawing, facts), encoding="utf-8", newline="\n")
+# In the order in which they are one script.
+_SCRIPTS = ("core.js", "scene.js", "view.js", "tables.js", "charts.js", "page.js")
 
 
-def report_html(drawing: Drawing, facts: dict[str, Any]) -> str:
-    """Return the page; the facts are those of locate.json."""
-    data = page_data(drawing, facts)
-    plotly, script = _plotly(), _asset("page.js")
+def write_report(
+    drawing: Drawing, facts: dict[str, Any], path: Path, thumbnails: dict[int, str] | None = None
+) -> None:
+    """Write the report of a result; see `report_html`."""
+    path.write_text(report_html(drawing, facts, thumbnails), encoding="utf-8", newline="\n")
+
+
+def report_html(drawing: Drawing, facts: dict[str, Any], thumbnails: dict[int, str] | None = None) -> str:
+    """Return the page.
+
+    Args:
+        drawing: what is drawn.
+        facts: those of locate.json.
+        thumbnails: data URLs of pictures by row of the cameras, as of `read_thumbnails`; none if None.
+    """
+    data, script = page_data(drawing, facts, thumbnails), _script()
     values = {
         "title": html.escape(f"{data['title']} \N{EN DASH} sfm_shapefit"),
-        "hashes": " ".join(f"'sha256-{_hash(text)}'" for text in (plotly, script)),
+        "hashes": f"'sha256-{_hash(script)}'",
         "style": _asset("page.css"),
         "data": _json(data),
-        "plotly": plotly,
         "script": script,
     }
     # In one pass, so that nothing inside a value is taken for a place holder.
     return re.sub(r"\{\{(\w+)\}\}", lambda found: values[found[1]], _asset("page.html"))
 
 
-def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
+def page_data(
+    drawing: Drawing, facts: dict[str, Any], thumbnails: dict[int, str] | None = None
+) -> dict[str, Any]:
     """Return everything that the page shows, as JSON values; cameras and pairs stand worst first."""
     trust = drawing.cameras.trust
     # Cameras of unknown trust come last.
@@ -77,16 +92,19 @@ def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
     display = _Display(drawing)
     histogram = residual_histogram(drawing.pairs)
     return {
-        "title": _title(facts),
+        "title": scene_name(facts),
         "subtitle": _subtitle(facts),
-        "tiles": _tiles(drawing, facts),
+        "banner": {name: shorten(text, 1000) for name, text in banner(drawing, facts).items()},
+        "tiles": tiles(drawing, facts),
         "summary": summary_sentences(drawing, facts),
+        "expertFacts": expert_sentences(facts),
         "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
         "dimension": drawing.dimension,
         "shownAxes": min(drawing.dimension, len(_AXES)),
         "frustum": drawing.frustum_depth,
-        "box": [*display.low.tolist(), *display.high.tolist()],
+        "axes": _pack(drawing.axes.T, "f4"),
         "cameras": _cameras(drawing, cameras, display, reasons),
+        "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
         "pairs": _pairs(drawing, pairs, rank, reasons),
         "points": {
             "positions": _pack(display(drawing.points.positions), "f4"),
@@ -96,7 +114,8 @@ def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
         "sceneNote": _scene_note(drawing),
         "pairsNote": _pairs_note(drawing),
         "hasSupport": bool(np.any(drawing.pairs.support > 0)),
-        "trustOrder": list(range(min(int(np.isfinite(trust).sum()), _MAX_BARS))),
+        "highTrust": _HIGH_TRUST,
+        "minTrust": float(facts["options"].get("min_trust", 0.0)),
         "histogram": {
             "edges": histogram.edges_deg.tolist(),
             "counts": {state: values.tolist() for state, values in histogram.counts.items()},
@@ -106,7 +125,7 @@ def page_data(drawing: Drawing, facts: dict[str, Any]) -> dict[str, Any]:
         "notes": _notes(drawing, histogram.medians_deg),
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts["pieces"])],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
-        "options": [[name.replace("_", " "), _option(value)] for name, value in facts["options"].items()],
+        "options": _options(facts["options"]),
         "versions": [
             [shorten(str(name)), shorten(_option(value), 400)]
             for name, value in (facts["versions"] | facts["inputs"]).items()
@@ -120,17 +139,15 @@ class _Display:
     def __init__(self, drawing: Drawing) -> None:
         self._axes = drawing.axes
         centers = drawing.cameras.centers[drawing.cameras.placed]
-        drawn = np.concatenate([centers, drawing.points.positions, np.zeros((int(len(centers) == 0), 3))])
         self._middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
-        inside = self(drawn)
-        low, high = inside.min(axis=0), inside.max(axis=0)
-        largest = float((high - low).max()) or 1.0
-        half = np.maximum((high - low) / 2, _FLATTEST * largest) + _MARGIN * largest + drawing.frustum_depth
-        self.low, self.high = (low + high) / 2 - half, (low + high) / 2 + half
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Return points (..., 3) in the page's axes."""
-        shown: FloatArray = (points - self._middle) @ self._axes.T
+        return self.turn(points - self._middle)
+
+    def turn(self, vectors: FloatArray) -> FloatArray:
+        """Return vectors (..., 3) in the page's axes."""
+        shown: FloatArray = vectors @ self._axes.T
         return shown
 
 
@@ -139,21 +156,42 @@ class _Display:
 
 def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict[str, int]) -> dict[str, Any]:
     cameras = drawing.cameras
-    corners = frustum_corners(drawing, order, cameras.centers[order])
-    shown = display(cameras.poses.centers[order]) if drawing.input_is_aligned else None
+    agreeing, errors = drawing.pairs.per_camera(len(order))
+    aligned = drawing.input_is_aligned
     return {
         "names": [shorten(cameras.names[k]) for k in order.tolist()],
         "placed": _pack(cameras.placed[order], "u1"),
         "trust": _pack(cameras.trust[order], "f4"),
-        "sigma": _pack(np.where(np.isfinite(cameras.sigmas), cameras.sigmas, np.nan)[order], "f4"),
+        "sigma": _pack(cameras.sigmas[order], "f4"),
+        "sigmas": _pack(cameras.axis_sigmas[order], "f4"),
         "degree": _pack(cameras.degrees[order], "i4"),
+        "agreeing": _pack(agreeing[order], "i4"),
+        "error": _pack(errors[order], "f4"),
         "piece": _pack(cameras.pieces[order], "i4"),
         "reason": _encode([cameras.reasons[k] for k in order.tolist()], reasons),
         "world": _pack(cameras.centers[order], "f8"),
         "center": _pack(display(cameras.centers[order]), "f4"),
-        "corners": _pack(display(corners), "f4"),
-        "inputCenter": None if shown is None else _pack(shown, "f4"),
+        "frusta": _pack(_frusta(drawing, order, display), "f4"),
+        "ghost": _pack(display(_ghosts(drawing)[order]), "f4"),
+        "inputCenter": _pack(display(cameras.poses.centers[order]), "f4") if aligned else None,
+        "shift": _pack(drawing.shifts()[order], "f4") if aligned else None,
     }
+
+
+def _frusta(drawing: Drawing, order: IntArray, display: _Display) -> FloatArray:
+    """Return half the width, half the height, and the depth of pictures at distance 1, (n, 3, 3) in rows."""
+    poses = drawing.cameras.poses
+    vectors = display.turn(poses.rotations[order])
+    vectors[:, :2] *= poses.half_sizes[order][:, :, None]
+    return vectors
+
+
+def _ghosts(drawing: Drawing) -> FloatArray:
+    """Return where the input has the cameras that are not placed; NaN for others, or if it is not known."""
+    centers = input_centers(drawing)
+    if centers is None:
+        return np.full((len(drawing.cameras.names), 3), np.nan)
+    return np.where(drawing.cameras.placed[:, None], np.nan, centers)
 
 
 def _pairs(drawing: Drawing, order: IntArray, rank: IntArray, reasons: dict[str, int]) -> dict[str, Any]:
@@ -215,39 +253,9 @@ def _convergence(drawing: Drawing) -> dict[str, Any]:
 # --- words -----------------------------------------------------------------------------------------
 
 
-def _title(facts: dict[str, Any]) -> str:
-    """Name the input: a model in memory, as of `map`, by the database that its matches come from."""
-    inputs = facts["inputs"]
-    model, database = inputs.get("model"), inputs.get("database")
-    named = database if model == IN_MEMORY and database else model or inputs.get("graph")
-    return shorten(str(named))
-
-
 def _subtitle(facts: dict[str, Any]) -> str:
-    inputs = facts["inputs"]
-    directions = inputs.get("directions")
-    origin = f"directions from {directions}; " if directions else f"{facts.get('dimension', 3)} dimensions; "
-    return shorten(origin + f"{sum(facts['timings_s'].values()):.1f} s in all", 400)
-
-
-def _tiles(drawing: Drawing, facts: dict[str, Any]) -> list[list[str]]:
-    cameras, classes = drawing.cameras, drawing.pairs.classes
-    trust = cameras.trust[cameras.placed]
-    tiles = [
-        [f"{int(cameras.placed.sum()):,} / {len(cameras.names):,}", "cameras placed"],
-        [f"{int(np.sum(classes == PairClass.AGREES)):,} / {len(classes):,}", "pairs agree"],
-        [f"{facts['residual_level_deg']:.2g}°", "level of the residuals"],
-    ]
-    observations = facts.get("agreement", {}).get("observations")
-    if observations is not None:
-        tiles.append([f"{observations:.0%}", "of the observations see a point"])
-    if np.isfinite(trust).any():
-        tiles.append([f"{np.nanmin(trust):.2f}", f"least trust, median {np.nanmedian(trust):.2f}"])
-    if drawing.points.num_all:
-        error = facts.get("mean_reprojection_error_px")
-        mean = f", mean error {error:.2f} px" if error is not None and np.isfinite(error) else ""
-        tiles.append([f"{drawing.points.num_all:,}", f"points{mean}"])
-    return tiles
+    dimensions = "" if "model" in facts["inputs"] else f", in {facts.get('dimension', 3)} dimensions"
+    return shorten(input_of(facts) + dimensions, 400)
 
 
 def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
@@ -261,9 +269,7 @@ def _look(hint: Hint, rank: IntArray, pairs: IntArray) -> dict[str, Any]:
 
 
 def _scene_note(drawing: Drawing) -> str:
-    notes = [
-        f"Cameras span {drawing.extent:.4g} units; frusta are drawn {drawing.frustum_depth:.2g} units deep."
-    ]
+    notes = [f"Cameras span {drawing.extent:.4g} units."]
     if not np.isfinite(drawing.cameras.poses.rotations[drawing.cameras.placed]).any():
         notes = [f"Nodes span {drawing.extent:.4g} units."]
     if drawing.dimension > len(_AXES):
@@ -288,36 +294,40 @@ def _pairs_note(drawing: Drawing) -> str:
 
 def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
-    known = int(np.isfinite(drawing.cameras.trust).sum())
     return {
         "histogram": _histogram_note(medians_deg),
-        "trust": f"The {_MAX_BARS} least trusted of {known:,} cameras." if known > _MAX_BARS else "",
+        "trust": _trust_note(drawing.cameras.trust),
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
-        "pieces": "Directions fix neither scale nor place of one piece against another; a hinge is a camera "
-        "that two pieces share.",
+        "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }
+
+
+def _trust_note(trust: FloatArray) -> str:
+    known = int(np.isfinite(trust).sum())
+    high = int(np.sum(trust >= _HIGH_TRUST))
+    if not known:
+        return "No camera has a trust."
+    said = f"{high:,} of {known:,} cameras have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
+    return f"{said}; the least trusted others are shown." if high < known else f"{said}."
 
 
 def _histogram_note(medians_deg: dict[str, float]) -> str:
     if not medians_deg:
         return "No pair has a residual."
     where = {
-        "input": "at the input's centers",
-        "optimum": "at the convex optimum",
-        "output": "at the output's centers",
+        "input": "at the input's positions",
+        "optimum": "at the solver's optimum",
+        "output": "as delivered",
     }
     medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
-    return f"Angle between each measured direction and its baseline; medians: {medians}."
+    return f"Angle between what the matches of a pair say and where its cameras stand; medians: {medians}."
 
 
 def _matrix_note(cameras_per_cell: int) -> str:
     if cameras_per_cell > 1:
-        return (
-            f"{cameras_per_cell} cameras share a cell; its color is the share of its pairs that contradict "
-            "the solution."
-        )
+        return f"{cameras_per_cell} cameras share a cell; the redder it is, the more of its pairs contradict."
     return "Blue agrees, red contradicts, yellow cannot be judged, gray has no direction."
 
 
@@ -350,6 +360,16 @@ def _piece(k: int, piece: dict[str, Any]) -> dict[str, Any]:
     }
 
 
+def _options(options: dict[str, Any]) -> dict[str, list[list[str]]]:
+    """Return names and values, those that differ from the defaults apart."""
+    defaults = asdict(LocateOptions())
+    rows: dict[bool, list[list[str]]] = {True: [], False: []}
+    for name, value in options.items():
+        is_default = name in defaults and _option(defaults[name]) == _option(value)
+        rows[is_default].append([shorten(name.replace("_", " ")), shorten(_option(value), 400)])
+    return {"changed": rows[False], "unchanged": rows[True]}
+
+
 def _option(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -373,9 +393,7 @@ def _asset(name: str) -> str:
     return (files("sfm_shapefit.report") / "assets" / name).read_text(encoding="utf-8").replace("\r\n", "\n")
 
 
-@cache
-def _plotly() -> str:
-    """Return plotly.js."""
-    from plotly.offline import get_plotlyjs
-
-    return str(get_plotlyjs())
+def _script() -> str:
+    """Return the scripts of the page as one, with a scope of its own."""
+    parts = "\n".join(_asset(name) for name in _SCRIPTS)
+    return f'(() => {{\n"use strict";\n{parts}}})();\n'

@@ -1,5 +1,7 @@
 """The report in words: what was placed, how certain it is, and what to look at first.
 
+What comes before all of it, the verdict and the key figures, is in `headline`.
+
 Sentences are plain text. Names in them come from strangers: whoever shows a sentence shows it as text, and
 `shorten` keeps a name of any length readable.
 """
@@ -10,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.results.intrinsics import describe_intrinsics
 
@@ -19,7 +22,9 @@ MAX_TEXT = 160
 _FAR_DEG = 1.0
 # Below this trust, reasons are given.
 _LOW_TRUST = 0.75
-_SOLVER_SCALE = "the solver's own units, the centroid at the origin"
+_SOLVER_SCALE = "solver: the solver's own units, the centroid at the origin"
+# Of fewer pairs it says nothing that most are of one camera.
+_FEW_PAIRS = 4
 # So many items of a kind are among the first things to look at.
 _SHOWN = 3
 
@@ -46,51 +51,56 @@ def shorten(text: str, limit: int = MAX_TEXT) -> str:
 def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
     """Return what was placed and how certain it is, a sentence each; the facts are those of locate.json."""
     return [
-        *_verdict(facts),
-        _placed(drawing),
-        _pairs(drawing, facts),
-        *_certainty(drawing),
-        f"Scale and origin: {shorten(facts.get('scale') or _SOLVER_SCALE, 2 * MAX_TEXT)}.",
+        placed_sentence(drawing),
+        _pairs(drawing),
+        *_certainty(drawing, facts),
+        _units(facts),
         *_intrinsics(facts),
-        *_delivered(facts),
     ]
+
+
+def expert_sentences(facts: dict[str, Any]) -> list[str]:
+    """Return what only those who know the method ask for."""
+    level = facts["residual_level_deg"]
+    said = [f"Pairs that agree are off by a standard deviation of {level:.2g} degrees per axis."]
+    if "delivered" in facts:  # which earlier outputs lack
+        said.append(f"The certificate: {facts['delivered']['statement']}.")
+    adjustment = facts.get("adjustment")
+    if adjustment:
+        statement = shorten(adjustment["statement"], 4 * MAX_TEXT)
+        said.append(f"{statement[:1].upper()}{statement[1:]}.")
+    return said
 
 
 def first_looks(drawing: Drawing, facts: dict[str, Any]) -> list[Hint]:
     """Return what deserves a look, the most telling first; empty if nothing does."""
+    cameras = [*_left_out(drawing), *_least_trusted(drawing)]
     return [
-        *(Hint(text=shorten(text, 2 * MAX_TEXT)) for text in facts["warnings"]),
-        *_left_out(drawing),
-        *_least_trusted(drawing),
+        *_warnings(drawing, facts, {hint.camera for hint in cameras}),
+        *cameras,
         *_contradictions(drawing),
         *_loose(facts),
         *_unchecked(drawing),
     ]
 
 
-def _verdict(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield the verdict, which earlier outputs lack."""
-    if "verdict" in facts:
-        yield f"Verdict: {shorten(facts['verdict']['statement'], 2 * MAX_TEXT)}."
-
-
-def _placed(drawing: Drawing) -> str:
+def placed_sentence(drawing: Drawing) -> str:
+    """Return how many cameras are placed, as a sentence."""
     placed, total = int(drawing.cameras.placed.sum()), len(drawing.cameras.names)
-    noun = "images" if np.isfinite(drawing.cameras.poses.rotations).any() else "nodes"
     if placed == total:
-        return f"All {total:,} {noun} were placed."
+        return f"All {total:,} {drawing.noun}s are placed."
     elsewhere = int(np.sum(~drawing.cameras.placed & (drawing.cameras.pieces > 0)))
     note = f" ({elsewhere:,} in smaller pieces)" if elsewhere else ""
-    missing = f"{total - placed:,} {'is' if total - placed == 1 else 'are'} not in this model"
-    return f"{placed:,} of {total:,} {noun} were placed; {missing}{note}."
+    missing = f"{total - placed:,} {_are(total - placed)} not in this model"
+    return f"{placed:,} of {total:,} {drawing.noun}s are placed; {missing}{note}."
 
 
-def _pairs(drawing: Drawing, facts: dict[str, Any]) -> str:
+def _pairs(drawing: Drawing) -> str:
     counts = np.bincount(drawing.pairs.classes, minlength=len(PairClass)).tolist()
+    against = counts[PairClass.CONTRADICTS]
     text = (
-        f"Of {len(drawing.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the solution "
-        f"(a standard deviation of {facts['residual_level_deg']:.2g} degrees per axis) and "
-        f"{counts[PairClass.CONTRADICTS]:,} contradict it"
+        f"Of {len(drawing.pairs.classes):,} pairs, {counts[PairClass.AGREES]:,} agree with the "
+        f"placed cameras and {against:,} {'contradicts' if against == 1 else 'contradict'} them"
     )
     if counts[PairClass.UNDETERMINED]:
         text += f"; {counts[PairClass.UNDETERMINED]:,} cannot be judged"
@@ -100,24 +110,19 @@ def _pairs(drawing: Drawing, facts: dict[str, Any]) -> str:
     return text + "."
 
 
-def _certainty(drawing: Drawing) -> Iterator[str]:
+def _certainty(drawing: Drawing, facts: dict[str, Any]) -> Iterator[str]:
     sigmas = drawing.cameras.sigmas[drawing.cameras.placed]
     known = np.isfinite(sigmas)
     if not known.any() or drawing.extent <= 0.0:
         return
     worst = int(np.argmax(np.where(drawing.cameras.placed, np.nan_to_num(drawing.cameras.sigmas), -1.0)))
     median = float(np.median(sigmas[known]))
+    meaning = f" ({shorten(facts['sigma_of'])})" if facts.get("sigma_of") else ""
     yield (
         f"The median standard deviation of a position is {median:.2g} units, "
         f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
-        f"{drawing.cameras.sigmas[worst]:.2g}, of {shorten(drawing.cameras.names[worst])}."
+        f"{drawing.cameras.sigmas[worst]:.2g}, of {shorten(drawing.cameras.names[worst])}{meaning}."
     )
-
-
-def _delivered(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what is certified and what is delivered, which earlier outputs lack."""
-    if "delivered" in facts:
-        yield f"The certificate: {facts['delivered']['statement']}."
 
 
 def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
@@ -125,6 +130,24 @@ def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
     lines = describe_intrinsics(facts.get("intrinsics", []))
     if lines:
         yield f"Intrinsics: {'; '.join(lines)}."
+
+
+def _units(facts: dict[str, Any]) -> str:
+    """Say what a unit is; the statement of the scale begins with the option's value."""
+    stated = facts.get("scale") or _SOLVER_SCALE
+    return f"Units and axes: {shorten(stated.partition(': ')[2] or stated, 2 * MAX_TEXT)}."
+
+
+def _warnings(drawing: Drawing, facts: dict[str, Any], told: set[int | None]) -> Iterator[Hint]:
+    """Yield warnings, but for those of a camera of which something is told anyway."""
+    names = {name: row for row, name in enumerate(drawing.cameras.names) if not name.isdigit()}
+    for warning in facts["warnings"]:
+        # The longest name wins, as "11.jpg" is in "111.jpg".
+        named = max((name for name in names if name in warning), key=len, default=None)
+        camera = None if named is None else names[named]
+        if camera is None or camera not in told:
+            text = shorten(warning, 2 * MAX_TEXT)
+            yield Hint(text=f"{text[:1].upper()}{text[1:]}", camera=camera)
 
 
 def _left_out(drawing: Drawing) -> Iterator[Hint]:
@@ -154,21 +177,38 @@ def _contradictions(drawing: Drawing) -> Iterator[Hint]:
     pairs = drawing.pairs
     against = np.flatnonzero(pairs.classes == PairClass.CONTRADICTS)
     far = pairs.residuals_deg[against] >= _FAR_DEG
-    if len(against) and not far.any():
-        yield Hint(
-            text=f"{len(against):,} of the pairs contradict the solution, but by "
-            f"{pairs.residuals_deg[against].max():.2g} degrees at most"
-        )
+    if len(against):
+        yield _set_aside(drawing, against)
     against = against[far]
     order = np.lexsort((-pairs.residuals_deg[against], -pairs.support[against]))
     for row in against[order][:_SHOWN].tolist():
         first, second = (shorten(drawing.cameras.names[k], 60) for k in pairs.cameras[row].tolist())
         matches = f" with {pairs.support[row]:,} matches" if pairs.support[row] else ""
         yield Hint(
-            text=f"{first} to {second}{matches} contradicts the solution "
-            f"by {pairs.residuals_deg[row]:.3g} degrees",
+            text=f"{first} and {second}{matches}: off by {pairs.residuals_deg[row]:.3g} degrees",
             pair=row,
         )
+
+
+def _set_aside(drawing: Drawing, against: IntArray) -> Hint:
+    """Say how many pairs contradict the placed cameras, by how much if it is little, and whose they are."""
+    pairs, count = drawing.pairs, len(against)
+    verb = "contradicts" if count == 1 else "contradict"
+    text = f"{count:,} of {len(pairs.classes):,} pairs {verb} the placed cameras and {_are(count)} set aside"
+    largest = float(pairs.residuals_deg[against].max())
+    if largest < _FAR_DEG:
+        text += f"; by {largest:.2g} degrees at most, which does no harm"
+    else:
+        text += ": repeated structure, as a rule, if they have many matches"
+    shares = np.bincount(pairs.cameras[against].ravel(), minlength=len(drawing.cameras.names))
+    most = int(np.argmax(shares))
+    if count < _FEW_PAIRS or 2 * shares[most] <= count:
+        return Hint(text=text)
+    return Hint(text=f"{text}; {shares[most]:,} are of {shorten(drawing.cameras.names[most])}", camera=most)
+
+
+def _are(count: int) -> str:
+    return "is" if count == 1 else "are"
 
 
 def _loose(facts: dict[str, Any]) -> Iterator[Hint]:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.errors import InputError
-from sfm_shapefit.geometry import angle_between_deg, fit_similarity_l1, normalized
-from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners
+from sfm_shapefit.extras import MissingExtraError
+from sfm_shapefit.geometry import angle_between_deg, normalized
+from sfm_shapefit.report.drawing import Drawing, PairClass, frustum_corners, input_centers
 from sfm_shapefit.report.mesh import PAIR_COLORS, trust_colors
 from sfm_shapefit.report.sentences import shorten
 
@@ -27,7 +27,6 @@ _GRAY = (140, 140, 140)
 _CHOSEN = (240, 180, 40)
 _NOBODY = "all cameras"
 _MAX_PAIRS = 50_000
-_FEWEST_FITTED = 3
 # A click means the camera whose center is at most this far off.
 _PICKED_DEG = 2.0
 # The slider is logarithmic, from here to 180 degrees.
@@ -89,9 +88,7 @@ def serve(drawing: Drawing, facts: dict[str, Any], host: str, port: int) -> "vis
     try:
         import viser
     except ImportError as error:
-        raise InputError(
-            "the viewer needs viser: pip install '.[viewer]' in the folder of sfm_shapefit"
-        ) from error
+        raise MissingExtraError("the viewer", "viser", "viewer") from error
     # The server prints a banner; the address is for the caller to tell.
     with redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -207,17 +204,3 @@ class _View:
         return self._server.scene.add_line_segments(
             name, points, both, thickness=1.5, thickness_units="screen"
         )
-
-
-def input_centers(drawing: Drawing) -> FloatArray | None:
-    """Return the input's centers (n, 3) in the output's units and axes, brought there by a fit if need be.
-
-    None where the input has no centers, or they all coincide.
-    """
-    before, after = drawing.cameras.poses.centers, drawing.cameras.centers
-    common = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
-    if common.sum() < _FEWEST_FITTED or not np.ptp(before[common], axis=0).max() > 0.0:
-        return None
-    if drawing.input_is_aligned:
-        return before
-    return fit_similarity_l1(before[common], after[common]).apply(before)

@@ -5,8 +5,9 @@ Keys may be added, never renamed, within a schema version. Numbers that are not 
 
 from typing import Annotated, Any, Literal, TypedDict
 
-from sfm_shapefit.evaluation import ErrorSummary, Recall
+from sfm_shapefit.evaluation import Recall, RelativePoseAuc
 from sfm_shapefit.placement.diagnosis import Diagnosis
+from sfm_shapefit.pose_errors import ErrorSummary, TrajectoryErrors
 
 Options = Annotated[dict[str, Any], "The settings of the run, a key per option of the command."]
 Timings = Annotated[dict[str, float], "Wall-clock seconds per stage."]
@@ -27,6 +28,14 @@ class JudgedModel(TypedDict):
     statement: Annotated[str, "The same in a sentence."]
     cameras: Annotated[list[str], "To be looked at, the least trusted first."]
     reasons: Annotated[list[str], "Why the grade is not better."]
+
+
+class EarthDatum(TypedDict):
+    """A point on the WGS84 ellipsoid: the origin of axes east, north and up, in meters."""
+
+    latitude_deg: Annotated[float, "Geodetic latitude."]
+    longitude_deg: Annotated[float, "Longitude, east of Greenwich."]
+    altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
 
 
 class LooseGroup(TypedDict):
@@ -236,6 +245,10 @@ class LocateSummary(PlacementSummary):
     mean_reprojection_error_px: Annotated[float | None, "Of these points; null if there are none."]
     num_points_as_nodes: Annotated[int, "Tracks that joined the view graph."]
     scale: Annotated[str, "Scale, origin and axes of the output, in words."]
+    scale_sigma: Annotated[
+        float | None, "Relative standard deviation of a scale that rigs or priors tell; else null."
+    ]
+    datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[
         list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
@@ -334,6 +347,14 @@ class Alignment(TypedDict):
     translation: Annotated[list[float], "In the reference's units."]
 
 
+class WorstCamera(TypedDict):
+    """A camera that is farthest off."""
+
+    name: Annotated[str, "Of its image."]
+    position_error: Annotated[float, "In the reference's units."]
+    rotation_error_deg: Annotated[float, "What remains after the best global rotation."]
+
+
 class EvaluateSummary(TypedDict):
     """What `sfm-shapefit evaluate --json` prints."""
 
@@ -348,6 +369,14 @@ class EvaluateSummary(TypedDict):
     position_error: Annotated[ErrorSummary, "In the reference's units."]
     rotation_error_deg: Annotated[ErrorSummary, "What remains after the best global rotation."]
     recall: Annotated[list[Recall], "At shares of the extent, then at the thresholds that were asked for."]
+    relative_pose_auc: Annotated[
+        list[RelativePoseAuc], "Over all pairs of the reference's cameras, at 0.5, 1, 5 and 10 degrees."
+    ]
+    trajectory: Annotated[
+        TrajectoryErrors | None,
+        "ATE and RPE in the order of the names; null unless --trajectory asks for them.",
+    ]
+    worst: Annotated[list[WorstCamera], "The ten cameras with the largest position errors, the worst first."]
     ref_from_model: Annotated[Alignment, "From the model's world to the reference's."]
     rotation_ref_from_model: Annotated[list[list[float]], "The rotations' own alignment, 3 rows."]
     degenerate: Annotated[bool, "Whether the centers lie on a line."]

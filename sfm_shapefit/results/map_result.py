@@ -4,6 +4,7 @@ OUT/0, OUT/1, ...   models, largest first: each a folder as `locate` writes it
 OUT/map.json        the averaging behind each, and the images in no model with the reason
 """
 
+import html
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -14,6 +15,7 @@ from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION
 from sfm_shapefit.rotations.averaged import AveragedRotations
+from sfm_shapefit.wording import counted
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,5 +75,10 @@ class MapResult(Displayed):
         }
         return dict(facts)
 
+    def _repr_html_(self) -> str:
+        """Return what matters of all models, and what the largest shows of itself."""
+        return f"<p>{html.escape(self._headline())}</p>{self.models[0].located._repr_html_()}"
+
     def _headline(self) -> str:
-        return f"{self.num_placed} of {self.num_images} images placed in {len(self.models)} models"
+        models = counted(len(self.models), "model")
+        return f"{self.num_placed} of {self.num_images} images placed in {models}"

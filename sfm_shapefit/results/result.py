@@ -20,14 +20,18 @@ from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
+from sfm_shapefit.results.columns import Column, TableName, table_of
+from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
+from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
 from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import RigidPiece
 from sfm_shapefit.solver.options import SolverResult
+from sfm_shapefit.wording import counted
 
 if TYPE_CHECKING:
     import pycolmap
@@ -110,7 +114,16 @@ class LocateResult(Displayed):
 
     def _headline(self) -> str:
         images = f"{self.reconstruction.num_reg_images()} of {len(self.image_names)} images placed"
-        return f"{self.verdict.grade.value}: {images}, {self.reconstruction.num_points3D()} points"
+        return f"{self.verdict.grade.value}: {images}, {counted(self.reconstruction.num_points3D(), 'point')}"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.warnings]
+        return notebook_html(self, [*headline_of_model(self).rows(), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, 3)
 
     @cached_property
     def image_names(self) -> tuple[str, ...]:
@@ -155,7 +168,7 @@ class LocateResult(Displayed):
             reason = CARRIED_FIXED if is_fixed else CARRIED_BY_FRAME
             rows[camera] = replace(rows[camera], placed=True, piece=0, center=center, reason=reason)
         for camera, count in self.few_points.items():
-            reason = f"it sees {count} points, fewer than {self.options.min_points_per_image}"
+            reason = f"it sees {counted(count, 'point')}, fewer than {self.options.min_points_per_image}"
             rows[camera] = replace(rows[camera], reason=reason)
         unposed = sorted(set(self.image_names) - set(self.model.names))
         return rows + [CameraRow(name=name, reason="the input has no rotation for it") for name in unposed]
@@ -273,6 +286,15 @@ class GraphResult(Displayed):
     def _headline(self) -> str:
         placed, total = len(self.placement.cameras), self.placement.graph.num_nodes
         return f"{placed} of {total} nodes placed, {self.placement.num_pairs} pairs"
+
+    def _repr_html_(self) -> str:
+        """Return verdict, figures and warnings, and the report with its scene."""
+        warnings = [("warning", warning) for warning in self.summary()["warnings"]]
+        return notebook_html(self, [*headline_of_graph(self).rows(), *warnings])
+
+    def table(self, name: TableName) -> dict[str, Column]:
+        """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
+        return table_of(self, name, self.placement.graph.dimension)
 
     @cached_property
     def departure(self) -> Departure:

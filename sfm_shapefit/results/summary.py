@@ -13,6 +13,7 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.results.json_types import (
     BundleAdjustment,
+    EarthDatum,
     GraphSummary,
     LocateSummary,
     Lud,
@@ -67,6 +68,8 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "mean_reprojection_error_px": model.compute_mean_reprojection_error(),
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
+        "scale_sigma": found.gauge.scale_sigma,
+        "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
         "adjustment": _summarize_adjustment(found),

@@ -93,11 +93,9 @@ def write_rows(
     rows: Sequence[CameraRow] | Sequence[PairRow], row_type: type, dimension: int, path: Path
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
-    axes = axis_names(dimension)
-    per_axis = {name: [prefix + axis for axis in axes] for name, prefix in _PREFIXES.items()}
     names = [field.name for field in fields(row_type)]
     values_of, nothing = attrgetter(*names), ("",) * dimension
-    is_vector = [name in per_axis for name in names]
+    is_vector = [name in _PREFIXES for name in names]
 
     def cells(row: CameraRow | PairRow) -> list[object]:
         found: list[object] = []
@@ -108,7 +106,7 @@ def write_rows(
                 found.append(_cell(value))
         return found
 
-    columns = [column for name in names for column in per_axis.get(name, [name])]
+    columns = [column for name in names for column in columns_of_field(name, dimension)]
     _write_csv(columns, map(cells, rows), path)
 
 
@@ -139,6 +137,11 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
             )
             for cells in csv.DictReader(stream)
         ]
+
+
+def columns_of_field(name: str, dimension: int) -> list[str]:
+    """Return the columns of a row's field: one, or one per axis of a vector."""
+    return [_PREFIXES[name] + axis for axis in axis_names(dimension)] if name in _PREFIXES else [name]
 
 
 def axis_names(dimension: int) -> list[str]:

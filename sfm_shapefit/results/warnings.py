@@ -63,7 +63,7 @@ def uncertain_cameras(placement: Placement) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
+    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * extent_of(placement.locations))
 
 
 def _largest_sigmas(placement: Placement) -> FloatArray:
@@ -78,13 +78,17 @@ def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
         yield "standard deviations are left out: the graph is too large, or too loose, for their factor"
     if len(uncertain):
         worst = placement.graph.name_of(int(placement.cameras[np.argmax(largest)]))
-        yield (
-            f"{len(uncertain)} cameras are uncertain by more than {_UNCERTAIN_SHARE:.0%} of the extent, "
-            f"above all {worst}; see sigma and trust in cameras.csv"
-        )
+        share, see = f"{_UNCERTAIN_SHARE:.0%}", "see sigma and trust in cameras.csv"
+        if len(uncertain) == 1:
+            yield f"{worst} is uncertain by more than {share} of the extent; {see}"
+        else:
+            yield (
+                f"{len(uncertain)} cameras are uncertain by more than {share} of the extent, above all "
+                f"{worst}; {see}"
+            )
 
 
-def _extent(locations: FloatArray) -> float:
+def extent_of(locations: FloatArray) -> float:
     """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
     distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
     inside = locations[distances <= _INSIDE * median_spread(locations)]
@@ -113,10 +117,14 @@ def trust_warnings(placement: Placement, kept: BoolArray) -> Iterator[str]:
     """Yield which cameras are left out for want of trust, if any are."""
     lost = np.flatnonzero(~kept)
     if len(lost):
-        yield (
-            f"{len(lost)} cameras are left out because they are not trusted, above all "
-            f"{_least_trusted(placement, lost)}; --min-trust 0 keeps them"
-        )
+        worst = _least_trusted(placement, lost)
+        if len(lost) == 1:
+            yield f"1 camera is left out because it is not trusted: {worst}; --min-trust 0 keeps it"
+        else:
+            yield (
+                f"{len(lost)} cameras are left out because they are not trusted, above all {worst}; "
+                "--min-trust 0 keeps them"
+            )
 
 
 def ambiguity_warnings(placement: Placement) -> Iterator[str]:

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sfm_shapefit.arrays import BoolArray, FloatArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.display import Displayed
 
 Averaging = Literal["own", "pycolmap"]
@@ -49,7 +49,7 @@ class AveragedRotations(Displayed):
         """Which images have a rotation that most of their pairs contradict, in every answer tried, (n,)."""
         return np.asarray(self.registered & (self.best_agreements < 0.5))
 
-    def subset(self, images: BoolArray) -> "AveragedRotations":
+    def subset(self, images: BoolArray | IntArray) -> "AveragedRotations":
         """Return the answer for some of the images, in their order."""
         return replace(
             self,
@@ -59,6 +59,11 @@ class AveragedRotations(Displayed):
             agreements=self.agreements[images],
             best_agreements=self.best_agreements[images],
         )
+
+    def turned(self, frames: IntArray, sensor_rotations: FloatArray) -> "AveragedRotations":
+        """Return the answer for images by their frames (m,) and the rotations of their sensors (m, 3, 3)."""
+        own = self.subset(frames)
+        return replace(own, rotations=sensor_rotations @ own.rotations)
 
     @property
     def statement(self) -> str:

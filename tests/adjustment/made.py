@@ -31,9 +31,20 @@ def look_at(centers, targets):
 
 
 def ring_problem(
-    rng, num_cameras=12, num_points=200, *, models=("SIMPLE_PINHOLE",), noise_px=0.5, share=0.5, sensors=0
+    rng,
+    num_cameras=12,
+    num_points=200,
+    *,
+    models=("SIMPLE_PINHOLE",),
+    noise_px=0.5,
+    share=0.5,
+    sensors=0,
+    offset=0.3,
 ):
-    """Return the truth with noisy pixels; with `sensors` > 0, each frame is a rig of so many cameras."""
+    """Return the truth with noisy pixels; with `sensors` > 0, each frame is a rig of so many cameras.
+
+    These stand about `offset` from its origin.
+    """
     angles = 2.0 * np.pi * np.arange(num_cameras) / num_cameras
     centers = np.stack([4.0 * np.cos(angles), 4.0 * np.sin(angles), 0.5 * np.sin(3.0 * angles)], axis=1)
     points = rng.uniform(-1.0, 1.0, (num_points, 3))
@@ -46,7 +57,7 @@ def ring_problem(
         rig = Rig(
             frame_of_camera=np.repeat(np.arange(num_cameras), sensors),
             rotations=np.tile(turns, (num_cameras, 1, 1)),
-            translations=np.tile(0.3 * rng.standard_normal((sensors, 3)), (num_cameras, 1)),
+            translations=np.tile(offset * rng.standard_normal((sensors, 3)), (num_cameras, 1)),
         )
     cameras, seen = np.nonzero(rng.random((count, num_points)) < share)
     problem = AdjustmentProblem(

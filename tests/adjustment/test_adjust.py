@@ -18,6 +18,7 @@ from sfm_shapefit.adjustment import (
     Rig,
     RotationPrior,
     adjust,
+    frames_not_gained,
     isotropic_information,
     reprojection_errors_px,
 )
@@ -272,6 +273,17 @@ def test_a_camera_without_observations_and_a_point_behind_all_are_held():
         np.testing.assert_array_equal(found.problem.centers[n], extra.centers[n])
         np.testing.assert_array_equal(found.problem.points[k], extra.points[k])
         assert error(replace(found.problem, fixed=[], centers=found.problem.centers), extra) < 0.1
+
+
+def test_a_frame_that_was_led_away_from_a_better_pose_is_told_from_those_that_gained():
+    _, start = make_start()
+    found = adjust(start, TIGHT).problem
+    assert not frames_not_gained(start, found, 2.0).any()
+    away = found.centers.copy()
+    away[3] += [0.5, 0.0, 0.0]
+    np.testing.assert_array_equal(
+        np.flatnonzero(frames_not_gained(start, replace(found, centers=away), 2.0)), [3]
+    )
 
 
 def test_points_of_one_view_do_no_harm():

@@ -14,7 +14,7 @@ from sfm_shapefit.adjustment import (
     shared_errors,
 )
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
-from sfm_shapefit.geometry import fit_similarity_l1
+from sfm_shapefit.geometry import METRIC_SIGMA, fit_similarity_l1
 from tests.adjustment.made import ring_problem
 
 OPTIONS = AdjustmentOptions(loss_scale_px=1.0, noise_px=0.5, cost_tolerance=1e-8)
@@ -59,6 +59,26 @@ def test_errors_under_known_noise_are_as_large_as_stated(case):
             truth = replace(truth, rotation_prior=prior)
         found.append(ratios(truth, options, start=start, align=case != "fixed")[0])
     assert 0.75 < rms(np.concatenate(found)) < 1.25
+
+
+@pytest.mark.parametrize(("offset", "is_metric"), [(0.3, True), (3e-5, False)])
+def test_the_scale_of_a_rig_is_as_well_known_as_stated(offset, is_metric):
+    """Noise of 0.5 of 500 px at a distance of 4 is 4e-3: offsets must be more than that."""
+    scales, errors = [], []
+    for seed in range(6):
+        truth = ring_problem(np.random.default_rng(seed), 12, 400, share=0.4, sensors=2, offset=offset)
+        adjusted = adjust(truth, OPTIONS).problem
+        found = estimate_center_errors(adjusted, OPTIONS)
+        fit = fit_similarity_l1(adjusted.centers, truth.centers, rotate=True)
+        off = fit.apply(adjusted.centers) - truth.centers
+        scales.append((1.0 / fit.scale - 1.0) / found.scale_sigma)
+        assert (found.scale_sigma < METRIC_SIGMA) == is_metric
+        variances = fit.scale**2 * np.einsum("naa->n", found.covariances)
+        errors.append(np.sqrt(np.sum(off**2, axis=1) / variances))
+    # Six draws of one number: their rms is below 0.4 or above 1.8 once in a hundred times.
+    assert 0.4 < rms(scales) < 1.8 or not is_metric
+    # The shape is as well known where the scale is not: the covariances are of it.
+    assert 0.75 < rms(np.concatenate(errors)) < 1.25
 
 
 def test_errors_of_rotations_that_are_held_are_in_it():

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 import sfm_shapefit
 from sfm_shapefit import atomic_folder as output
 from sfm_shapefit.cli import app
+from sfm_shapefit.commands.map import database_in
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.viewgraph import ViewGraph
@@ -38,8 +40,13 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
-    for words in ("8 of 8 images", "certified to", "locate.json"):
+    for words in ("8 of 8 images", "typical pair error", "typical deviation", "locate.json"):
         assert words in result.stdout
+    assert "certified" not in result.stdout  # but with --verbose
+    *_, verdict, report, command = result.stdout.splitlines()
+    assert verdict == "verdict: good"
+    assert report == f"next:    open {out / 'report.html'}"
+    assert command == f"         colmap bundle_adjuster --input_path {out} --output_path ADJUSTED"
     assert result.stderr == ""
 
 
@@ -295,7 +302,11 @@ def test_evaluate_prints_a_table_json_and_csv_and_writes_over_no_other_file(ring
     assert "8 in common of 8" in table.stdout
     errors = json.loads(run(*arguments, "--json").stdout)
     assert errors["position_error"]["max"] < 1e-5
-    assert errors["recall"][-1] == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0}
+    last = errors["recall"][-1]
+    assert last == {"threshold": 0.5, "fraction_of_extent": None, "recall": 1.0, "auc": last["auc"]}
+    assert last["auc"] > 0.9999
+    assert "rotation error" in table.stdout
+    assert re.search(r"ATE +│ rms \d", run(*arguments, "--trajectory", code=0).stdout)
     lines = (tmp_path / "errors.csv").read_text().splitlines()
     assert lines[0] == "name,position_error,rotation_error_deg,x,y,z"
     assert len(lines) == 9
@@ -367,3 +378,50 @@ def test_the_program_itself_runs_and_exits_with_its_code(tmp_path):
     assert done.returncode == 3
     assert done.stdout == ""
     assert done.stderr.count("\n") == 1
+
+
+def test_arguments_in_the_wrong_order_are_told_so_before_anything_is_read(ring_run, tmp_path):
+    for first in (tmp_path / "new", ring_run[1]):
+        said = run_refused("locate", first, RING_MODEL, "--overwrite")
+        assert "the order is MODEL OUT" in said
+        assert f"give {RING_MODEL} first" in said
+    assert "the order is DATABASE OUT" in run_refused("map", tmp_path / "new", RING / "database.db")
+    assert "the order is GRAPH OUT" in run_refused("place", tmp_path / "new", BUNDLED / "graph40.txt")
+
+
+@pytest.mark.parametrize("command", ["inspect", "locate", "place"])
+def test_a_database_in_the_place_of_a_model_is_told_which_command_takes_it(command, tmp_path):
+    out = [] if command == "inspect" else [tmp_path / "out"]
+    said = run_refused(command, RING / "database.db", *out)
+    assert "is a database: `sfm-shapefit map`" in said
+    assert "--database" in said
+
+
+def test_a_file_that_is_missing_is_said_to_be_missing(tmp_path):
+    for arguments in (
+        ("place", "missing.txt", tmp_path / "out"),
+        ("locate", RING_MODEL, tmp_path / "out", "--priors", "missing.txt"),
+        ("locate", RING_MODEL, tmp_path / "out", "--fix", "missing.txt"),
+    ):
+        assert run_refused(*arguments) == "sfm-shapefit: missing.txt does not exist\n"
+    flag = ("--config", "missing.toml")
+    assert "missing.toml does not exist" in run("locate", RING_MODEL, tmp_path / "o", *flag, code=2).output
+
+
+def test_map_takes_a_folder_by_its_database_and_refuses_one_without(tmp_path):
+    assert database_in(RING) == RING / "database.db"
+    assert database_in(RING / "database.db") == RING / "database.db"
+    assert "without a database.db" in run_refused("map", RING_MODEL, tmp_path / "out")
+
+
+def test_what_is_not_installed_has_an_exit_code_of_its_own(ring_run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    assert "the viewer needs viser: pip install" in run_refused("view", ring_run[1], code=5)
+
+
+def test_the_values_that_flags_take_are_named_in_words():
+    text = run("locate", "-h").stdout
+    assert "--known-distance NAME NAME DISTANCE" in text
+    assert "--fix FILE|solved" in text
+    for word in ("<str>", "<int>", "<float>", "str,str"):
+        assert word not in text

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from collections import defaultdict
 from functools import partial
 
@@ -14,6 +15,10 @@ import pytest
 from sfm_shapefit import locate
 from sfm_shapefit.cli import console
 from sfm_shapefit.cli.console import show_progress
+from sfm_shapefit.cli.flags import OutputFlags
+from sfm_shapefit.cli.frame import Run
+from sfm_shapefit.kernel_cache import counted_as_compiling, measure_compilation
+from sfm_shapefit.results.model_verdict import Grade, ModelVerdict
 from tests.program import run
 from tests.scenes import FACADE, RING, ROOT
 
@@ -99,11 +104,12 @@ def test_verbose_lets_pycolmap_speak_and_lists_seconds_per_stage(tmp_path, capfd
     native = capfd.readouterr().err
     if not verbose:
         assert (done.stderr, native) == ("", "")
-        assert re.search(r"time +│ \d+\.\d s +│", done.stdout)
+        assert re.search(r"time +│ \d+\.\d s[ ,]", done.stdout)
+        assert "bundle adjustment" not in done.stdout
         return
     assert "Bundle adjustment report" in native
     assert "sfm-shapefit: directions\n" in done.stderr
-    assert re.search(r"time +│ \d+\.\d s \(read \d+\.\d\d, directions \d+\.\d\d", done.stdout)
+    assert re.search(r"time +│ \d+\.\d s .*\(read \d+\.\d\d, directions", done.stdout)
     assert "bundle adjustment" in done.stdout
 
 
@@ -132,3 +138,50 @@ def test_json_means_the_same_on_any_stdout(monkeypatch, encoding):
     shown = written(monkeypatch, encoding, partial(console.print_json, summary))
     assert json.loads(shown) == summary
     assert ("\u0663" in shown) == (encoding == "utf-8")
+
+
+class Terminal(io.TextIOWrapper):
+    """A stdout that says it is a terminal."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_color_terminal_shows_warnings_and_verdict_in_color_unless_no_color_is_wanted(monkeypatch):
+    verdict = ModelVerdict(grade=Grade.LOOK, cameras=("a.jpg",), reasons=())
+
+    def shown(**environment):
+        with monkeypatch.context() as patch:
+            for name, value in ({"TERM": "xterm-256color"} | environment).items():
+                patch.setenv(name, value)
+            raw = io.BytesIO()
+            patch.setattr(sys, "stdout", Terminal(raw, encoding="utf-8"))
+            console.print_table("title", [("placed", "8 of 8"), ("warning", "look out")])
+            console.print_ending(verdict, ["open out/report.html"])
+            sys.stdout.flush()
+            return raw.getvalue().decode()
+
+    colored = shown()
+    assert re.search("\x1b\\[1;33mlook out\x1b\\[0m", colored)
+    assert "\x1b[1;33mlook at 1 camera (a.jpg)" in colored
+    assert "33m" not in shown(NO_COLOR="1")
+
+
+def test_a_path_that_is_longer_than_the_table_is_folded_not_cut(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "40")
+    path = "/" + "/".join(f"folder{k}" for k in range(12))
+    shown = written(monkeypatch, "utf-8", partial(console.print_table, path, [("written to", path)]))
+    assert "\u2026" not in shown
+    assert path in "".join(shown.replace("│", " ").split()).partition("writtento")[2].replace("┘", "")
+
+
+def test_a_run_says_how_much_of_its_time_went_into_compiling(monkeypatch):
+    with measure_compilation() as spent, counted_as_compiling(), counted_as_compiling():
+        time.sleep(0.02)
+    assert 0.02 <= spent.seconds < 1.0  # once, though one counted inside the other
+    run_ = Run(options=None, flags=OutputFlags(), protect=[], compiling=spent)
+    assert "compiling" not in run_._describe_time({})
+    spent.seconds = 97.2
+    assert re.fullmatch(
+        r"\d+\.\d s, of which 97 s compiling kernels, once", run_._describe_time({"read": 1.0})
+    )

@@ -14,7 +14,7 @@ import pytest
 
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
-from sfm_shapefit.colmap.model import PosedModel, read_model, track_matches, world_rays
+from sfm_shapefit.colmap.model import PosedModel, camera_rays, read_model, track_matches, world_rays
 from sfm_shapefit.commands.evaluate import evaluate
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import angle_between_deg, normalized
@@ -421,6 +421,21 @@ def test_rays_of_every_camera_model_project_back_to_their_pixel(camera_model):
     focal_px = 640 / (2 * np.pi) if camera_model == "EQUIRECTANGULAR" else 500.0
     assert model.focal_lengths_px[1] == pytest.approx(focal_px)
     assert world_rays(model, 0, np.zeros((0, 2))).shape == (0, 3)
+
+
+def test_rays_that_a_fisheye_folds_back_are_none():
+    """A lens of 129 px per radian: 205 px are 85 degrees, and from 217 px on it looks behind itself."""
+    focal = [129.15, 129.26, 240.0, 240.0]
+    camera = pycolmap.Camera(
+        camera_id=1,
+        model="OPENCV_FISHEYE",
+        width=480,
+        height=480,
+        params=[*focal, 0.038, -0.008, 0.0083, -0.0027],
+    )
+    xy = np.array([[240.0 + radius, 240.0] for radius in (100.0, 205.0, 218.0, 230.0)])
+    assert np.isfinite(camera.cam_ray_from_img(xy)[:3]).all()  # wrong ones among them
+    assert np.isfinite(camera_rays(camera, xy)).all(axis=1).tolist() == [True, True, False, False]
 
 
 def brute_force_tracks(scene: pycolmap.Reconstruction) -> dict[tuple[int, int], set[tuple[int, int]]]:

@@ -16,7 +16,7 @@ from sfm_shapefit import LocateOptions, locate
 from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.atomic_folder import atomic_folder
 from sfm_shapefit.colmap.adjustment import lens_of
-from sfm_shapefit.colmap.bundle_adjustment import Given, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
@@ -459,7 +459,7 @@ def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     assert fixed.reconstruction.camera(3).params[0] == 808.0
     doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
     for adjuster in ("own", "ceres"):
-        given = Given(lenses=FreeLenses(doubts, distortion=False))
+        given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
         found = bundle_adjust(seed, graph, adjuster=adjuster, given=given)
         for camera_id, camera in found.reconstruction.cameras.items():
             if camera_id == 3:

@@ -47,6 +47,34 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
 
 
+def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    ids = ", ".join(map(str, truth.image_ids[:4].tolist()))
+    across = f"(pair_id / {PAIR} IN ({ids})) != (pair_id % {PAIR} IN ({ids}))"
+    turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()
+    positions = dict(zip(truth.names, 2.0 * truth.centers @ turn.T + 100.0, strict=True))
+    table = tmp_path / "priors.txt"
+    table.write_text(
+        "\n".join(f"{n} {x} {y} {z}" for n, (x, y, z) in positions.items() if n in truth.names[4:])
+    )
+    found = sfm_shapefit.map_database(
+        changed(RING, tmp_path / "copy", f"DELETE FROM two_view_geometries WHERE {across}"),
+        priors=table,
+        refine_with_priors=True,
+        **FAST,
+    )
+    scales = {}
+    for model in found.models:
+        scales[model.names[0] in truth.names[:4]] = model.located.gauge.scale
+        if model.located.gauge.scale == "prior":
+            images = model.located.reconstruction.images.values()
+            off = [image.projection_center() - positions[image.name] for image in images if image.has_pose]
+            # Half a pixel, as far as the placement alone is off; the scene is 20 units across.
+            assert len(off) == 4
+            assert np.abs(off).max() < 0.05
+    assert scales == {True: "unit", False: "prior"}
+
+
 def test_the_command_adjusts_prints_one_object_and_replaces_only_its_own_output(tmp_path):
     database = RING / "database.db"
     arguments = ["map", database, tmp_path / "out", "--bundle-adjust", "--points", "never", "--json"]

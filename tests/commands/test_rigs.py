@@ -9,6 +9,7 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError, LocateOptions, UnsolvableError
+from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.seed import build_seed
 from sfm_shapefit.commands.write import write_result
@@ -16,7 +17,7 @@ from sfm_shapefit.geometry import fit_similarity
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run
-from tests.scenes import RING, copied
+from tests.scenes import RING, copied, edit_database
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +269,7 @@ def test_a_frame_with_a_fixed_image_stays_and_the_others_keep_the_metric_scale(r
     [
         ("0001.jpg\nnobody.jpg\n", "line 2: the model has no posed image 'nobody.jpg'"),
         ("# nobody\n", "names no image"),
-        (None, "is not a readable text file"),
+        (None, "does not exist"),
         ("0001.jpg\n0002.jpg\n0003.jpg\n", "the 3 fixed cameras stand at one place"),
     ],
 )
@@ -286,7 +287,7 @@ def test_names_that_fit_nothing_and_cameras_without_positions_are_refused(tmp_pa
 def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
     scene, names = copied(RING, tmp_path), tmp_path / "names.txt"
     names.write_text("0001.jpg\n0002.jpg\n0003.jpg\n")
-    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--fix"]
+    arguments = ["locate", scene / "sparse" / "0", tmp_path / "out", "--verbose", "--fix"]
     done = run(*arguments, names, code=0)
     assert "3 cameras fixed; 3 pairs inside them give no constraint" in " ".join(
         done.output.replace("│", " ").split()
@@ -295,3 +296,55 @@ def test_the_command_takes_names_and_prints_what_moved_together(tmp_path):
     for k in (1, 2, 3):
         np.testing.assert_array_equal(after[f"000{k}.jpg"], given[f"000{k}.jpg"])
     run(*arguments, tmp_path / "none.txt", "--overwrite", code=3)
+
+
+@pytest.fixture(scope="module")
+def mapped(workspace):
+    return sfm_shapefit.map_database(workspace / "database.db")
+
+
+def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspace):
+    (model,) = mapped.models
+    assert (mapped.num_placed, mapped.left_out, mapped.warnings) == (36, {}, ())
+    assert model.located.gauge.scale == "rig"
+    errors = sfm_shapefit.evaluate(model.located.reconstruction, workspace / "truth")
+    assert abs(errors.ref_from_model.scale - 1.0) < 1e-3
+    # Half a pixel of noise; `locate` with the true rotations ends at 0.001 of an extent of 10.
+    assert errors.position.max < 0.01
+    ours, theirs = (
+        read_model(given).reconstruction for given in (model.located.reconstruction, workspace / "truth")
+    )
+    for rig_id, rig in theirs.rigs.items():
+        for sensor, pose in rig.non_ref_sensors.items():
+            np.testing.assert_allclose(
+                ours.rig(rig_id).sensor_from_rig(sensor).matrix(), pose.matrix(), atol=1e-12
+            )
+
+
+def test_a_rig_with_an_uncalibrated_sensor_is_left_aside_and_named(workspace, tmp_path):
+    path = edit_database(
+        copied(workspace, tmp_path) / "database.db",
+        "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2",
+    )
+    images = read_images(path)
+    assert images.rigs.uncalibrated == (1,)
+    assert list(images.rigs.rigs) == [2]
+    of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
+    assert set(images.rigs.place_of_image) == of_second
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE rig_sensors SET sensor_from_rig = x'00'", "the pose of a sensor in rig 1 is damaged"),
+        ("UPDATE rig_sensors SET sensor_id = 99 WHERE sensor_id = 3", "rig 1 refers to camera 99"),
+        ("UPDATE rigs SET ref_sensor_id = 77 WHERE rig_id = 1", "rig 1 refers to camera 77"),
+        ("UPDATE rigs SET ref_sensor_id = 2 WHERE rig_id = 1", "camera 2 stands twice in rig 1"),
+        ("UPDATE frame_data SET sensor_id = 3 WHERE data_id = 2", "frame 1 has image 2 at another camera"),
+        ("UPDATE frame_data SET frame_id = 1", "an image of frame 1 stands twice"),
+    ],
+)
+def test_a_damaged_rig_of_a_database_is_named(workspace, tmp_path, statement, message):
+    path = edit_database(copied(workspace, tmp_path) / "database.db", statement)
+    with pytest.raises(InputError, match=message):
+        read_images(path)

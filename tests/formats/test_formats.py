@@ -69,8 +69,11 @@ def test_a_written_graph_is_read_back_to_the_bit(tmp_path, weighted):
         np.testing.assert_array_equal(getattr(again, name), getattr(graph, name))
 
 
-def test_the_bundled_graph_is_the_one_that_its_script_makes():
-    from scripts.make_data import bundled_graph_text
+def test_the_bundled_graph_and_tables_are_those_that_their_script_makes():
+    from scripts.make_data import bundled_graph_text, measured_positions_text, names_text
+
+    assert (BUNDLED / "gps.csv").read_text() == measured_positions_text()
+    assert (BUNDLED / "names.txt").read_text() == names_text()
 
     ours = read_graph(BUNDLED / "graph40.txt")
     lines = bundled_graph_text().splitlines()[1:]
@@ -125,7 +128,7 @@ def test_solve_places_a_bare_graph(tmp_path, d):
 
 
 def test_missing_and_binary_files_are_refused_and_a_graph_that_determines_nothing_exits_with_4(tmp_path):
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="does not exist"):
         read_graph(tmp_path / "nowhere.txt")
     (tmp_path / "binary").write_bytes(bytes(range(256)))
     with pytest.raises(InputError, match="not a readable"):

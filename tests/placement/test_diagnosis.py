@@ -148,7 +148,7 @@ def test_inspect_says_what_locate_would_do_and_changes_nothing(tmp_path):
         "found beside the model",
         "176 usable",
         "tracks join as nodes",
-        "1 (25 cameras)",
+        "1 (of 25 cameras)",
         "newton:",
     ):
         assert words in text

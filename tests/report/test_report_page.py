@@ -10,10 +10,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
+from sfm_shapefit.report.headline import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
-from sfm_shapefit.report.sentences import first_looks, shorten, summary_sentences
+from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
+from sfm_shapefit.report.thumbnails import read_thumbnails
 from tests.drawings import make_drawing
 
 HOSTILE = [
@@ -66,12 +70,11 @@ def test_columns_survive_the_way_into_the_page_by_trust_and_contradicting_pairs_
 
 def test_the_page_is_small_and_quickly_made_and_the_same_for_the_same_scene():
     drawing, facts = make_drawing(1000, 20_000, 20_000)
-    first = report_html(drawing, facts)  # reads plotly.js, once per process
     start = time.process_time()
     page = report_html(drawing, facts)
     assert time.process_time() - start < 2.0  # the requirement; 0.1 s here
-    assert len(page.encode()) < 8_000_000
-    assert page == first
+    assert len(page.encode()) < 2_500_000
+    assert page == report_html(drawing, facts)
 
 
 def test_of_many_pairs_the_worst_are_listed_and_the_page_says_so():
@@ -94,35 +97,30 @@ def test_hostile_names_stay_text_in_the_file():
     page = report_html(drawing, facts)
     assert page.count("<script") == report_html(*make_drawing()).count("<script")
     assert "<img" not in page.split("<script>", 1)[0]
-    assert "<title>&lt;script&gt;" in page
+    assert "<title>script&gt;.jpg" in page
     names = data_of(page)["cameras"]["names"]
     assert sorted(names) == sorted(shorten(name) for name in HOSTILE)
     assert max(map(len, names)) < 200
     page.encode("utf-8")  # lone surrogates would raise
 
 
-def test_only_the_two_scripts_of_the_page_may_run_and_nothing_be_fetched(page):
+def test_only_the_script_of_the_page_may_run_and_nothing_be_fetched(page):
     policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page).group(1)
-    scripts = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
-    assert len(scripts) == 2
-    for script in scripts:
-        assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in policy
+    (script,) = re.findall(r"<script>(.*?)</script>", page, flags=re.DOTALL)
+    assert base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() in policy
     assert "default-src 'none'" in policy
-    assert "'unsafe-inline'" not in policy.split("script-src")[1].split(";")[0]
-    own = page.replace(scripts[0], "")  # beside plotly.js
-    assert not re.findall(r"(?:src|href)\s*=\s*[\"'](?!data:,)", own)
-    assert "http" not in own.replace("http-equiv", "")
+    assert "unsafe" not in policy.split("script-src")[1].split(";")[0]
+    assert not re.findall(r"(?:src|href)\s*=\s*[\"'](?!data:,)", page)
+    assert "http" not in page.replace("http-equiv", "").replace("http://www.w3.org/2000/svg", "")
 
 
 def test_the_words_say_what_is_placed_and_what_to_look_at():
     drawing, facts = make_drawing()
     text = " ".join(summary_sentences(drawing, facts))
-    assert "24 of 25 images were placed; 1 is not" in text
-    assert "18 contradict it" in text
-    assert text.startswith("Verdict: look at 1 camera (images/IMG_00000.jpg). 24 of 25")
-    assert text.endswith(
-        "The certificate: ShapeFit's optimum is certified to 3.0e-09; delivered: that optimum."
-    )
+    assert text.startswith("24 of 25 cameras are placed; 1 is not in this model.")
+    assert "18 contradict them" in text
+    assert text.endswith("Units and axes: scale and origin of the input's centers.")
+    assert "ShapeFit's optimum is certified to 3.0e-09" in " ".join(expert_sentences(facts))
     looks = first_looks(drawing, facts)
     assert looks[0].text == facts["warnings"][0]
     assert any(look.camera == 24 and "not placed" in look.text for look in looks)
@@ -133,30 +131,122 @@ def test_the_words_say_what_is_placed_and_what_to_look_at():
     assert drawing.pairs.support[pair] == drawing.pairs.support[against].max()
 
 
+def test_a_warning_leads_to_its_camera_and_is_not_said_of_one_that_is_listed_anyway():
+    drawing, facts = make_drawing()
+    facts["warnings"] = [f"{name} looks odd" for name in drawing.cameras.names]
+    looks = first_looks(drawing, facts)
+    odd = [look.camera for look in looks if "looks odd" in look.text]
+    listed = [look.camera for look in looks if "is not placed" in look.text or "has trust" in look.text]
+    assert sorted([*odd, *listed]) == list(range(25))
+
+
+@pytest.mark.parametrize(
+    ("grade", "adjusted", "headline", "command"),
+    [
+        ("good", None, "Good: this model can be used", "bundle_adjuster"),
+        ("good", {"converged": True}, "Good: this model can be used", "image_undistorter"),
+        ("look", None, "Look at 2 cameras first", "bundle_adjuster"),
+        ("do not use", None, "Do not use this model", "inspect 'a folder/sparse/0'"),
+    ],
+)
+def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, headline, command):
+    drawing, facts = make_drawing()
+    reasons = ["only 30% of the pairs agree"] if grade == "do not use" else []
+    facts["verdict"] = {"grade": grade, "cameras": list(drawing.cameras.names[:2]), "reasons": reasons}
+    facts |= {"bundle_adjustment": adjusted}
+    facts["inputs"]["model"] = "a folder/sparse/0"
+    found = banner(drawing, facts)
+    assert (found["grade"], found["headline"]) == (grade, headline)
+    assert command in found["command"]
+    said = {
+        "good": "24 of 25 cameras are placed; 1 is not in this model, 95 of 120 pairs agree",
+        "look": "IMG_00000.jpg, images/IMG_00001.jpg may be wrong",
+        "do not use": "Only 30% of the pairs agree.",
+    }
+    assert said[grade] in found["sentence"]
+
+
+def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are():
+    drawing, facts = make_drawing()
+    shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
+    assert shown["cameras placed"] == "24 of 25"
+    assert shown["typical error of a pair"] == "1.4 px, 0.08°"  # 1000 px * tan(0.08 deg)
+    assert shown["camera to check"] == "1"
+    sigma = next(value for label, value in shown.items() if label.startswith("typical uncertainty"))
+    assert sigma == f"± {np.median(drawing.cameras.sigmas[:24]):.2g} units"
+
+
+def test_agreeing_pairs_and_median_errors_are_counted_per_camera():
+    pairs = make_drawing()[0].pairs
+    agreeing, errors = pairs.per_camera(26)  # the last has no pair
+    for camera in (0, 7, 25):
+        own = (pairs.cameras == camera).any(axis=1)
+        assert agreeing[camera] == np.sum(own & (pairs.classes == PairClass.AGREES))
+        expected = np.nanmedian(pairs.residuals_deg[own]) if own.any() else np.nan
+        np.testing.assert_allclose(errors[camera], expected)
+
+
+def test_options_that_differ_from_the_defaults_stand_apart():
+    options = page_data(*make_drawing())["options"]
+    assert [name for name, _ in options["changed"]] == ["scale", "min trust"]
+    assert options["unchanged"] == [["solver", "auto"], ["refine", "yes"]]
+
+
+def test_thumbnails_are_small_in_all_and_only_of_files_inside_the_folder(tmp_path, monkeypatch):
+    cv2 = pytest.importorskip("cv2")
+    picture = np.random.default_rng(5).integers(0, 255, (300, 400, 3), dtype=np.uint8)
+    (tmp_path / "images" / "sub").mkdir(parents=True)
+    for name in ("images/a.jpg", "images/sub/b.png", "secret.jpg"):
+        cv2.imwrite(str(tmp_path / name), picture)
+    (tmp_path / "images" / "text.jpg").write_text("no picture")
+    names = ["a.jpg", "sub/b.png", "../secret.jpg", "text.jpg", "missing.jpg", "\x00.jpg"]
+    found = read_thumbnails(tmp_path / "images", names, np.arange(len(names)))
+    assert sorted(found) == [0, 1]
+    raw = base64.b64decode(found[1].removeprefix("data:image/jpeg;base64,"))
+    assert cv2.imdecode(np.frombuffer(raw, np.uint8), cv2.IMREAD_COLOR).shape == (240, 320, 3)
+    monkeypatch.setattr(thumbnails, "MAX_BYTES", 2000)
+    assert sorted(read_thumbnails(tmp_path / "images", names, np.arange(len(names)))) == [0]
+    assert read_thumbnails(tmp_path / "images", names[2:], np.arange(1)) == {}
+    with pytest.raises(InputError, match="is no folder"):
+        read_thumbnails(tmp_path / "secret.jpg", names, np.arange(1))
+
+
 def test_pairs_that_are_off_by_little_alarm_nobody_one_by_one():
     drawing, facts = make_drawing()
     against = drawing.pairs.classes == PairClass.CONTRADICTS
     small = np.where(against, 0.05, drawing.pairs.residuals_deg)
     looks = first_looks(replace(drawing, pairs=replace(drawing.pairs, residuals_deg=small)), facts)
     assert all(look.pair is None for look in looks)
-    said = f"{against.sum()} of the pairs contradict the solution, but by 0.05 degrees at most"
-    assert said in [look.text for look in looks]
+    said = f"{against.sum()} of 120 pairs contradict the placed cameras and are set aside; by 0.05 degrees"
+    assert any(look.text.startswith(said) for look in looks)
 
 
-def test_nothing_known_nothing_claimed_and_a_model_in_memory_is_titled_by_its_database():
-    drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
-    facts |= {"warnings": [], "loose_groups": []}
-    del facts["verdict"], facts["delivered"]
-    for inputs, title in [
-        ({"model": "sparse/0", "database": "a.db"}, "sparse/0"),
+@pytest.mark.parametrize(
+    ("inputs", "title"),
+    [
+        ({"model": "project/sparse/0", "database": "a.db"}, "project"),
+        ({"model": "/data/castle/dense/sparse", "database": None}, "castle"),
+        ({"model": "in memory", "database": "scene/database.db"}, "scene"),
         ({"model": "in memory", "database": "a.db"}, "a.db"),
         ({"model": "in memory", "database": None}, "in memory"),
-    ]:
-        data = page_data(drawing, {**facts, "inputs": {**facts["inputs"], **inputs}})
-        assert data["title"] == title
-        assert "erdict" not in " ".join(data["summary"])
-        assert "certif" not in " ".join(data["summary"])
-        json.dumps(data, allow_nan=False)
+        ({"model": "0", "database": None}, "0"),
+        ({"graph": "data/graph40.txt"}, "graph40.txt"),
+    ],
+)
+def test_the_title_is_the_name_of_the_scene(inputs, title):
+    assert scene_name({"inputs": inputs}) == title
+
+
+def test_nothing_known_nothing_claimed():
+    drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
+    facts |= {"warnings": [], "loose_groups": []}
+    for key in ("verdict", "delivered", "residuals_deg", "sigma_of", "scale", "mean_reprojection_error_px"):
+        del facts[key]
+    data = page_data(drawing, facts)
+    assert data["banner"]["grade"] == ""
+    assert data["banner"]["headline"] == "2 of 3 cameras placed"
+    assert "certif" not in " ".join(data["expertFacts"])
+    json.dumps(data, allow_nan=False)
 
 
 def test_residuals_at_the_optimum_are_angles_and_the_histogram_counts_the_same_pairs_in_each_state():

@@ -9,9 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sfm_shapefit.report.drawing import PairClass
+from sfm_shapefit.report.drawing import PairClass, input_centers
 from sfm_shapefit.report.read_back import read_output
-from sfm_shapefit.report.viewer import Thresholds, camera_at, input_centers, select_pairs, serve
+from sfm_shapefit.report.viewer import Thresholds, camera_at, select_pairs, serve
 from tests.drawings import make_drawing
 from tests.program import run, viewing
 from tests.scenes import BUNDLED, FACADE
@@ -45,7 +45,7 @@ def test_a_bare_graph_has_its_report_too_and_a_report_can_be_made_again(located,
     assert all(name in result.stdout for name in ("report.html", "scene.glb", "scene.ply"))
     drawing, _ = read_output(tmp_path / "out")
     assert np.isfinite(drawing.cameras.centers).all()
-    for folder, words in ((tmp_path / "out", "40 nodes"), (located, "9 images")):
+    for folder, words in ((tmp_path / "out", "40 nodes"), (located, "9 cameras")):
         report = folder / "report.html"
         before = report.read_text(encoding="utf-8")
         assert words in before

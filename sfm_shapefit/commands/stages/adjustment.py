@@ -5,7 +5,6 @@ once, and rotations that the matches know better than whoever gave them.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -13,7 +12,12 @@ import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_placement
+from sfm_shapefit.colmap.adjustment import KnownCenters
+from sfm_shapefit.colmap.bundle_adjustment import (
+    AdjustedPlacement,
+    Uncertainty,
+    adjust_placement,
+)
 from sfm_shapefit.colmap.model import PosedModel, with_frame_rotations
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.inputs import MatchSource
@@ -23,8 +27,10 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.geometry import normalized, rotation_angles_deg, tangent_bases
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.measured import MeasuredGraph
+from sfm_shapefit.placement.gauge import PositionPriors
 from sfm_shapefit.placement.move import move_cameras
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_refinement import pull_to_priors
 from sfm_shapefit.viewgraph import ViewGraph
 
 
@@ -33,6 +39,21 @@ def weight_of_rotations(options: LocateOptions) -> RotationWeight | None:
     if options.rotation_sigma_deg:
         return RotationWeight(sigma_rad=math.radians(options.rotation_sigma_deg))
     return {"auto": None, "measured": RotationWeight(hold=True), "free": RotationWeight()}[options.rotations]
+
+
+def pull_cameras(
+    model: PosedModel, located: Located, priors: PositionPriors, options: LocateOptions
+) -> Located:
+    """Return the cameras pulled by position priors, which hold the gauge from here on.
+
+    Raises:
+        UnsolvableError: if the factor would take more memory than the options allow.
+    """
+    pulled = pull_to_priors(located.placement, located.gauge, priors, options)
+    nodes, positions, information = pulled.anchors
+    frame_ids = model.frame_ids[pulled.placement.nodes[nodes]]
+    given = located.given._replace(centers=KnownCenters(frame_ids, positions, information))
+    return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 
 class AfterAdjustment(NamedTuple):
@@ -54,8 +75,9 @@ def adjust_placed(
     located: Located,
     options: LocateOptions,
     clock: Clock,
+    weight: RotationWeight | None,
 ) -> AfterAdjustment:
-    """Adjust all placed cameras, in the gauge that was chosen.
+    """Adjust all placed cameras, in the gauge that was chosen; `weight` is of their rotations.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
@@ -64,10 +86,7 @@ def adjust_placed(
     fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed, tracks = seed_and_tracks(source, everyone, clock.advance)
-    weight = weight_of_rotations(options)
-    adjusted = adjust_placement(
-        seed, tracks, options, weight, fixed_frames=fixed, lenses=located.given.lenses
-    )
+    adjusted = adjust_placement(seed, tracks, options, weight, fixed_frames=fixed, given=located.given)
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
@@ -77,22 +96,23 @@ def adjust_placed(
         directions = _measure_again(source, directions, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations
         placement = replace(placement, measured=_turn(placement.measured, directions, turns))
-    moved = with_covariances(
-        move_cameras(placement, locations, options), model, adjusted.covariances, similarity.scale
+    moved = with_uncertainty(
+        move_cameras(placement, locations, options), model, adjusted.uncertainty, similarity.scale
     )
     return AfterAdjustment(source, directions, moved, adjusted)
 
 
-def with_covariances(
-    placement: Placement, model: PosedModel, covariances: Mapping[int, FloatArray], scale: float
+def with_uncertainty(
+    placement: Placement, model: PosedModel, uncertainty: Uncertainty, scale: float
 ) -> Placement:
-    """Return the placement with covariances of an adjustment, by image id, `scale` to the solver's unit."""
+    """Return the placement with what an adjustment knows of its errors, `scale` to the solver's unit."""
+    covariances = uncertainty.covariances
     if not covariances:
         return placement
     unknown = np.full((3, 3), np.nan)
     ids = model.image_ids[placement.cameras].tolist()
     own = np.array([covariances.get(i, unknown) for i in ids]) / scale**2
-    return replace(placement, adjusted_covariances=own)
+    return replace(placement, adjusted_covariances=own, scale_sigma=uncertainty.scale_sigma)
 
 
 def _measure_again(

@@ -90,8 +90,10 @@ def refine_in_angles(_folder: Path) -> None:
 
 
 def measure_pairs(folder: Path) -> None:
-    """Measure directions from matches, and join tracks as nodes."""
-    inspect(_workspace(folder, WorkspaceOptions(model="rotations")))
+    """Measure directions from matches, join tracks as nodes, and estimate relative rotations."""
+    model = _workspace(folder, WorkspaceOptions(model="rotations"))
+    inspect(model)
+    relative_rotations(model.parents[1] / "database.db", threads=2)
 
 
 def solve_sparse(_folder: Path) -> None:
@@ -152,12 +154,6 @@ def locate_from_tracks(folder: Path) -> None:
     model = _workspace(folder, WorkspaceOptions(database=False))
     locate(model, threads=1, bundle_adjust=True)
     inspect(model, theory=True)
-
-
-def adjust_few_tracks(folder: Path) -> None:
-    """Adjust the poses of a model on few tracks."""
-    model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
-    adjust_thinly(model, model)
 
 
 def locate_rigs(folder: Path) -> None:
@@ -229,14 +225,28 @@ def draw_images(folder: Path) -> None:
     synthetic.surface_points(scene, 0, np.array([[80.0, 60.0]]))
 
 
-def adjust_bundles(_folder: Path) -> None:
-    """Adjust a bundle of our own, for those who call it from Python."""
+def adjust_bundle(folder: Path) -> None:
+    """Adjust the tracks of a small model, and say how uncertain a bundle is, as after each placement."""
+    model = read_model(_workspace(folder, WorkspaceOptions(database=False))).reconstruction
+    adjust_thinly(model, model)
+    adjusted = adjust(_bundle(), loss_scale_px=1.0, threads=2)
+    estimate_covariances(adjusted.problem)
+    estimate_center_errors(adjusted.problem, AdjustmentOptions())
+
+
+def adjust_sparsely(_folder: Path) -> None:
+    """Adjust a bundle with the factor that long ones take."""
+    adjust(_bundle(), linear_solver="sparse", loss_scale_px=1.0, threads=2)
+
+
+def _bundle() -> AdjustmentProblem:
+    """Return five cameras that see forty points."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1.0, 1.0, (40, 3)) + np.array([0.0, 0.0, 5.0])
     centers = rng.uniform(-1.0, 1.0, (5, 3)) * [1.0, 1.0, 0.1]
     cameras, seen = np.divmod(np.arange(200), 40)
     rays = points[seen] - centers[cameras]
-    problem = AdjustmentProblem(
+    return AdjustmentProblem(
         rotations=np.tile(np.eye(3), (5, 1, 1)),
         centers=centers + 0.01,
         points=points,
@@ -246,7 +256,3 @@ def adjust_bundles(_folder: Path) -> None:
         lenses=(Lens("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)),),
         lens_of_camera=np.zeros(5, dtype=np.int64),
     )
-    for linear_solver in ("dense", "sparse"):
-        adjusted = adjust(problem, linear_solver=linear_solver, loss_scale_px=1.0, threads=2)
-    estimate_covariances(adjusted.problem)
-    estimate_center_errors(adjusted.problem, AdjustmentOptions())

@@ -25,6 +25,7 @@ from sfm_shapefit.colmap.model import PosedModel, from_posed_cameras, posed_came
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
+from sfm_shapefit.extras import MissingExtraError
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
 Measured = TypeVar("Measured")
@@ -34,7 +35,6 @@ MATCHES_PER_TASK = 1_000_000
 """About 1.5 seconds of work for directions, and 230 MB."""
 # Dask gives a task whose worker died to another so many times.
 _RETRIES = 3
-_NO_DASK = "the executor dask needs dask.distributed: pip install '.[dask]' in the folder of sfm_shapefit"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -129,7 +129,7 @@ def _dask_client(workers: int, scheduler: str | None) -> Iterator[Any]:
     try:
         from distributed import Client, LocalCluster
     except ModuleNotFoundError:
-        raise InputError(_NO_DASK) from None
+        raise MissingExtraError("the executor dask", "dask.distributed", "dask") from None
     if scheduler is None:
         with (
             LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None) as cluster,

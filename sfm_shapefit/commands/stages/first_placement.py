@@ -14,52 +14,56 @@ from sfm_shapefit.arrays import BoolArray, FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
+from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
 from sfm_shapefit.commands.stages.inputs import MatchSource
 from sfm_shapefit.commands.stages.measure import build_graph, measure_directions
+from sfm_shapefit.commands.stages.rigs import place_cameras
 from sfm_shapefit.commands.stages.seed import Located, seed_and_tracks
 from sfm_shapefit.geometry import mean_rotation_l1
-from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import unit_gauge
-from sfm_shapefit.placement.place import place
 
 
 class FirstPlacement(NamedTuple):
     """What comes out of the adjustment of a first placement."""
 
     adjusted: AdjustedPlacement
-    """With the intrinsics that it ended with, and the covariances of the centers."""
+    """With the intrinsics that it ended with, and how well the centers are known."""
     rotations: FloatArray
     """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
     as the others were on average."""
     centers: FloatArray
     """(n, 3); NaN for images that the first placement lacks."""
 
+    def parameters(self) -> dict[int, list[float]]:
+        """Return the parameters of the cameras that were free, or turned out to be left open, by their id."""
+        cameras = [*self.adjusted.lenses.sigmas, *self.adjusted.lenses.undetermined]
+        return {i: self.adjusted.reconstruction.camera(i).params.tolist() for i in sorted(set(cameras))}
+
 
 def adjust_first_placement(
-    source: MatchSource,
-    options: LocateOptions,
-    clock: Clock,
-    lenses: FreeLenses | None = None,
-    *,
-    thorough: bool = True,
+    source: MatchSource, rule: GaugeRule, clock: Clock, lenses: FreeLenses, *, thorough: bool = True
 ) -> FirstPlacement:
     """Place the images of a source by their averaged rotations, and adjust all on few tracks.
 
     Args:
         source: at the averaged rotations.
-        options: of the directions, the placement and the points.
+        rule: what sets the gauge, with the options of the run.
         clock: hears of progress.
-        lenses: that change with the poses; none if None.
+        lenses: that change with the poses.
         thorough: as in `adjust_thinly`.
 
     Raises:
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
     """
-    model = source.model
+    model, options = source.model, rule.options
     directions = measure_directions(source, options, clock)
-    placement = place(build_graph(source, directions, options), options, on_iteration=clock.iteration)
+    measured = rule.rigid.apply(build_graph(source, directions, options))
+    placement = place_cameras(measured, options, clock)
     everyone = np.ones(len(placement.cameras), dtype=np.bool_)
-    located = Located(placement, everyone, unit_gauge(placement.locations))
+    gauge = unit_gauge(placement.locations)
+    if placement.unit is not None:  # the offsets of sensors have theirs
+        gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
+    located = Located(placement, everyone, gauge)
     seed, tracks = seed_and_tracks(source, located, clock.advance)
     adjusted = adjust_thinly(seed, tracks, options, lenses=lenses, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())

@@ -15,6 +15,7 @@ from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import (
     Gauge,
     PositionPriors,
+    coincide,
     distance_gauge,
     input_gauge,
     metric_gauge,
@@ -71,6 +72,8 @@ class GaugeRule(NamedTuple):
         """
         model, rigid, options = self.model, self.rigid, self.options
         centers, fixed = model.centers[cameras], rigid.fixed[cameras]
+        if coincide(model.centers - model.frame_offsets):
+            centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
         if options.known_distance:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, IntArray
-from sfm_shapefit.colmap.bundle_adjustment import NOTHING_GIVEN, Adjusted, Given, bundle_adjust
+from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
     deregister_of_few_points,
@@ -47,8 +47,8 @@ class Located(NamedTuple):
     """(n,) the images that keep their poses to the last bit; none if None."""
     rule: GaugeRule | None = None
     """What sets the gauge, and again after bundle adjustment; "unit" if None."""
-    given: Given = NOTHING_GIVEN
-    """Rotations and lenses of the input, and how adjustments treat them."""
+    given: GivenPoses = GivenPoses()
+    """The rotations of the input, and position priors that pull at the cameras and hold the gauge by that."""
 
     @property
     def cameras(self) -> IntArray:
@@ -99,9 +99,13 @@ def build_seeded_model(
             seeded = triangulate(seed, tracks, options, clock.advance, executor, in_place=True)
     else:  # which triangulates at the seed's poses itself
         with clock("bundle adjustment"):
-            how = options.adjuster
             adjusted = bundle_adjust(
-                seed, tracks, options, adjuster=how, fixed_frames=frames, given=located.given
+                seed,
+                tracks,
+                options,
+                adjuster=options.adjuster,
+                fixed_frames=frames,
+                given=located.given,
             )
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
@@ -114,7 +118,8 @@ def build_seeded_model(
     if poor:
         lost = np.isin(source.model.image_ids[located.placement.cameras], list(poor))
         located = located._replace(kept=located.kept & ~lost)
-    if adjusted is not None or poor:
+    is_held = located.given.centers is not None and options.adjuster == "own"
+    if (adjusted is not None or poor) and not is_held:
         seeded, gauge = _set_gauge(seeded, source.model, located)
     elif gauge.axes is not None:
         seeded = turn_model(seeded, gauge.axes)

@@ -1,0 +1,108 @@
+"""Compiled code as it is kept on disk: packed into bytes, and made ready to run again.
+
+numba's own way to load a kernel first sets up all that is needed to compile one, and reads the kernel's LLVM
+code, which is of use to other kernels only, when they are compiled. Here both wait until something is
+compiled: that takes a quarter of the time. It rests on parts of numba that are not public. Where they are
+not as expected, numba loads the kernel its own way.
+"""
+
+import pickle
+from typing import Any
+
+import llvmlite.binding as llvm
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompileResult
+from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
+
+# Of strings in sets and dictionaries: numba defines these symbols when it is ready to compile.
+_NEEDS_COMPILER = b"_numba_hashsecret"
+
+
+class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
+    """Machine code from a file, whose LLVM code is read when another kernel takes it in."""
+
+    _shared_module: Any
+
+    @classmethod
+    def load(cls, codegen: Any, name: str, machine_code: bytes, llvm_code: bytes) -> "LoadedLibrary":
+        """Return a library that is ready to run."""
+        library = cls(codegen, name)
+        library.enable_object_caching()
+        library._set_compiled_object(machine_code)
+        library._finalize_final_module()
+        library._llvm_code = llvm_code
+        return library
+
+    def get_pointer_to_function(self, name: str) -> Any:
+        """Return the address of a function of this library."""
+        return self._codegen._engine.get_function_address(name)
+
+    def _get_module_for_linking(self) -> Any:
+        """Return the LLVM code, for a kernel that is being compiled."""
+        if self._shared_module is None:
+            self._shared_module = llvm.parse_bitcode(self._llvm_code)
+            self._codegen._engine._load_defined_symbols(self._shared_module)
+        return self._shared_module
+
+
+def pack(compiled: Any) -> bytes:
+    """Return what `unpack` takes, without the text that numba keeps for those who inspect types."""
+    return bytes(dumps(compiled._replace(type_annotation="")._reduce()))
+
+
+def unpack(content: bytes, target_context: Any) -> Any:
+    """Return compiled code that is ready to run.
+
+    Raises:
+        Exception: of any type, if the content is damaged or of another version.
+    """
+    reduced = pickle.loads(content)
+    try:
+        return _load(target_context, reduced)
+    except Exception:  # whatever another version of numba does
+        target_context.refresh()
+        return CompileResult._rebuild(target_context, *reduced)
+
+
+def _load(target_context: Any, reduced: tuple[Any, ...]) -> Any:
+    """Do what `CompileResult._rebuild` does.
+
+    Raises:
+        ValueError: if the code needs more than is set up here.
+    """
+    (
+        (name, kind, (machine_code, llvm_code)),
+        description,
+        environment,
+        signature,
+        is_object_mode,
+        lifted,
+        type_annotation,
+        initializers,
+        environments,
+    ) = reduced
+    if kind != "object" or initializers or _NEEDS_COMPILER in machine_code:
+        raise ValueError("this code is for numba to load")
+    rtsys.initialize(target_context)
+    library = LoadedLibrary.load(target_context.codegen(), name, machine_code, llvm_code)
+    function = target_context.get_executable(library, description, environment)
+    for each in environments:
+        library.codegen.set_env(each.env_name, each)
+    return CompileResult(
+        target_context=target_context,
+        typing_context=target_context.typing_context,
+        library=library,
+        environment=environment,
+        entry_point=function,
+        fndesc=description,
+        type_annotation=type_annotation,
+        signature=signature,
+        objectmode=is_object_mode,
+        lifted=lifted,
+        typing_error=None,
+        call_helper=None,
+        metadata=None,
+        reload_init=initializers,
+        referenced_envs=environments,
+    )

@@ -1,0 +1,132 @@
+// What all parts of the page share: its data, and small helpers. Names come from strangers: they reach the
+// page through textContent only.
+const TYPES = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u1: Uint8Array };
+const VERDICTS = ["agrees", "contradicts", "cannot be judged", "no direction"];
+const LAYER_OF = ["agrees", "contradicts", "undetermined", "nodirection"];
+const VARIABLES = LAYER_OF.map((name) => `--${name}`);
+const $ = (id) => document.getElementById(id);
+
+const decode = (value) => {
+  if (Array.isArray(value)) return value.map(decode);
+  if (value === null || typeof value !== "object") return value;
+  if (!("bytes" in value)) {
+    return Object.fromEntries(Object.entries(value).map(([key, item]) => [key, decode(item)]));
+  }
+  const text = atob(value.bytes);
+  const bytes = new Uint8Array(text.length);
+  for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
+  return new TYPES[value.type](bytes.buffer);
+};
+const data = decode(JSON.parse($("data").textContent));
+const { cameras, pairs, points } = data;
+const numCameras = cameras.names.length;
+const numPairs = pairs.first.length;
+
+const element = (tag, text = "", className = "") => {
+  const made = document.createElement(tag);
+  if (text !== "") made.textContent = text;
+  if (className) made.className = className;
+  return made;
+};
+const button = (text, className, action) => {
+  const made = element("button", text, className);
+  made.type = "button";
+  made.onclick = action;
+  return made;
+};
+const SVG = "http://www.w3.org/2000/svg";
+const shape = (tag, attributes, text = "") => {
+  const made = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  if (text !== "") made.textContent = text;
+  return made;
+};
+const fill = (id, ...children) => $(id).replaceChildren(...children);
+const number = (value, digits = 3) => {
+  if (!Number.isFinite(value)) return "";
+  if (value === 0) return "0";
+  const size = Math.abs(value);
+  if (size < 1e-3 || size >= 1e6) return value.toExponential(Math.max(digits - 1, 0));
+  return Number(value.toPrecision(digits)).toString();
+};
+const count = (value) => value.toLocaleString("en");
+const counted = (value, noun) => `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
+const reason = (code) => data.reasons[code];
+const at = (positions, k) => [positions[3 * k], positions[3 * k + 1], positions[3 * k + 2]];
+const isPlaced = (k) => cameras.placed[k] === 1;
+const isDrawn = (p) => isPlaced(pairs.first[p]) && isPlaced(pairs.second[p]);
+const quantile = (values, share) => {
+  const sorted = Float64Array.from(values).filter(Number.isFinite).sort();
+  return sorted.length ? sorted[Math.min(Math.floor(share * sorted.length), sorted.length - 1)] : NaN;
+};
+const middleOfName = (name, most) => {
+  if (name.length <= most) return name;
+  const tail = Math.ceil(most * 0.6);
+  return `${name.slice(0, most - tail - 1)}…${name.slice(-tail)}`;
+};
+const pairTitle = (p) => `${cameras.names[pairs.first[p]]} – ${cameras.names[pairs.second[p]]}`;
+const off = (value) => number(value, 2) && `${number(value, 2)}°`;
+
+const isDark = () => {
+  const chosen = document.documentElement.dataset.theme;
+  return chosen ? chosen === "dark" : matchMedia("(prefers-color-scheme: dark)").matches;
+};
+const probe = document.body.appendChild(element("i"));
+probe.hidden = true;
+// [red, green, blue] in 0..1 of a color of the style sheet.
+const rgbOf = (variable) => {
+  probe.style.color = `var(${variable})`;
+  return getComputedStyle(probe).color.match(/[\d.]+/g).slice(0, 3).map((part) => part / 255);
+};
+
+// --- what is said of a camera or a pair ------------------------------------------------------------
+
+const agreeing = (k) => `${count(cameras.agreeing[k])} of ${count(cameras.degree[k])} agree`;
+const cameraFacts = (k) => [
+  ["placed", isPlaced(k) ? "" : "no, left out"],
+  ["trust", number(cameras.trust[k], 2)],
+  ["uncertainty", isPlaced(k) && number(cameras.sigma[k], 2) ? `± ${number(cameras.sigma[k], 2)} units` : ""],
+  ["pairs", cameras.degree[k] ? agreeing(k) : "none"],
+  ["typical error", off(cameras.error[k])],
+  ["moved from the input", cameras.shift && number(cameras.shift[k], 2) ? `${number(cameras.shift[k], 2)} units` : ""],
+  ["why", reason(cameras.reason[k])],
+];
+const pairFacts = (p) => [
+  ["verdict", VERDICTS[pairs.verdict[p]]],
+  ["off by", off(pairs.residual[p])],
+  ["matches", pairs.support[p] ? count(pairs.support[p]) : ""],
+  ["why", reason(pairs.reason[p])],
+];
+const cameraExpertFacts = (k) => [
+  ["center", isPlaced(k) ? at(cameras.world, k).slice(0, data.shownAxes).map((x) => number(x, 5)).join(", ") : ""],
+  ["rigid piece", cameras.piece[k] < 0 ? "none" : String(cameras.piece[k])],
+];
+const pairExpertFacts = (p) => [
+  ["residual at the certified optimum", off(pairs.certified[p])],
+  ["residual at the input", off(pairs.input[p])],
+  ["weight", number(pairs.weight[p])],
+  ["leverage", number(pairs.leverage[p], 2)],
+  ["dual norm", number(pairs.dual[p])],
+];
+const known = (facts) => facts.filter(([, value]) => value !== "" && value !== undefined);
+
+// --- the box beside the pointer --------------------------------------------------------------------
+
+const tooltip = $("tooltip");
+const showTooltip = (event, title, facts) => {
+  tooltip.replaceChildren(element("strong", title));
+  for (const [label, value] of known(facts)) tooltip.append(`\n${label}: ${value}`);
+  tooltip.hidden = false;
+  const [x, y] = [event.clientX, event.clientY];
+  tooltip.style.left = `${Math.max(Math.min(x + 14, innerWidth - tooltip.offsetWidth - 8), 4)}px`;
+  tooltip.style.top = `${Math.max(Math.min(y + 14, innerHeight - tooltip.offsetHeight - 8), 4)}px`;
+};
+const hideTooltip = () => {
+  tooltip.hidden = true;
+};
+const tell = (event, found) => {
+  if (!found) hideTooltip();
+  else if (found[0] === "text") showTooltip(event, found[1], found[2]);
+  else if (found[0] === "camera") showTooltip(event, cameras.names[found[1]], cameraFacts(found[1]));
+  else showTooltip(event, pairTitle(found[1]), pairFacts(found[1]));
+};

@@ -1,0 +1,147 @@
+// The tables of cameras and pairs: sorted, filtered, and in pages.
+
+const ROWS_PER_PAGE = 10;
+
+const makeTable = (id, kind, total, columns, text, onChoice) => {
+  let order = Array.from({ length: total }, (_, k) => k);
+  let page = 0;
+  let sorted = null;
+  let chosen = null;
+  const search = element("input");
+  search.type = "search";
+  search.placeholder = "Filter by name";
+  search.setAttribute("aria-label", `Filter ${kind}s by name`);
+  const back = button("Back", "quiet", () => { page -= 1; draw(); });
+  const next = button("Next", "quiet", () => { page += 1; draw(); });
+  const shown = element("span", "", "count");
+  const tools = element("div", "", "tools");
+  tools.append(search, shown, back, next);
+  const table = element("table");
+  const head = table.createTHead().insertRow();
+  const body = table.createTBody();
+  const headings = columns.map((column) => {
+    const cell = element("th", "", column.number ? "number" : "");
+    const sorter = button(column.title, "", () => sortBy(column));
+    if (column.hint) sorter.title = column.hint;
+    cell.scope = "col";
+    cell.append(sorter);
+    head.append(cell);
+    return cell;
+  });
+  const rowOf = (k) => {
+    const row = element("tr");
+    row.tabIndex = 0;
+    row.dataset.row = k;
+    row.setAttribute("aria-selected", String(k === chosen));
+    for (const column of columns) row.append(column.cell(k));
+    const choose = () => onChoice(kind, k);
+    row.onclick = choose;
+    row.onkeydown = (event) => {
+      if (event.key !== "Enter" && event.key !== " ") return;
+      event.preventDefault();
+      choose();
+      body.querySelector(`[data-row="${k}"]`)?.focus();
+    };
+    return row;
+  };
+  const draw = () => {
+    const first = page * ROWS_PER_PAGE;
+    const last = Math.min(first + ROWS_PER_PAGE, order.length);
+    body.replaceChildren(...order.slice(first, last).map(rowOf));
+    shown.textContent = order.length ? `${count(first + 1)}–${count(last)} of ${count(order.length)}` : "none";
+    back.disabled = page === 0;
+    next.disabled = last >= order.length;
+  };
+  const sortBy = (column) => {
+    const down = sorted && sorted.column === column ? !sorted.down : Boolean(column.number);
+    sorted = { column, down };
+    const sign = down ? -1 : 1;
+    order.sort((a, b) => {
+      const [u, v] = [column.value(a), column.value(b)];
+      const [lostA, lostB] = [Number.isNaN(u), Number.isNaN(v)];
+      if (lostA || lostB) return lostA - lostB || a - b;
+      return u < v ? -sign : u > v ? sign : a - b;
+    });
+    headings.forEach((cell, c) => {
+      if (columns[c] === column) cell.setAttribute("aria-sort", down ? "descending" : "ascending");
+      else cell.removeAttribute("aria-sort");
+    });
+    page = 0;
+    draw();
+  };
+  const filter = () => {
+    const wanted = search.value.toLowerCase();
+    order = [];
+    for (let k = 0; k < total; k++) if (!wanted || text(k).toLowerCase().includes(wanted)) order.push(k);
+    page = 0;
+    if (sorted) {
+      sorted.down = !sorted.down;
+      sortBy(sorted.column);
+    } else draw();
+  };
+  search.oninput = filter;
+  const scroll = element("div", "", "scroll");
+  scroll.append(table);
+  fill(id, tools, scroll);
+  draw();
+  return {
+    show: (k) => {
+      chosen = k;
+      if (!order.includes(k)) {
+        search.value = "";
+        filter();
+      }
+      page = Math.floor(order.indexOf(k) / ROWS_PER_PAGE);
+      draw();
+    },
+    clear: () => {
+      chosen = null;
+      draw();
+    },
+  };
+};
+
+const numeric = (title, value, digits, hint) => ({
+  title, hint, number: true, value, cell: (k) => element("td", number(value(k), digits), "number"),
+});
+// A name, and under it why the row stands where it does.
+const named = (title, name, why) => ({
+  title, value: name, cell: (k) => {
+    const cell = element("td", "", "name");
+    cell.append(element("span", name(k)));
+    if (why(k)) cell.append(element("small", why(k)));
+    return cell;
+  },
+});
+const verdictCell = (p) => {
+  const cell = element("td", "", "verdict");
+  const dotted = element("span", "", "dot");
+  dotted.style.background = `var(${VARIABLES[pairs.verdict[p]]})`;
+  cell.append(dotted, ` ${VERDICTS[pairs.verdict[p]]}`);
+  return cell;
+};
+const drawTables = (onChoice) => {
+  // Rows arrive worst first: the cameras by trust, the pairs by verdict and residual.
+  const why = (k) => reason(cameras.reason[k]) || (isPlaced(k) ? "" : "left out");
+  const shift = cameras.shift ? [numeric("Shift", (k) => cameras.shift[k], 2, "How far it is from where the input has it, in units")] : [];
+  return {
+    camera: makeTable("cameras", "camera", numCameras, [
+      named("Camera", (k) => cameras.names[k], why),
+      numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise"),
+      numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units"),
+      numeric("Error °", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
+      {
+        title: "Pairs agree", number: true, value: (k) => (cameras.degree[k] ? cameras.agreeing[k] / cameras.degree[k] : NaN),
+        cell: (k) => element("td", cameras.degree[k] ? `${cameras.agreeing[k]}/${cameras.degree[k]}` : "none", "number"),
+      },
+      ...shift,
+    ], (k) => cameras.names[k], onChoice),
+    pair: makeTable("pairs", "pair", numPairs, [
+      named("Camera 1", (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),
+      named("Camera 2", (p) => cameras.names[pairs.second[p]], () => ""),
+      { title: "Verdict", value: (p) => VERDICTS[pairs.verdict[p]], cell: verdictCell },
+      numeric("Off by °", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
+      ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 9)] : []),
+    ], pairTitle, onChoice),
+  };
+};

@@ -1,0 +1,98 @@
+"""Small pictures of the images of a model, for the report; so small that all together stay within a limit."""
+
+import base64
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from sfm_shapefit.arrays import IntArray
+from sfm_shapefit.errors import InputError
+from sfm_shapefit.report.drawing import Drawing
+
+MAX_BYTES = 4_000_000
+"""Of all pictures of a page together, as base64."""
+_WIDEST_PX = 320
+_NARROWEST_PX = 64
+_QUALITY = 72
+# A JPEG picture of this quality has about so many bytes per pixel; a few are made to know better.
+_BYTES_PER_PIXEL = 0.25
+_BASE64 = 4.0 / 3.0
+
+
+def thumbnails_of(drawing: Drawing, folder: Path | str) -> dict[int, str] | None:
+    """Return small pictures of a drawing's cameras, the least trusted first; None if no folder is given.
+
+    Raises:
+        InputError: if the folder is none.
+    """
+    if not str(folder):
+        return None
+    trust = drawing.cameras.trust
+    return read_thumbnails(Path(folder), drawing.cameras.names, np.lexsort((trust, np.isnan(trust))))
+
+
+def read_thumbnails(folder: Path, names: Sequence[str], order: IntArray) -> dict[int, str]:
+    """Return data URLs of small JPEG pictures by row of the names, but for rows without a readable image.
+
+    Args:
+        folder: where the images are, under their names.
+        names: as the model has them, from strangers: one that leads out of the folder is left out.
+        order: rows, the most important first, in case that not all fit into `MAX_BYTES`.
+
+    Raises:
+        InputError: if the folder is none.
+    """
+    refuse_no_folder(folder)
+    files = {row: path for row in order.tolist() if (path := _file_of(folder, names[row])) is not None}
+    budget = MAX_BYTES / _BASE64 / max(len(files), 1)
+    width = float(np.clip(np.sqrt(budget / _BYTES_PER_PIXEL / 0.75), _NARROWEST_PX, _WIDEST_PX))
+    found, total = {}, 0
+    for row, path in files.items():
+        picture = _shrink(path, round(width))
+        if picture is None:
+            continue
+        total += round(_BASE64 * len(picture)) + 30
+        if total > MAX_BYTES:
+            break
+        found[row] = f"data:image/jpeg;base64,{base64.b64encode(picture).decode('ascii')}"
+    return found
+
+
+def refuse_no_folder(folder: Path) -> None:
+    """Refuse what is no folder of images.
+
+    Raises:
+        InputError: a sentence that says so.
+    """
+    if not folder.is_dir():
+        raise InputError(f"{folder} is no folder; give the one that the names of the images start from")
+
+
+def _file_of(folder: Path, name: str) -> Path | None:
+    """Return the file of an image, if there is one inside the folder."""
+    try:
+        path, root = (folder / name).resolve(), folder.resolve()
+        return path if path.is_relative_to(root) and path.is_file() else None
+    except (OSError, ValueError):
+        return None
+
+
+def _shrink(path: Path, width: int) -> bytes | None:
+    """Return a JPEG of at most this width and height, as COLMAP sees the image; None if it is none."""
+    import cv2
+
+    # Large ones are read at an eighth of their size, which takes a fraction of the time.
+    for reduced in (cv2.IMREAD_REDUCED_COLOR_8, cv2.IMREAD_REDUCED_COLOR_2, cv2.IMREAD_COLOR):
+        # Pixels are counted as they are stored, whatever the camera says of its orientation.
+        image = cv2.imread(str(path), reduced | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            return None
+        if max(image.shape[:2]) >= width:
+            break
+    assert image is not None
+    scale = min(width / max(image.shape[:2]), 1.0)
+    size = [max(round(scale * side), 1) for side in image.shape[1::-1]]
+    small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    done, encoded = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+    return encoded.tobytes() if done else None
