@@ -156,21 +156,23 @@ def fit_similarity_l1(
     def distances(similarity: Similarity) -> FloatArray:
         return np.asarray(np.linalg.norm(similarity.apply(source) - target, axis=1))
 
+    def total(apart: FloatArray) -> float:
+        return float(np.minimum(apart, cap).sum())
+
     def cost(similarity: Similarity) -> float:
-        return float(np.minimum(distances(similarity), cap).sum())
+        return total(distances(similarity))
 
     def reweigh(best: Similarity) -> Similarity:
-        best_cost = cost(best)
+        apart = distances(best)
         for _ in range(iterations):
-            apart = distances(best)
             weights = np.where(apart < cap, floor / np.maximum(apart, floor), 0.0)
             if not weights.any():
                 break
             candidate = fit_similarity(source, target, weights, rotate=rotate)
-            new_cost = cost(candidate)
-            if new_cost >= best_cost * (1.0 - 1e-12):
+            apart_then = distances(candidate)
+            if total(apart_then) >= total(apart) * (1.0 - 1e-12):
                 break
-            best, best_cost = candidate, new_cost
+            best, apart = candidate, apart_then
         return best
 
     plain = fit_similarity(source, target, rotate=rotate)
@@ -179,11 +181,25 @@ def fit_similarity_l1(
 
 
 def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
-    """Return similarities that each fit as few points as determine one, drawn with a fixed seed."""
+    """Return similarities that each fit as few points as determine one, drawn with a fixed seed.
+
+    They are what `fit_similarity` returns for each few, all at once.
+    """
     size = min(len(source), source.shape[1] if rotate else 2)
     rng = np.random.default_rng(0)
-    samples = (rng.choice(len(source), size, replace=False) for _ in range(_NUM_SAMPLES))
-    return [fit_similarity(source[few], target[few], rotate=rotate) for few in samples]
+    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(_NUM_SAMPLES)])
+    w = np.full(size, 1.0 / size)
+    source_means, target_means = w @ source[few], w @ target[few]
+    x, y = source[few] - source_means[:, None], target[few] - target_means[:, None]
+    spreads = np.vecdot(np.sum(x * x, axis=2), w)
+    crosses = np.swapaxes(w[:, None] * y, 1, 2) @ x
+    eyes = np.broadcast_to(np.eye(source.shape[1]), crosses.shape)
+    rotations = nearest_rotations(crosses) if rotate else eyes
+    alike = np.maximum((rotations * crosses).reshape(_NUM_SAMPLES, -1).sum(axis=1), 0.0)
+    scales = np.divide(alike, spreads, out=np.ones(_NUM_SAMPLES), where=spreads > 0.0)
+    moved = ((scales[:, None, None] * rotations) @ source_means[:, :, None])[:, :, 0]
+    fits = zip(scales.tolist(), rotations, target_means - moved, strict=True)
+    return [Similarity(scale=scale, rotation=turn, translation=shift) for scale, turn, shift in fits]
 
 
 def rotation_angles_deg(rotations: FloatArray) -> FloatArray:

@@ -46,7 +46,7 @@ class Settings:
         kinds = _hints(type(self))  # type: ignore[arg-type]  # a class can be hashed
         for item in fields(self):
             value, kind = getattr(self, item.name), kinds[item.name]
-            if not _fits(value, kind):
+            if value is not item.default and not _fits(value, kind):  # most are the defaults
                 raise ValueError(f"{item.name} must be {_wanted(kind)}, got {value!r}")
 
     def check_range(self, name: str, low: float, high: float = float("inf")) -> None:

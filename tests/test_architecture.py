@@ -133,3 +133,9 @@ def test_the_command_line_starts_without_the_heavy_dependencies():
     code = f"import sys, sfm_shapefit.cli; print(*sorted({heavy!r} & set(sys.modules)))"
     done = run_python("-c", code)
     assert done.stdout == "\n"
+
+
+def test_what_draws_is_not_loaded_where_nothing_is_drawn():
+    done = run_python("-c", "import sys, sfm_shapefit.commands.write; print(*sys.modules)")
+    assert "sfm_shapefit.commands.write" in done.stdout
+    assert "sfm_shapefit.report" not in done.stdout

@@ -1,5 +1,7 @@
 """Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
 
+import sys
+
 import llvmlite.binding as llvm
 import numba
 import pytest
@@ -8,7 +10,7 @@ from numba.core.codegen import JITCodeLibrary
 
 from sfm_shapefit import kernel_cache
 from sfm_shapefit.jit import kernel
-from sfm_shapefit.kernel_cache import hear_of_kernels, is_noted, note, on_miss, stamp_of
+from sfm_shapefit.kernel_cache import KernelCache, hear_of_kernels, is_noted, note, on_miss, stamp_of
 from sfm_shapefit.kernel_code import LoadedLibrary
 from tests.program import run_python
 
@@ -220,3 +222,19 @@ def test_two_processors_give_the_same_bits(tmp_path):
     assert host.returncode == 0, host.stderr[-500:]
     assert host.stdout == portable.stdout
     assert len(host.stdout.split()) == 1
+
+
+def test_who_calls_from_python_is_told_once_that_kernels_are_compiled(monkeypatch, capsys):
+    monkeypatch.setattr(kernel_cache, "_said", [])
+    of_package, of_others = KernelCache(kernel_cache.here), KernelCache(double)
+    of_package._say_once()  # the program, which these tests load, says it itself
+    monkeypatch.delitem(sys.modules, "sfm_shapefit.cli")
+    of_others._say_once()
+    with hear_of_kernels(print):
+        of_package._say_once()
+    assert capsys.readouterr().err == ""
+    of_package._say_once()
+    of_package._say_once()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert "compiling kernels, once" in said

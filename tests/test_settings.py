@@ -3,7 +3,7 @@
 import csv
 import dataclasses
 import inspect
-from typing import get_args
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from sfm_shapefit.refinement.options import PlacementOptions, Scale
 from sfm_shapefit.results import headline
 from sfm_shapefit.results.columns import columns_of
 from sfm_shapefit.results.tables import CameraRow
-from sfm_shapefit.settings import groups_of, merge_options
+from sfm_shapefit.settings import _fits, groups_of, merge_options
 from sfm_shapefit.solver.options import SolverOptions
 from sfm_shapefit.synthetic import RenderOptions, SceneOptions, WorkspaceOptions, random_graph_problem
 from tests.scenes import RING
@@ -32,6 +32,14 @@ def test_every_option_has_a_sentence_that_help_shows(settings):
         assert item.metadata["help"].endswith(".")
         assert f"{item.name} = {item.default!r} {item.metadata['help']}" in shown
     assert "LocateOptions" in inspect.getdoc(sfm_shapefit.locate)
+
+
+@pytest.mark.parametrize("settings", ALL)
+def test_every_default_is_what_its_option_takes(settings):
+    """Settings trust their defaults, and look at other values only."""
+    kinds = get_type_hints(settings)
+    wrong = [item.name for item in dataclasses.fields(settings) if not _fits(item.default, kinds[item.name])]
+    assert not wrong
 
 
 def test_each_option_belongs_to_one_group_and_is_stated_by_one_class():

@@ -59,6 +59,7 @@ _METAVARS: dict[Any, str] = {
     "known_distance": "NAME NAME DISTANCE",
     "fix": "FILE|solved",
     "config": "FILE",
+    "images": "FOLDER",
     int: "INTEGER",
     float: "NUMBER",
     int | None: "INTEGER",

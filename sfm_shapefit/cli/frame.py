@@ -147,12 +147,8 @@ def command_run(
 
             refuse_no_folder(Path(flags.images))
         fixed = getattr(options, "fix", "")
-        paths = [
-            *inputs,
-            config,
-            Path(fixed) if fixed else None,
-            Path(flags.images) if flags.images else None,
-        ]
+        images = Path(flags.images) if flags.images else None
+        paths = [*inputs, config, Path(fixed) if fixed else None, images]
         protect = [path for path in paths if path is not None]
         run = Run(options=options, flags=flags, protect=protect, started=started)
         if inputs[0] is not None:

@@ -1,5 +1,8 @@
 """Lines that more than one command's table has."""
 
+import re
+import shlex
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.cli.console import Rows, shorten
@@ -46,3 +49,13 @@ def describe_adjustment(adjusted: "Adjusted") -> str:
 def name_pictures(flags: OutputFlags) -> str:
     """Name the pictures that were written, to follow the names of other files."""
     return ", report.html" * flags.report + ", scene.glb, scene.ply" * flags.scene
+
+
+def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str]:
+    """Return what to do next, a line each: look at the report, then the command that the report names."""
+    from sfm_shapefit.report.headline import next_step
+
+    _, command = next_step(facts["verdict"]["grade"], facts)
+    filled = re.sub(r"\{out(?:/([\w.]+))?\}", lambda found: shlex.quote(str(out / (found[1] or ""))), command)
+    opened = [f"open {shlex.quote(str(out / 'report.html'))}"] if flags.report else []
+    return [*opened, filled]

@@ -26,6 +26,7 @@ from sfm_shapefit.cli.lines import (
     further_piece_rows,
     intrinsics_rows,
     name_pictures,
+    next_steps,
 )
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.wording import counted
@@ -82,7 +83,7 @@ def locate_command(
 
 def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model, next_steps
+    from sfm_shapefit.results.headline import headline_of_model
 
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -110,7 +111,7 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
             ("certificate", found.departure.statement),
         ],
         verdict=found.verdict,
-        steps=next_steps(found, out, report=flags.report),
+        steps=next_steps(facts, out, flags),
         timings_s=found.timings_s,
         written=f"{out}: seeded model, locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
     )

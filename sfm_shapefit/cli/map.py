@@ -17,7 +17,7 @@ from sfm_shapefit.cli.flags import (
     takes,
 )
 from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import describe_adjustment, describe_points, intrinsics_rows
+from sfm_shapefit.cli.lines import describe_adjustment, describe_points, intrinsics_rows, next_steps
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.wording import counted
 
@@ -59,7 +59,7 @@ def map_command(
 
 def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
     """Say what each model has, what was left out, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model, next_steps
+    from sfm_shapefit.results.headline import headline_of_model
 
     several = len(found.models) > 1
     figures: Rows = []
@@ -70,7 +70,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         figures += [
             *title,
             *headline_of_model(located).rows(),
-            ("reprojection error", describe_points(located.summary())),
+            ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]
@@ -91,7 +91,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         ],
         details=details,
         verdict=found.models[0].located.verdict,
-        steps=next_steps(found.models[0].located, out / "0", report=flags.report),
+        steps=next_steps(dict(found.models[0].located.summary()), out / "0", flags),
         timings_s=found.timings_s,
         written=f"{out}: {'models' if several else 'a model'} in "
         f"{', '.join(str(k) for k in range(len(found.models)))}, map.json",

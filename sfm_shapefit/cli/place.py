@@ -1,6 +1,5 @@
 """`sfm-shapefit place GRAPH OUT`, or by its other name `solve`."""
 
-import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -10,7 +9,7 @@ from sfm_shapefit.cli.app import app
 from sfm_shapefit.cli.console import shorten
 from sfm_shapefit.cli.flags import GroupedCommand, OutArgument, OutputFlags, one_path, takes
 from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import further_piece_rows, name_pictures
+from sfm_shapefit.cli.lines import further_piece_rows, name_pictures, next_steps
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.wording import counted
 
@@ -112,7 +111,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
             ("certificate", found.departure.statement),
         ],
         verdict=found.verdict,
-        steps=[f"open {shlex.quote(str(out / 'report.html'))}"] if flags.report else [],
+        steps=next_steps(facts, out, flags),
         timings_s=found.timings_s,
         written=f"{out}: locate.json, cameras.csv, pairs.csv{name_pictures(flags)}",
     )

@@ -11,10 +11,6 @@ from typing import Any
 
 from sfm_shapefit.atomic_folder import MAP_MARKER, MARKER, atomic_folder
 from sfm_shapefit.colmap.seed import write_model
-from sfm_shapefit.report.mesh import write_meshes
-from sfm_shapefit.report.page import write_report
-from sfm_shapefit.report.read_back import draw_result
-from sfm_shapefit.report.thumbnails import thumbnails_of
 from sfm_shapefit.results.map_result import MapResult
 from sfm_shapefit.results.result import FurtherPiece, GraphResult, LocateResult
 from sfm_shapefit.results.rows import folder_of, own_camera_rows
@@ -100,8 +96,19 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
     write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
     write_json(facts, folder / MARKER)
     if options.report or options.scene:
-        drawing = draw_result(found)
-        if options.report:
-            write_report(drawing, facts, folder / "report.html", thumbnails_of(drawing, options.images))
-        if options.scene:
-            write_meshes(drawing, folder)
+        _draw(found, folder, options)
+
+
+def _draw(found: LocateResult | GraphResult, folder: Path, options: WriteOptions) -> None:
+    """Write the report and the scenes that are wanted."""
+    from sfm_shapefit.report.mesh import write_meshes
+    from sfm_shapefit.report.page import write_report
+    from sfm_shapefit.report.read_back import draw_result
+    from sfm_shapefit.report.thumbnails import thumbnails_of
+
+    drawing = draw_result(found)
+    if options.report:
+        pictures = thumbnails_of(drawing, options.images)
+        write_report(drawing, found.summary(), folder / "report.html", pictures)
+    if options.scene:
+        write_meshes(drawing, folder)

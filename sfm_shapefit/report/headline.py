@@ -44,7 +44,7 @@ def banner(drawing: Drawing, facts: dict[str, Any]) -> dict[str, str]:
     """
     verdict = facts.get("verdict", {})
     grade = str(verdict.get("grade", ""))
-    text, command = _next_step(grade, facts)
+    text, command = next_step(grade, facts)
     return {
         "grade": grade,
         "headline": _headline(grade, drawing, verdict),
@@ -64,6 +64,28 @@ def tiles(drawing: Drawing, facts: dict[str, Any]) -> list[dict[str, str]]:
         *_points_tile(drawing, facts),
         *_shift_tile(drawing),
     ]
+
+
+def next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
+    """Return what to do, and the command that does it; in it {out} stands as `banner` says."""
+    if "graph" in facts["inputs"]:
+        return (
+            "Next: the positions are in cameras.csv; look at them from all sides.",
+            "sfm-shapefit view {out}",
+        )
+    if grade == "do not use":
+        path = shlex.quote(input_of(facts))
+        return "Next: find out what is wrong with the input.", f"sfm-shapefit inspect {path}"
+    if facts.get("bundle_adjustment"):
+        return (
+            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
+            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out/dense}",
+        )
+    first = "Next: bundle adjustment" + (", once you have looked." if grade == "look" else ".")
+    return (
+        first,
+        "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
+    )
 
 
 # --- the banner ------------------------------------------------------------------------------------
@@ -97,28 +119,6 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     named = f"{', '.join(cameras[:_NAMED])}{more}"
     others = "the others can be used" if not reasons else reasons[:1].lower() + reasons[1:]
     return f"{named} may be wrong or {'is' if len(cameras) == 1 else 'are'} left out; {others}."
-
-
-def _next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
-    """Return what to do, and the command that does it."""
-    if "graph" in facts["inputs"]:
-        return (
-            "Next: the positions are in cameras.csv; look at them from all sides.",
-            "sfm-shapefit view {out}",
-        )
-    if grade == "do not use":
-        path = shlex.quote(input_of(facts))
-        return "Next: find out what is wrong with the input.", f"sfm-shapefit inspect {path}"
-    if facts.get("bundle_adjustment"):
-        return (
-            "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
-            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out/dense}",
-        )
-    first = "Next: bundle adjustment" + (", once you have looked." if grade == "look" else ".")
-    return (
-        first,
-        "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
-    )
 
 
 # --- the tiles -------------------------------------------------------------------------------------

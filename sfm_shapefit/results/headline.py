@@ -1,23 +1,21 @@
-"""The figures that matter of a placed model, and what to do next.
+"""The three figures that matter of a placed model, for the terminal and for notebooks.
 
-placed              25 of 25 images
-typical pair error  0.008 deg (0.2 px)
-typical deviation   0.0009 of the input's units, 0.006% of the cameras' extent (standard deviation)
+    placed                   25 of 25 images
+    typical error of a pair  0.04 deg (0.5 px)
+    typical uncertainty      0.0002 of the input's units, 0.006% of the scene (standard deviation)
+
+The tiles of the report say the same.
 """
 
 import math
-import shlex
-from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.placement.place import Placement
-from sfm_shapefit.results.model_verdict import Grade
 from sfm_shapefit.results.summary import sigma_of
-from sfm_shapefit.results.warnings import extent_of
 from sfm_shapefit.wording import counted, rounded
 
 if TYPE_CHECKING:
@@ -34,6 +32,8 @@ _UNITS = {
 """What a standard deviation is given in, by the choice of the scale."""
 _SOLVER_UNITS = "of the solver's units"
 _NOISE_ONLY = "matching noise only"
+# Of an angle that is seen in pixels.
+_MOST_DEG = 89.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,11 +45,11 @@ class Headline:
     noun: str
     """What is placed: images or nodes."""
     pair_error_deg: float
-    """Median angle between the direction of a pair that agrees and the baseline of its cameras."""
+    """Median angle between the direction of a pair and the line between its cameras."""
     pair_error_px: float
     """The same at the median focal length; NaN for a bare graph."""
     sigma: float
-    """Median over the placed cameras of the norm of the three standard deviations."""
+    """Median over the placed cameras of the largest of the standard deviations along the axes."""
     sigma_of_extent: float
     """The same as a share of the cameras' extent."""
     unit: str
@@ -62,12 +62,13 @@ class Headline:
         in_pixels = f" ({self.pair_error_px:.2g} px)" if math.isfinite(self.pair_error_px) else ""
         sigma = "not known; see warnings, or --verbose"
         if math.isfinite(self.sigma):
-            sigma = f"{self.sigma:.2g} {self.unit}, {self.sigma_of_extent:.2g}% of the cameras' extent"
+            share = f"{self.sigma_of_extent:.2g}% of the scene"
+            sigma = f"{self.sigma:.2g} {self.unit}, {share}"
             sigma += f" (standard deviation{f', {_NOISE_ONLY}' if self.knows_only_noise else ''})"
         return [
             ("placed", f"{self.num_placed:,} of {counted(self.num_images, self.noun)}"),
-            ("typical pair error", f"{rounded(self.pair_error_deg, digits=2)} deg{in_pixels}"),
-            ("typical deviation", sigma),
+            ("typical error of a pair", f"{rounded(self.pair_error_deg, digits=2)} deg{in_pixels}"),
+            ("typical uncertainty", sigma),
         ]
 
 
@@ -80,8 +81,8 @@ def headline_of_model(found: "LocateResult") -> Headline:
     return _headline(
         found.placement,
         (found.reconstruction.num_reg_images(), len(found.image_names), "image"),
-        [math.hypot(*row.sigma) for row in rows if row.sigma],
-        extent_of(centers) if len(centers) else math.nan,
+        [max(row.sigma) for row in rows if row.sigma],
+        centers,
         (focal_px, _UNITS[found.gauge.scale]),
     )
 
@@ -92,8 +93,8 @@ def headline_of_graph(found: "GraphResult") -> Headline:
     return _headline(
         placement,
         (len(placement.cameras), placement.graph.num_nodes, "node"),
-        [math.hypot(*row.sigma) for row in found.cameras if row.sigma],
-        extent_of(placement.locations),
+        [max(row.sigma) for row in found.cameras if row.sigma],
+        placement.locations,
         (math.nan, _SOLVER_UNITS),
     )
 
@@ -102,13 +103,13 @@ def _headline(
     placement: Placement,
     placed: tuple[int, int, str],
     sigmas: list[float],
-    extent: float,
+    centers: FloatArray,
     scale: tuple[float, str],
 ) -> Headline:
     """Put the figures together: numbers placed and in all, and their noun; the focal length and the unit."""
-    agreeing = placement.pairs[placement.assessment.inliers[placement.pairs]]
-    errors_deg = placement.assessment.residuals_deg[agreeing]
+    errors_deg = placement.assessment.residuals_deg[placement.pairs]
     error_deg = float(np.median(errors_deg)) if len(errors_deg) else math.nan
+    extent = float(np.linalg.norm(np.ptp(centers, axis=0))) if len(centers) else 0.0
     known = [sigma for sigma in sigmas if math.isfinite(sigma)]
     sigma = float(np.median(known)) if known else math.nan
     focal_px, unit = scale
@@ -117,29 +118,9 @@ def _headline(
         num_images=placed[1],
         noun=placed[2],
         pair_error_deg=error_deg,
-        pair_error_px=math.radians(error_deg) * focal_px,
+        pair_error_px=math.tan(math.radians(min(error_deg, _MOST_DEG))) * focal_px,
         sigma=sigma,
         sigma_of_extent=100.0 * sigma / extent if extent > 0.0 else math.nan,
         unit=unit,
         knows_only_noise=sigma_of(placement).startswith(_NOISE_ONLY),
     )
-
-
-def next_steps(found: "LocateResult", out: Path, *, report: bool) -> Iterator[str]:
-    """Yield what a user does next with a model that was written to OUT, a line each; commands to copy.
-
-    Args:
-        found: the model.
-        out: its folder.
-        report: whether its report was written.
-    """
-    folder, verdict = shlex.quote(str(out)), found.verdict
-    if report:
-        yield f"open {shlex.quote(str(out / 'report.html'))}"
-    if verdict.grade is Grade.DO_NOT_USE:
-        model = found.inputs.folder
-        yield f"sfm-shapefit inspect {shlex.quote(str(model))}" if model else "sfm-shapefit inspect MODEL"
-    elif found.adjusted is None:
-        yield f"colmap bundle_adjuster --input_path {folder} --output_path ADJUSTED"
-    else:
-        yield f"colmap image_undistorter --image_path IMAGES --input_path {folder} --output_path DENSE"

@@ -63,7 +63,7 @@ def uncertain_cameras(placement: Placement) -> IntArray:
     """Return the cameras, as rows of `placement.cameras`, whose standard deviation is large for the scene."""
     if len(placement.cameras) < SMALLEST_PIECE:
         return np.zeros(0, dtype=np.int64)
-    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * extent_of(placement.locations))
+    return np.flatnonzero(_largest_sigmas(placement) > _UNCERTAIN_SHARE * _extent(placement.locations))
 
 
 def _largest_sigmas(placement: Placement) -> FloatArray:
@@ -88,7 +88,7 @@ def _uncertainty_warnings(placement: Placement) -> Iterator[str]:
             )
 
 
-def extent_of(locations: FloatArray) -> float:
+def _extent(locations: FloatArray) -> float:
     """Return the diagonal of the box around locations (n, d), without those that fly far outside."""
     distances = np.linalg.norm(locations - np.median(locations, axis=0), axis=1)
     inside = locations[distances <= _INSIDE * median_spread(locations)]

@@ -19,6 +19,8 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.commands.map import database_in
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.report.headline import tiles
+from sfm_shapefit.report.read_back import read_output
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
@@ -40,14 +42,25 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     tables = {"locate.json", "cameras.csv", "pairs.csv", "report.html"}
     assert {path.name for path in out.iterdir()} == model | tables
     assert pycolmap.Reconstruction(out).num_reg_images() == 8
-    for words in ("8 of 8 images", "typical pair error", "typical deviation", "locate.json"):
+    for words in ("8 of 8 images", "typical error of a pair", "typical uncertainty", "locate.json"):
         assert words in result.stdout
     assert "certified" not in result.stdout  # but with --verbose
     *_, verdict, report, command = result.stdout.splitlines()
     assert verdict == "verdict: good"
     assert report == f"next:    open {out / 'report.html'}"
-    assert command == f"         colmap bundle_adjuster --input_path {out} --output_path ADJUSTED"
+    adjust = f"colmap bundle_adjuster --input_path {out} --output_path {out}/adjusted"
+    assert command == f"         mkdir -p {out}/adjusted && {adjust}"
     assert result.stderr == ""
+
+
+def test_the_terminal_and_the_report_give_the_same_figures(ring_run):
+    result, out = ring_run
+    shown = {tile["label"]: tile["value"] for tile in tiles(*read_output(out))}
+    error_px, error_deg = re.match(r"(\S+) px, (\S+)°", shown["typical error of a pair"]).groups()
+    (uncertainty,) = (value for label, value in shown.items() if label.startswith("typical uncertainty"))
+    assert re.search(rf"typical error of a pair +│ {error_deg} deg \({error_px} px\)", result.stdout)
+    assert f"│ {uncertainty.removeprefix('± ').removesuffix(' units')} " in result.stdout
+    assert "8 of 8" in shown.values()
 
 
 def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_names(tmp_path):
