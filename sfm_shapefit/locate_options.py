@@ -17,6 +17,7 @@ Rotations = Literal["auto", "measured", "free"]
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 Relative = Literal["matches", "stored"]
+Refined = Literal["auto", "focal", "all", "none"]
 
 LEAST_MATCHES = 15
 """Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
@@ -86,12 +87,20 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "Standard deviation of the given rotations about each axis, if it is known; 0: as `rotations` says.",
     )
     bundle_adjust: bool = option(
-        False, "Refine poses and points by bundle adjustment from the seed; intrinsics stay fixed."
+        False,
+        "Refine poses and points by bundle adjustment from the seed; intrinsics as refine_intrinsics says.",
     )
     adjuster: Adjuster = option(
         "own",
         "What adjusts if bundle_adjust is asked for: our own, whose answer is the same bit by bit and "
         "several times faster, or pycolmap's Ceres.",
+    )
+    refine_intrinsics: Refined = option(
+        "auto",
+        'Intrinsics that the adjustments change: "auto", focal length and distortion of cameras that were '
+        'never calibrated (COLMAP\'s guess, or EXIF data); "focal", the focal lengths of all cameras; "all", '
+        'their distortion too; "none", nothing. What was given pulls by its own weight, and stays where the '
+        "matches do not tell it. Cameras that images share stay shared.",
     )
     min_trust: float = option(
         0.6,
@@ -111,6 +120,8 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         self._check_rotations()
         self.check_range("min_trust", 0.0, 1.0)
         self.check_range("max_memory_mb", 0)
+        if self.refine_intrinsics in ("focal", "all") and not (self.adjust or self.bundle_adjust):
+            raise ValueError("refine_intrinsics needs an adjustment; leave out no-adjust")
         if self.adjuster != "own" and not self.bundle_adjust:
             raise ValueError("adjuster has no effect without bundle_adjust; leave it out, or ask for both")
         if self.refine_with_priors and self.scale not in ("auto", "prior"):

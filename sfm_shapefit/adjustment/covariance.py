@@ -36,7 +36,7 @@ _COLLINEAR = 1e-10  # least eigenvalue of the centers' motions, relative to the 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class FrameCovariances:
-    """Covariances of the frames' poses, right observations having `noise_px` of independent noise."""
+    """Covariances of frames and lenses, right observations having `noise_px` of independent noise."""
 
     centers: FloatArray
     """(n, 3, 3) in squared units of the world, world axes; 0 for fixed frames, NaN where no point is seen."""
@@ -44,6 +44,8 @@ class FrameCovariances:
     """(n, 3, 3) in rad^2, axes of the camera (the rig); 0 also for held rotations."""
     free_similarities: int
     """Motions of everything that nothing holds, 0 to 7, which these covariances leave out."""
+    lens_sigmas: FloatArray
+    """(l, 8) standard deviations of the OPENCV parameters of each lens; 0 for what is held."""
 
 
 def estimate_covariances(
@@ -204,4 +206,18 @@ def _by_frame(layout: Layout, blocks: FloatArray, unseen: BoolArray, num_free: i
     own = blocks[layout.node_of_frame[moves]]
     centers[moves], rotations[moves] = own[:, :3, :3], own[:, 3:, 3:]
     centers[unseen], rotations[unseen] = np.nan, np.nan
-    return FrameCovariances(centers=centers, rotations=rotations, free_similarities=num_free)
+    return FrameCovariances(
+        centers=centers,
+        rotations=rotations,
+        free_similarities=num_free,
+        lens_sigmas=_by_lens(layout, blocks),
+    )
+
+
+def _by_lens(layout: Layout, blocks: FloatArray) -> FloatArray:
+    """Return the standard deviations of all parameters of all lenses from the blocks of their nodes."""
+    sigmas = np.zeros(layout.lens_slots.shape)
+    lens, value = np.nonzero(layout.lens_slots >= 0)
+    slot = layout.lens_slots[lens, value]
+    sigmas[lens, value] = np.sqrt(blocks[layout.node_of_lens[lens], slot, slot])
+    return sigmas

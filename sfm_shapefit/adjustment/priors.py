@@ -1,4 +1,4 @@
-"""Priors on rotations and centers: their cost, gradient and curvature, and small rotations.
+"""Priors on rotations, centers and lenses: their cost, gradient and curvature, and small rotations.
 
 With d = log(R R_prior^T) and R <- exp(w) R, the derivative of d by w is the inverse left Jacobian of SO(3),
 
@@ -10,8 +10,9 @@ With d = log(R R_prior^T) and R <- exp(w) R, the derivative of d by w is the inv
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from sfm_shapefit.adjustment.layout import Layout
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
-from sfm_shapefit.adjustment.residuals import Values
+from sfm_shapefit.adjustment.residuals import NormalEquations, Values
 from sfm_shapefit.arrays import FloatArray
 
 _SMALL_RAD = 1e-4  # below, the series: its next term is t^2 / 720 of the first
@@ -36,6 +37,9 @@ def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> f
         if prior is not None:
             d = off(problem, values)
             total += float(np.einsum("n,na,nab,nb->", moves, d, prior.information, d))
+    if problem.lens_prior is not None:
+        d = values.lenses - problem.lens_prior.values
+        total += float(np.sum(_lens_information(problem) * d**2))
     return 0.5 * noise_px**2 * total
 
 
@@ -61,6 +65,27 @@ def add_center_prior(
     information = noise_px**2 * problem.center_prior.information
     blocks += information
     gradients += np.einsum("nab,nb->na", information, _shifts(problem, values))
+
+
+def add_lens_prior(
+    problem: AdjustmentProblem, layout: Layout, values: Values, noise_px: float, normal: NormalEquations
+) -> None:
+    """Add the lens prior to the normal equations of the lenses that have a node."""
+    if problem.lens_prior is None:
+        return
+    information = noise_px**2 * _lens_information(problem)
+    lens, value = np.nonzero((layout.lens_slots >= 0) & (information > 0.0))
+    node, slot = layout.node_of_lens[lens], layout.lens_slots[lens, value]
+    pulled = information[lens, value]
+    normal.nodes[node, slot, slot] += pulled
+    normal.node_gradients[node, slot] += pulled * (values.lenses - problem.lens_prior.values)[lens, value]
+
+
+def _lens_information(problem: AdjustmentProblem) -> FloatArray:
+    """Return the information of the lens prior, (l, 8), where a parameter is one of its lens by itself."""
+    assert problem.lens_prior is not None
+    own = np.array([lens.own_values() for lens in problem.lenses])
+    return np.where(own, problem.lens_prior.information, 0.0)
 
 
 def _turns(problem: AdjustmentProblem, values: Values) -> FloatArray:

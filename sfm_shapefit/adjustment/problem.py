@@ -77,6 +77,12 @@ class Lens:
         kept = [float(values[max(place, 0)]) for place in _PLACES[self.model]]
         return replace(self, parameters=tuple(kept))
 
+    def own_values(self) -> BoolArray:
+        """Return which of OPENCV's parameters the model states by itself, (8,): fy is none where it is fx."""
+        own = np.zeros(NUM_VALUES, np.bool_)
+        own[[max(place, 0) for place in _PLACES[self.model]]] = True
+        return own
+
     def slots(self, *, focal_lengths: bool, distortion: bool) -> IntArray:
         """Return which unknown of the lens each OPENCV parameter is, (8,); -1 for those that are held."""
         slots = np.full(NUM_VALUES, -1)
@@ -123,6 +129,19 @@ class CenterPrior:
     """(n, 3, 3) inverse covariances in world axes; 0 where there is no prior."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LensPrior:
+    """Intrinsics known otherwise: cost 1/2 noise_px^2 sum_p Omega_p d_p^2 with d = p - p_prior.
+
+    Parameters are those of the OPENCV model; where fx and fy are one, it counts once.
+    """
+
+    values: FloatArray
+    """(l, 8)"""
+    information: FloatArray
+    """(l, 8) inverse variances; 0 where there is no prior."""
+
+
 def isotropic_information(sigmas: FloatArray) -> FloatArray:
     """Return the information (n, 3, 3) of standard deviations (n,) per axis; infinite ones give 0."""
     return np.asarray(sigmas, dtype=np.float64)[:, None, None] ** -2.0 * np.eye(3)
@@ -161,6 +180,8 @@ class AdjustmentProblem:
     """Weighs rotations that are not held."""
     center_prior: CenterPrior | None = None
     """Weighs centers."""
+    lens_prior: LensPrior | None = None
+    """Weighs focal lengths and distortion that are not held."""
 
     def __post_init__(self) -> None:
         """Bring every array to its type and check it."""
@@ -263,6 +284,14 @@ class AdjustmentProblem:
             if centers.shape != (n, 3) or not np.isfinite(centers).all():
                 raise InputError(f"the center prior must have {n} finite centers")
             _check_information(self.center_prior.information, n, "center")
+        if self.lens_prior is not None:
+            shape = (len(self.lenses), NUM_VALUES)
+            values, information = self.lens_prior.values, self.lens_prior.information
+            sound = values.shape == information.shape == shape and np.isfinite([values, information]).all()
+            if not sound or (information < 0.0).any():
+                raise InputError(
+                    f"the lens prior must have {shape[0]} x {shape[1]} finite values and information >= 0"
+                )
 
 
 def _check_range(indices: IntArray, size: int, what: str) -> None:

@@ -11,7 +11,13 @@ import numpy as np
 from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge
 from sfm_shapefit.adjustment.layout import Layout, lay_out
 from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
-from sfm_shapefit.adjustment.priors import add_center_prior, add_rotation_prior, sum_priors, turn
+from sfm_shapefit.adjustment.priors import (
+    add_center_prior,
+    add_lens_prior,
+    add_rotation_prior,
+    sum_priors,
+    turn,
+)
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.reduced_factor import ReducedFactor, choose_factor
 from sfm_shapefit.adjustment.residuals import (
@@ -220,6 +226,7 @@ def linearize_all(
         add(problem, values, options.noise_px, blocks, gradients)
         normal.nodes[nodes, slots, slots] += blocks[moves]
         normal.node_gradients[nodes, slots] += gradients[moves]
+    add_lens_prior(problem, layout, values, options.noise_px, normal)
     return normal
 
 

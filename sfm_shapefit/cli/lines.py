@@ -24,6 +24,14 @@ def further_piece_rows(facts: dict[str, Any]) -> Rows:
     return [("further pieces", shorten(lines))] if lines else []
 
 
+def intrinsics_rows(facts: dict[str, Any]) -> Rows:
+    """Return a row on cameras whose intrinsics were in doubt, if there are any."""
+    from sfm_shapefit.results.intrinsics import describe_intrinsics
+
+    lines = describe_intrinsics(facts["intrinsics"])
+    return [("intrinsics", shorten(lines))] if lines else []
+
+
 def describe_points(facts: dict[str, Any]) -> str:
     """Say how many points there are, and how far they are off their keypoints."""
     if not facts["num_points"]:

@@ -24,6 +24,7 @@ from sfm_shapefit.cli.lines import (
     describe_adjustment,
     describe_points,
     further_piece_rows,
+    intrinsics_rows,
     name_pictures,
     next_steps,
 )
@@ -91,6 +92,7 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
             *headline_of_model(found).rows(),
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
+            *intrinsics_rows(facts),
             *[("warning", warning) for warning in found.warnings],
         ],
         details=[

@@ -9,7 +9,7 @@ is at most 1.3 times that of the image, even for rays at right angles to the cam
 
 import itertools
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -143,7 +143,7 @@ def read_frames(
     translations = np.array([_pose(reconstruction.frame(i)).translation for i in frame_ids]).reshape(-1, 3)
     camera_ids = sorted({image.camera_id for image in images})
     views = {i: _views(reconstruction.camera(i)) for i in camera_ids}
-    lenses = tuple(_lens(reconstruction.camera(i)) for i in camera_ids)
+    lenses = tuple(lens_of(reconstruction.camera(i)) for i in camera_ids)
     sensors = [_sensor_from_rig(reconstruction, image) for image in images]
     counts = np.array([len(views[image.camera_id]) for image in images], dtype=np.int64)
     of_image = np.repeat(np.arange(len(images)), counts)
@@ -198,6 +198,20 @@ def collect_tracks(
         ids=names,
         may_split=False,
     )
+
+
+def with_rays_of(
+    frames: PosedFrames, tracks: ObservedTracks | MatchedKeypoints
+) -> ObservedTracks | MatchedKeypoints:
+    """Return the same observations with the rays that the lenses of the frames give them now."""
+    lens = frames.lens_of_camera[tracks.cameras]
+    on_plane = tracks.on_plane.copy()
+    for k, own in enumerate(frames.lenses):
+        rows = np.flatnonzero(lens == k)
+        if not own.fixed and len(rows):
+            camera = pycolmap.Camera(model=own.model, width=1, height=1, params=list(own.parameters))
+            on_plane[rows] = np.asarray(camera.cam_from_img(tracks.pixels[rows])).reshape(-1, 2)
+    return replace(tracks, on_plane=on_plane)
 
 
 def read_bundle(
@@ -312,9 +326,14 @@ def _pose(frame: pycolmap.Frame) -> pycolmap.Rigid3d:
     return pose
 
 
-def _lens(camera: pycolmap.Camera) -> Lens:
+def is_adjusted(camera: pycolmap.Camera) -> bool:
+    """Return whether the adjustment knows the model of a camera; others are undistorted for it."""
+    return camera.model_name in _ADJUSTED_MODELS
+
+
+def lens_of(camera: pycolmap.Camera) -> Lens:
     """Return the lens of a camera, or that of the views of one that is undistorted."""
-    if camera.model_name in _ADJUSTED_MODELS:
+    if is_adjusted(camera):
         return Lens(camera.model_name, tuple(camera.params.tolist()))
     return Lens("SIMPLE_PINHOLE", (_focal_length_px(camera), 0.0, 0.0), fixed=True)
 
@@ -328,7 +347,7 @@ def _focal_length_px(camera: pycolmap.Camera) -> float:
 
 def _views(camera: pycolmap.Camera) -> FloatArray:
     """Return the views of a camera, (v, 3, 3) view_from_camera: itself if it is adjusted as it is."""
-    if camera.model_name in _ADJUSTED_MODELS:
+    if is_adjusted(camera):
         return np.eye(3)[None]
     return _CUBE
 
@@ -385,7 +404,7 @@ def _look_up(
         image = reconstruction.image(frames.image_ids[k])
         camera, own = reconstruction.camera(image.camera_id), slice(begin, end)
         xy = points2d_xy(image)[keypoints[own]]
-        if camera.model_name in _ADJUSTED_MODELS:
+        if is_adjusted(camera):
             pixels[own], on_plane[own] = xy, np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
             continue
         rays = camera_rays(camera, xy)

@@ -20,7 +20,7 @@ One thread does all, as the answer must not depend on their number.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -35,6 +35,7 @@ from sfm_shapefit.adjustment import (
     frames_not_gained,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, focal_sigmas
 from sfm_shapefit.adjustment.given_rotations import RotationErrors, RotationWeight, estimate_rotation_errors
 from sfm_shapefit.adjustment.shared_errors import estimate_center_errors
 from sfm_shapefit.adjustment.thin_tracks import choose_thin_tracks
@@ -48,6 +49,7 @@ from sfm_shapefit.colmap.adjustment import (
     read_frames,
     rotations_of_frames,
     with_poses,
+    with_rays_of,
 )
 from sfm_shapefit.colmap.ceres_adjustment import adjust_by_ceres, refuse_without_points
 from sfm_shapefit.colmap.seed import copy_without_points
@@ -65,10 +67,25 @@ _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 _FINE = 0.9
 # Of the solves after a placement: the scale at which the rotations are judged, and where they end.
 _GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
+# So often lenses are held that turn out to be left open, and all is solved for again.
+_MOST_REPETITIONS = 2
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
 # With more frames, the standard deviations would take longer than all the rest.
 _MOST_FRAMES = 2_000
 _FREE = RotationWeight()
+
+
+class RefinedLenses(NamedTuple):
+    """What an adjustment makes of the lenses that it may change, by the ids of their cameras."""
+
+    sigmas: Mapping[int, float]
+    """Standard deviation of the focal length, as a share of it; NaN where it is not known, as with Ceres."""
+    undetermined: tuple[int, ...]
+    """Those whose focal length the points leave open: they have what was given."""
+
+
+UNREFINED = RefinedLenses({}, ())
+"""Where no lens was free."""
 
 
 class Uncertainty(NamedTuple):
@@ -97,6 +114,8 @@ class Adjusted:
     """Steps of all solves together."""
     uncertainty: Uncertainty
     """Nothing is known with Ceres, and of large models."""
+    lenses: RefinedLenses = UNREFINED
+    """What became of lenses that were free."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,6 +129,8 @@ class AdjustedPlacement:
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
     uncertainty: Uncertainty
+    lenses: RefinedLenses = UNREFINED
+    """What became of lenses that were free."""
 
     @property
     def statement(self) -> str:
@@ -131,7 +152,7 @@ class AdjustedPlacement:
 
 
 class GivenPoses(NamedTuple):
-    """What is known of poses beside the pixels, and how an adjustment treats it."""
+    """What is known of poses and lenses beside the pixels, and how an adjustment treats it."""
 
     weight: RotationWeight = _FREE
     """Of the model's rotations."""
@@ -139,6 +160,8 @@ class GivenPoses(NamedTuple):
     """Whose rotations were given; None: those of the seed."""
     centers: KnownCenters | None = None
     """Measured otherwise, which pull at the frames."""
+    lenses: FreeLenses = ALL_HELD
+    """Those that may change; all others stay what they are, to the bit."""
 
 
 def bundle_adjust(
@@ -158,31 +181,35 @@ def bundle_adjust(
         structure_options: filters; the defaults if None.
         adjuster: our own, or pycolmap's.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        given: what is known of poses, and how it is treated; nothing if None, and with Ceres.
+        given: what is known of poses, and how it is treated; nothing if None, and with Ceres. Lenses that may
+            change are free with both.
 
     Returns:
         The adjusted model, with ids and colors of points as from `triangulate`. Of the gauge, what fixed
         frames, rigs and known centers do not hold stays near the seed's: by our own, the centers' best
         similarity to the seed's is the identity; Ceres holds two cameras. The poses of sensors in their rigs
-        stay what they are, and intrinsics to the bit.
+        stay what they are, and intrinsics that are not free to the bit.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or Ceres diverges.
     """
-    structure_options = structure_options or StructureOptions()
+    structure_options, given = structure_options or StructureOptions(), given or GivenPoses()
     if adjuster == "ceres":
         start = triangulate(seed, tracks, structure_options)
         initial_error_px = start.compute_mean_reprojection_error()
-        unfiltered, iterations, converged = adjust_by_ceres(start, tracks, structure_options, fixed_frames)
+        unfiltered, iterations, converged = adjust_by_ceres(
+            start, tracks, structure_options, fixed_frames, given.lenses
+        )
         uncertainty = Uncertainty()
+        refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
     else:
-        given = given or GivenPoses()
-        run = _Run(seed, tracks, structure_options, fixed_frames, given.centers)
+        run = _Run(seed, tracks, structure_options, fixed_frames, given)
         run.weight = given.weight
         if given.model is not None:
             run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
         iterations, converged, uncertainty = run.iterations, run.converged, run.uncertainty(last)
+        refined = run.refined
     answer = filter_points(unfiltered, structure_options)
     return Adjusted(
         reconstruction=answer,
@@ -191,6 +218,7 @@ def bundle_adjust(
         converged=converged,
         iterations=iterations,
         uncertainty=uncertainty,
+        lenses=refined,
     )
 
 
@@ -200,6 +228,8 @@ def adjust_thinly(
     structure_options: StructureOptions | None = None,
     *,
     fixed_frames: Collection[int] = (),
+    lenses: FreeLenses = ALL_HELD,
+    thorough: bool = False,
 ) -> AdjustedPlacement:
     """Adjust the poses of `seed` on few tracks that hold every camera; for poses that may be coarse.
 
@@ -211,6 +241,10 @@ def adjust_thinly(
         tracks: as in `triangulate`.
         structure_options: filters; the defaults if None. Observations may miss by four times their limit.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
+        lenses: those that change with the poses. One whose focal length the points leave open gets what was
+            given back, and the poses are adjusted again.
+        thorough: whether all points follow where a lens has changed: a shape bends with a focal length that
+            few points leave a thousandth off. Up to 2,000 frames.
 
     Returns:
         The adjusted poses, all rotations free; their gauge is as from `bundle_adjust`.
@@ -218,14 +252,18 @@ def adjust_thinly(
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames)
-    adjusted = run.adjust_thinly(*run.triangulate(_THIN_LIMIT))
-    joined, found = run.triangulate(1.0)
-    if len(found.points):
-        adjusted = run.adjust_thinly(joined, found)
+    given = GivenPoses(lenses=lenses)
+    run = _Run(seed, tracks, structure_options or StructureOptions(), fixed_frames, given)
+    adjusted = run.repeat_with_known_lenses(run.adjust_twice_thinly)
+    if thorough and run.lenses.doubts and adjusted.num_frames <= _MOST_FRAMES:
+        _, _, adjusted = run.adjust_by_all_points()
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=_FREE, errors=None, uncertainty=run.uncertainty(adjusted)
+        reconstruction=poses,
+        weight=_FREE,
+        errors=None,
+        uncertainty=run.uncertainty(adjusted),
+        lenses=run.refined,
     )
 
 
@@ -236,7 +274,7 @@ def adjust_placement(
     weight: RotationWeight | None,
     *,
     fixed_frames: Collection[int] = (),
-    known: KnownCenters | None = None,
+    given: GivenPoses | None = None,
 ) -> AdjustedPlacement:
     """Adjust placed cameras whose rotations were given, on all tracks at once.
 
@@ -246,24 +284,35 @@ def adjust_placement(
         structure_options: filters.
         weight: of the given rotations; None: the matches decide, see `adjustment.given_rotations`.
         fixed_frames: ids of frames whose poses stay what they are to the last bit.
-        known: centers measured otherwise, which pull at the frames.
+        given: centers measured otherwise, which pull at the frames, and lenses that may change.
 
     Raises:
         UnsolvableError: if no point can be triangulated.
     """
-    run = _Run(seed, tracks, structure_options, fixed_frames, known)
+    run, errors = _Run(seed, tracks, structure_options, fixed_frames, given or GivenPoses()), None
+    if run.lenses.doubts:  # points are found, and rotations judged, with the lenses that come out
+        run.repeat_with_known_lenses(run.adjust_twice_thinly)
+        run.frames = replace(run.frames, rotations=run.start.rotations)
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
-    problem, errors = run.frames.problem(joined, found), None
+    problem = run.frames.problem(joined, found)
     if weight is None:
         loss_scale_px = _GIVEN_SCALE * structure_options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.return_frames(problem, run.solve(problem, run.choose_scale(problem), _GIVEN_FALL))
+    adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    if run.lenses.doubts:
+        run.judge_lenses(adjusted)
+    else:
+        adjusted = run.return_frames(problem, adjusted)
     poses = with_poses(copy_without_points(seed), run.start, run.frames)
     return AdjustedPlacement(
-        reconstruction=poses, weight=weight, errors=errors, uncertainty=run.uncertainty(adjusted)
+        reconstruction=poses,
+        weight=weight,
+        errors=errors,
+        uncertainty=run.uncertainty(adjusted),
+        lenses=run.refined,
     )
 
 
@@ -276,9 +325,10 @@ class _Run:
         tracks: TrackSource,
         options: StructureOptions,
         fixed_frames: Collection[int],
-        known: KnownCenters | None = None,
+        given: GivenPoses,
     ) -> None:
-        self.start = self.frames = read_frames(seed, fixed_frames, known)
+        self.lenses, self.refined = given.lenses, UNREFINED
+        self.start = self.frames = read_frames(seed, fixed_frames, given.centers)
         self.weight, self.given = _FREE, self.start.rotations
         self.source, self.options = collect_tracks(self.frames, seed, tracks), options
         self.iterations, self.converged, self.loss_scale_px = 0, False, 1.0
@@ -308,19 +358,76 @@ class _Run:
         points = TriangulatedPoints(points=found.points[chosen], tracks=chosen, points_seen=seen)
         return self.solve(self.frames.problem(thin.subset(chosen), points), _THIN_SCALE, _THIN_FALL)
 
+    def adjust_twice_thinly(self) -> AdjustmentProblem:
+        """Move coarse frames: at the wide limit, then at the threshold; return the last problem."""
+        adjusted = self.adjust_thinly(*self.triangulate(_THIN_LIMIT))
+        joined, found = self.triangulate(1.0)
+        return self.adjust_thinly(joined, found) if len(found.points) else adjusted
+
+    def repeat_with_known_lenses(self, solve: Callable[[], AdjustmentProblem]) -> AdjustmentProblem:
+        """Solve, and where focal lengths are left open, hold what was given of them and solve again.
+
+        What is still open after a few times keeps what it has, with its standard deviation.
+        """
+        adjusted = solve()
+        for _ in range(_MOST_REPETITIONS):
+            unknown = self.judge_lenses(adjusted)
+            if not unknown:
+                break
+            self.hold_lenses(unknown)
+            adjusted = solve()
+        else:
+            self.judge_lenses(adjusted)
+        return adjusted
+
+    def judge_lenses(self, adjusted: AdjustmentProblem) -> list[int]:
+        """Note how well free focal lengths are known; return the cameras whose points leave them open."""
+        if not self.lenses.doubts:
+            return []
+        options = AdjustmentOptions(
+            loss_scale_px=self.loss_scale_px,
+            hold_rotations=self.weight.hold,
+            noise_px=self.weight.noise_px,
+            **self.lenses.overrides(),
+        )
+        ids = self.frames.colmap_camera_of_lens
+        try:
+            found = dict(zip(ids, focal_sigmas(adjusted, options).tolist(), strict=True))
+        except UnsolvableError:
+            found = dict.fromkeys(ids, math.inf)
+        sigmas = {camera: found[camera] for camera in ids if camera in self.lenses.doubts}
+        self.refined = self.refined._replace(sigmas=sigmas)
+        lenses = dict(zip(ids, self.frames.lenses, strict=True))
+        doubts = self.lenses.doubts
+        return [i for i in sigmas if not doubts[i].accepts(lenses[i], sigmas[i])]
+
+    def hold_lenses(self, camera_ids: Sequence[int]) -> None:
+        """Give lenses back what was given of them, and hold it from now on."""
+        given = {camera: self.lenses.doubts[camera].given for camera in camera_ids}
+        ids = self.frames.colmap_camera_of_lens
+        lenses = tuple(given.get(i, lens) for i, lens in zip(ids, self.frames.lenses, strict=True))
+        self.frames = replace(self.frames, lenses=lenses)
+        self.source = with_rays_of(self.frames, self.source)
+        self.lenses = self.lenses.without(camera_ids)
+        self.refined = self.refined._replace(undetermined=(*self.refined.undetermined, *camera_ids))
+
     def solve(self, problem: AdjustmentProblem, scale: float, fall: float) -> AdjustmentProblem:
         """Move the frames to the optimum of a problem, and return it."""
         loss_scale_px = self.loss_scale_px = scale * self.options.max_reprojection_error_px
+        problem = self.lenses.apply(problem, self.frames.colmap_camera_of_lens)
         adjusted = adjust(
             self.weight.apply(problem, self.given),
             loss_scale_px=loss_scale_px,
             cost_tolerance=fall,
             hold_rotations=self.weight.hold,
             noise_px=self.weight.noise_px,
+            **self.lenses.overrides(),
         )
-        self.frames = replace(
-            self.frames, rotations=adjusted.problem.rotations, centers=adjusted.problem.centers
-        )
+        found = adjusted.problem
+        lenses = tuple(found.lenses)
+        self.frames = replace(self.frames, rotations=found.rotations, centers=found.centers, lenses=lenses)
+        if self.lenses.doubts:
+            self.source = with_rays_of(self.frames, self.source)
         self.iterations += adjusted.iterations
         self.converged = adjusted.converged
         return adjusted.problem
@@ -353,6 +460,22 @@ class _Run:
         threshold_px = self.options.max_reprojection_error_px
         return choose_loss_scale_px(problem, [scale * threshold_px for scale in _LAST_SCALES]) / threshold_px
 
+    def adjust_coarsely(self) -> AdjustmentProblem:
+        """Move the frames by all points, the first of two times; return the problem."""
+        joined, found = self.triangulate(1.0)
+        refuse_without_points(len(found.points))
+        return self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
+
+    def adjust_by_all_points(self) -> tuple[ObservedTracks, TriangulatedPoints, AdjustmentProblem]:
+        """Move the frames by all points, twice; return what was solved for last, and the problem."""
+        adjusted = self.repeat_with_known_lenses(self.adjust_coarsely)
+        last_scale = self.choose_scale(adjusted)
+        joined, found = self.triangulate(1.0)
+        refuse_without_points(len(found.points))
+        adjusted = self.solve(self.frames.problem(joined, found), last_scale, _LAST_FALL)
+        self.judge_lenses(adjusted)
+        return joined, found, adjusted
+
     def adjust_all(
         self, seed: pycolmap.Reconstruction, tracks: TrackSource
     ) -> tuple[pycolmap.Reconstruction, float, AdjustmentProblem]:
@@ -362,13 +485,7 @@ class _Run:
         initial_error_px = _mean_error_px(self.frames.problem(joined, found))
         if np.sum(found.points_seen >= 0) < _FINE * np.sum(loose.points_seen >= 0):
             self.adjust_thinly(loosely, loose)
-        joined, found = self.triangulate(1.0)
-        refuse_without_points(len(found.points))
-        adjusted = self.solve(self.frames.problem(joined, found), _FIRST_SCALE, _FIRST_FALL)
-        last_scale = self.choose_scale(adjusted)
-        joined, found = self.triangulate(1.0)
-        refuse_without_points(len(found.points))
-        adjusted = self.solve(self.frames.problem(joined, found), last_scale, _LAST_FALL)
+        joined, found, adjusted = self.adjust_by_all_points()
         answer = with_poses(copy_without_points(seed), self.start, self.frames)
         found = replace(found, points=adjusted.points)
         colors = None if isinstance(tracks, pycolmap.CorrespondenceGraph) else tracks

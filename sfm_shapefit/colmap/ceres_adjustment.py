@@ -21,6 +21,7 @@ from typing import cast
 import numpy as np
 import pycolmap
 
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.colmap.quiet import is_heard, quiet_stderr
 from sfm_shapefit.colmap.structure import TrackSource, triangulate
 from sfm_shapefit.colmap.structure_options import StructureOptions
@@ -39,8 +40,11 @@ def adjust_by_ceres(
     tracks: TrackSource,
     structure_options: StructureOptions,
     fixed_frames: Collection[int],
+    lenses: FreeLenses | None = None,
 ) -> tuple[pycolmap.Reconstruction, int, bool]:
     """Return a new model, not yet filtered, the steps of all rounds, and whether the last one converged.
+
+    Lenses that may change are free here: Ceres knows of no prior on them.
 
     Raises:
         UnsolvableError: if no point can be triangulated, or the adjustment diverges.
@@ -50,7 +54,7 @@ def adjust_by_ceres(
         limit_px = widening * structure_options.max_reprojection_error_px
         current = triangulate(current, tracks, replace(structure_options, max_reprojection_error_px=limit_px))
         refuse_without_points(current.num_points3D())
-        steps, converged = _solve(current, loss_scale_px, fixed_frames)
+        steps, converged = _solve(current, loss_scale_px, fixed_frames, lenses)
         for image in map(current.image, sorted(current.reg_image_ids())):
             if not np.isfinite(image.cam_from_world().matrix()).all():  # such points are filtered later
                 raise UnsolvableError(
@@ -71,7 +75,10 @@ def refuse_without_points(num_points: int) -> None:
 
 
 def _solve(
-    reconstruction: pycolmap.Reconstruction, loss_scale_px: float, fixed_frames: Collection[int]
+    reconstruction: pycolmap.Reconstruction,
+    loss_scale_px: float,
+    fixed_frames: Collection[int],
+    lenses: FreeLenses | None,
 ) -> tuple[int, bool]:
     """Adjust our own `reconstruction` in place; return the number of steps and whether they converged."""
     config = pycolmap.BundleAdjustmentConfig()
@@ -88,6 +95,10 @@ def _solve(
     settings.print_summary = is_heard()
     settings.refine_focal_length = settings.refine_principal_point = settings.refine_extra_params = False
     settings.refine_sensor_from_rig = False
+    if lenses is not None and lenses.doubts:
+        settings.refine_focal_length, settings.refine_extra_params = True, lenses.distortion
+        for camera_id in sorted(set(reconstruction.cameras) - set(lenses.doubts)):
+            config.set_constant_cam_intrinsics(camera_id)
     settings.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     settings.ceres.loss_function_scale = loss_scale_px
     settings.ceres.solver_options.function_tolerance = _FUNCTION_TOLERANCE

@@ -34,7 +34,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.atomic_folder import locked_folder, remove_abandoned
-from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, world_rays
+from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrices, same_intrinsics, world_rays
 from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import refuse_irregular_file
@@ -167,9 +167,14 @@ class MatchDatabase:
         self._cached_bytes = 0
 
     def turned(self, model: PosedModel) -> "MatchDatabase":
-        """Return the same matches for a model of the same images, in the same order, with other rotations."""
+        """Return the same matches for a model of the same images, in the same order, with other rotations.
+
+        Its intrinsics may be others too.
+        """
         other = copy.copy(self)
-        other._model, other._rays, other._cached_bytes = model, OrderedDict(), 0
+        other._model, other._rays, other._cached_bytes, other._kept = model, OrderedDict(), 0, {}
+        if not same_intrinsics(model, self._model):
+            return other
         turns = model.rotations.transpose(0, 2, 1) @ self._model.rotations
         other._kept = {least: [_turn(batch, turns) for batch in kept] for least, kept in self._kept.items()}
         return other

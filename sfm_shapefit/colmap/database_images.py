@@ -30,8 +30,6 @@ class UnposedImages:
 
     reconstruction: pycolmap.Reconstruction
     """All cameras and images; every rotation is the identity, every center the origin."""
-    num_guessed_cameras: int
-    """Cameras in use whose focal length is COLMAP's guess."""
     rigs: DatabaseRigs
     """Which of the images were taken together; the model here does not have them."""
 
@@ -78,9 +76,7 @@ def read_images(path: Path) -> UnposedImages:
             raise InputError(f"{path}: the image with id {image_id} stands twice; remove one of them")
         image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-    used = {row[2] for row in images}
-    guessed = sum(1 for row in cameras if row[0] in used and not row[5])
-    return UnposedImages(reconstruction=model, num_guessed_cameras=guessed, rigs=read_rigs(path, model))
+    return UnposedImages(reconstruction=model, rigs=read_rigs(path, model))
 
 
 def pose_at_origin(

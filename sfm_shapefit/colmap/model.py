@@ -91,6 +91,14 @@ class PosedModel:
         return self.reconstruction.camera(self.reconstruction.image(int(self.image_ids[index])).camera_id)
 
 
+def same_intrinsics(one: PosedModel, other: PosedModel) -> bool:
+    """Return whether two models of the same images take them through the same lenses."""
+    cameras = [
+        {i: camera.params.tolist() for i, camera in m.reconstruction.cameras.items()} for m in (one, other)
+    ]
+    return cameras[0] == cameras[1]
+
+
 def posed_cameras(model: PosedModel) -> PosedModelFile:
     """Return what rays in world axes need as plain values for other processes: no points, no centers."""
     cameras = [model.camera(index) for index in range(model.num_images)]
@@ -157,13 +165,17 @@ def read_model(source: Path | str | pycolmap.Reconstruction) -> PosedModel:
 
 
 def with_frame_rotations(model: PosedModel, turned: pycolmap.Reconstruction) -> PosedModel:
-    """Return the model with the frames' rotations of another, about their own centers; no input is touched.
+    """Return the model with the frames' rotations, and the intrinsics, of another; no input is touched.
 
     Args:
         model: the posed images.
-        turned: with some of the frames of it; where a rotation is the same, the pose keeps its bits.
+        turned: with the cameras and some of the frames of it. Frames turn about their own centers; where a
+            rotation is the same, the pose keeps its bits.
     """
     copy = pycolmap.Reconstruction(model.reconstruction)
+    for camera_id, camera in turned.cameras.items():
+        if camera.params.tolist() != copy.camera(camera_id).params.tolist():
+            copy.camera(camera_id).params = camera.params
     for frame_id in sorted(turned.reg_frame_ids()):
         frame, other = copy.frame(frame_id), turned.frame(frame_id).rig_from_world
         pose = frame.rig_from_world

@@ -14,7 +14,7 @@ import numpy as np
 import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show their report in notebooks
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, Uncertainty
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
@@ -27,6 +27,7 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
+from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
 from sfm_shapefit.commands.stages.rigs import Rigid, find_rigid_parts, place_cameras
@@ -43,6 +44,7 @@ from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.gauge import PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
@@ -103,10 +105,12 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)
     with open_source(model, inputs, options) as opened:
-        return locate_source(opened, Locating(inputs, rigid, priors_known, executor), options, clock)
+        known = Locating(inputs, rigid, priors_known, executor, intrinsics=intrinsics)
+        return locate_source(opened, known, options, clock)
 
 
 class Locating(NamedTuple):
@@ -121,6 +125,8 @@ class Locating(NamedTuple):
     None if there was no adjustment."""
     uncertainty: Uncertainty = Uncertainty()
     """Of these centers, in their units."""
+    intrinsics: Intrinsics = NO_DOUBTS
+    """Which of the images' are in doubt, and what became of them so far."""
 
 
 def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, clock: Clock) -> LocateResult:
@@ -142,19 +148,23 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             there = np.isfinite(centers).all(axis=1)
             scale = median_spread(centers[there]) / median_spread(placed[there])
             placement = with_uncertainty(placement, model, known.uncertainty, scale)
-        located = _choose(placement, GaugeRule(model, rigid, options, known.priors))
+        given = GivenPoses(lenses=known.intrinsics.free)
+        located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
         pulls = known.priors is not None and options.refine_with_priors
         if known.priors is not None and pulls:
             located = pull_cameras(model, located, known.priors, options)
             placement = located.placement
-    adjustment = None
+    adjustment, intrinsics = None, known.intrinsics
     is_adjusted = known.centers is not None and not pulls
     if not is_adjusted and options.adjusts_cameras(len(placement.cameras)):
         weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
             after = adjust_placed(source, directions, located, options, clock, weight)
             source, directions, placement, adjustment = after
-            given = located.given._replace(weight=adjustment.weight, model=model.reconstruction)
+            intrinsics = intrinsics.after(adjustment.lenses)
+            given = located.given._replace(
+                weight=adjustment.weight, model=model.reconstruction, lenses=intrinsics.free
+            )
             located = located._replace(given=given)
     with clock("trust"):
         relative = ask_pairs(source, directions, options)
@@ -167,10 +177,13 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     if seeded.adjusted is not None:
         scale = located.gauge.similarity.scale
         placement = with_uncertainty(placement, model, seeded.adjusted.uncertainty, scale)
+        intrinsics = intrinsics.after(seeded.adjusted.lenses)
+    focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, placement.scale_sigma)
     located = located._replace(placement=placement, gauge=gauge)
     warnings = (
-        *focal_warnings(model, focal_doubts),
+        *focal_warnings(source.model, focal_doubts, intrinsics.refined.undetermined),
+        *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
     )
     return LocateResult(
@@ -192,6 +205,7 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         further=further,
         fixed=rigid.fixed,
         focal_doubts=focal_doubts,
+        intrinsics=intrinsics,
     )
 
 

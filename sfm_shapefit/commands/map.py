@@ -6,9 +6,11 @@
 Images that the averaging drops form components of their own.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +18,7 @@ import numpy as np
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
+from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.locate import Locating, locate_source
 from sfm_shapefit.commands.relative_rotations import Sharing, measure_rotations
@@ -24,10 +27,12 @@ from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
+from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
@@ -76,24 +81,21 @@ def map_database(
     path, clock = database_in(Path(database)), Clock(progress) if progress else Clock()
     with clock("read"):
         images = read_images(path)
-        unposed = read_model(images.reconstruction)
+        unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         positions = read_priors(unposed, inputs, options, priors)
-    with clock("relative rotations"):
-        sharing = Sharing(options.num_threads(), advance=clock.advance)
-        relative = measure_rotations(path, unposed, LEAST_MATCHES, options.relative_rotations, sharing)
-        scores = score_triplets(unposed.num_images, relative).tolist()
-    triplet_scores = dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True))
-    run = _Run(options, clock, path, images, unposed, triplet_scores, positions)
-    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-    of_frames = relative_rotations_of_frames(relative, frame_of_image, sensor_rotations)
-    num_frames = int(frame_of_image.max()) + 1
-    models, reasons = [], dict.fromkeys(range(num_frames), _UNMATCHED)
-    for frames, averaged in run.average_components(num_frames, of_frames, reasons):
-        members = np.flatnonzero(np.isin(frame_of_image, frames))
-        averaging = averaged.turned(
-            np.searchsorted(frames, frame_of_image[members]), sensor_rotations[members]
-        )
+    run = _Run(options, clock, path, images, unposed, intrinsics, positions)
+    relative = run.measure()
+    if options.adjust and intrinsics.free.doubts:
+        known = run.refine_intrinsics(relative)
+        if differ_in_rays(known, unposed):
+            run = run._replace(unposed=known)
+            relative = run.measure()
+    scores = score_triplets(unposed.num_images, relative).tolist()
+    run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
+    frame_of_image, _ = images.frames(unposed.image_ids.tolist())
+    models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
+    for frames, members, averaging in run.average_images(relative, reasons):
         try:
             found = run.locate_component(members, averaging)
         except UnsolvableError as error:
@@ -145,9 +147,49 @@ class _Run(NamedTuple):
     images: UnposedImages
     unposed: PosedModel
     """The images as a model."""
-    triplet_scores: dict[tuple[int, int], float]
-    """Of the pairs with a relative rotation."""
+    intrinsics: Intrinsics
+    """Which of theirs are in doubt."""
     priors: PositionPriors | None
+    triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
+    """Of the pairs with a relative rotation."""
+
+    def measure(self) -> RelativeRotations:
+        """Return the relative rotations of all pairs, by the intrinsics that the images have."""
+        with self.clock("relative rotations"):
+            sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
+            source = self.options.relative_rotations
+            return measure_rotations(self.database, self.unposed, LEAST_MATCHES, source, sharing)
+
+    def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
+        """Return the images with the intrinsics that first placements of all components find.
+
+        Relative rotations by a wrong focal length are off by degrees, and the averaging may follow the false
+        ones among them; a placement that is wrong in places knows the focal length all the same. Of a camera
+        in several components the one with most images counts.
+        """
+        found: dict[int, list[float]] = {}
+        for _, members, averaging in self.average_images(relative, {}):
+            options = self._options_of(members, has_priors=False)
+            model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
+            inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+            rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
+            with open_source(model, inputs, options) as source, suppress(UnsolvableError):
+                with self.clock("first placement"):
+                    free = self.intrinsics.free
+                    first = adjust_first_placement(source, rule, self.clock, free, thorough=False)
+                found = first.parameters() | found
+        return with_parameters(self.unposed, found)
+
+    def average_images(
+        self, relative: RelativeRotations, reasons: dict[int, str]
+    ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
+        """Yield the frames of each component, and its images with their rotations."""
+        frame_of_image, sensor_rotations = self.images.frames(self.unposed.image_ids.tolist())
+        of_frames = relative_rotations_of_frames(relative, frame_of_image, sensor_rotations)
+        for frames, averaged in self.average_components(int(frame_of_image.max()) + 1, of_frames, reasons):
+            members = np.flatnonzero(np.isin(frame_of_image, frames))
+            places = np.searchsorted(frames, frame_of_image[members])
+            yield frames, members, averaged.turned(places, sensor_rotations[members])
 
     def average_components(
         self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]
@@ -200,14 +242,18 @@ class _Run(NamedTuple):
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
+            intrinsics = self.intrinsics
             if self.options.adjust:
                 with self.clock("first placement"):
-                    rotations, centers, uncertainty = adjust_first_placement(
-                        averaged, GaugeRule(model, rigid, options, priors), self.clock
-                    )
-                source = averaged.turned(self._pose(image_ids, rotations))
+                    rule = GaugeRule(model, rigid, options, priors)
+                    first = adjust_first_placement(averaged, rule, self.clock, intrinsics.free)
+                centers, uncertainty = first.centers, first.adjusted.uncertainty
+                intrinsics = intrinsics.after(first.adjusted.lenses)
+                source = averaged.turned(self._pose(image_ids, first.rotations, first.parameters()))
                 rigid = find_rigid_parts(source.model, options, has_priors=priors is not None)
-            locating = Locating(inputs, rigid, priors, centers=centers, uncertainty=uncertainty)
+            locating = Locating(
+                inputs, rigid, priors, centers=centers, uncertainty=uncertainty, intrinsics=intrinsics
+            )
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
@@ -235,9 +281,13 @@ class _Run(NamedTuple):
             settings["scale"] = "unit"
         return LocateOptions(**settings)
 
-    def _pose(self, image_ids: list[int], rotations: FloatArray) -> PosedModel:
-        """Return images with these rotations and all centers 0."""
-        return read_model(pose_at_origin(self.images, image_ids, rotations))
+    def _pose(
+        self, image_ids: list[int], rotations: FloatArray, found: Mapping[int, list[float]] | None = None
+    ) -> PosedModel:
+        """Return images with these rotations and all centers 0, and parameters that were found of cameras."""
+        known = with_parameters(self.unposed, found or {})
+        images = replace(self.images, reconstruction=known.reconstruction)
+        return read_model(pose_at_origin(images, image_ids, rotations))
 
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:
@@ -266,11 +316,6 @@ def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[s
             f"{len(images.rigs.uncalibrated)} rigs of the database are not used, rig "
             f"{images.rigs.uncalibrated[0]} for one, because a sensor has no pose in them or an image no "
             "frame: their cameras are placed one by one"
-        )
-    if images.num_guessed_cameras:
-        yield (
-            f"a guessed focal length stays as it is in {counted(images.num_guessed_cameras, 'camera')}; "
-            "calibrate (pycolmap.calibrate_view_graph) if the result is poor"
         )
     for number, model in enumerate(models):
         share, agreements = model.averaging.share, model.averaging.agreements

@@ -14,6 +14,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
+from sfm_shapefit.results.intrinsics import describe_intrinsics
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -55,6 +56,7 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         _pairs(drawing),
         *_certainty(drawing, facts),
         _units(facts),
+        *_intrinsics(facts),
     ]
 
 
@@ -124,6 +126,13 @@ def _certainty(drawing: Drawing, facts: dict[str, Any]) -> Iterator[str]:
         f"{100.0 * median / drawing.extent:.2g}% of the extent of {drawing.extent:.4g} units; the largest is "
         f"{drawing.cameras.sigmas[worst]:.2g}, of {shorten(drawing.cameras.names[worst])}{meaning}."
     )
+
+
+def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what became of intrinsics in doubt, which earlier outputs lack."""
+    lines = describe_intrinsics(facts.get("intrinsics", []))
+    if lines:
+        yield f"Intrinsics: {'; '.join(lines)}."
 
 
 def _units(facts: dict[str, Any]) -> str:

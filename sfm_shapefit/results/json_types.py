@@ -145,6 +145,25 @@ class RigidGroups(TypedDict):
     num_inner_pairs: Annotated[int, "Pairs inside one group, which say nothing."]
 
 
+class CameraIntrinsics(TypedDict):
+    """A camera whose intrinsics were in doubt, and what became of them."""
+
+    camera: Annotated[int, "Its id in the model."]
+    num_images: Annotated[int, "Placed images that it took."]
+    model: Annotated[str, "COLMAP's name of its model."]
+    origin: Annotated[str, "Where what was given comes from: a guess, EXIF data, or given."]
+    decided_by: Annotated[
+        Literal["adjusted", "view graph", "undetermined", "held"],
+        "What decided: the adjustments; the fundamental matrices alone; the matches do not tell it, so that "
+        "it stays as given; it was not to be changed.",
+    ]
+    given_focal_px: Annotated[float, "Mean focal length as given."]
+    focal_px: Annotated[float, "Mean focal length of the output."]
+    focal_sigma_px: Annotated[float | None, "Its standard deviation by the noise alone; null if not known."]
+    given_parameters: Annotated[list[float], "All parameters as given, in COLMAP's order."]
+    parameters: Annotated[list[float], "All parameters of the output."]
+
+
 class ModelInputs(TypedDict):
     """What `locate` worked from."""
 
@@ -231,6 +250,9 @@ class LocateSummary(PlacementSummary):
     ]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
+    intrinsics: Annotated[
+        list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
+    ]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]

@@ -22,6 +22,7 @@ from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
 from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
+from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.notebook import notebook_html
@@ -99,6 +100,9 @@ class LocateResult(Displayed):
     sees a 3D point; NaN where there is no database."""
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
+
+    intrinsics: Intrinsics = field(default_factory=Intrinsics)
+    """Cameras whose intrinsics were in doubt, and what became of them."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""

@@ -71,6 +71,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "scale_sigma": found.gauge.scale_sigma,
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
+        "intrinsics": found.intrinsics.rows(model),
         "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),

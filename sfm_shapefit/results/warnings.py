@@ -1,6 +1,6 @@
 """What the user should know beyond the tables, a sentence each."""
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 
@@ -143,14 +143,19 @@ def ambiguity_warnings(placement: Placement) -> Iterator[str]:
         )
 
 
-def focal_warnings(model: PosedModel, doubts: tuple[FocalDoubt, ...]) -> Iterator[str]:
-    """Yield which cameras' matches prefer another focal length."""
+def focal_warnings(
+    model: PosedModel, doubts: tuple[FocalDoubt, ...], tried: Collection[int] = ()
+) -> Iterator[str]:
+    """Yield which cameras' matches prefer another focal length; for those `tried`, no adjustment found it."""
     for doubt in doubts:
+        advice = "--refine-intrinsics focal lets it change"
+        if doubt.camera in tried:
+            advice = "the adjustment could not tell, so calibrate that camera"
         focal_px = float(model.reconstruction.camera(doubt.camera).mean_focal_length())
         yield (
             f"the matches of camera {doubt.camera} prefer a focal length of about "
             f"{doubt.factor * focal_px:,.0f} px to its {focal_px:,.0f} px ({doubt.num_pairs} pairs were "
-            "asked); its images stand wrong if that is so"
+            f"asked); its images stand wrong if that is so: {advice}"
         )
 
 

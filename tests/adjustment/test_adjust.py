@@ -14,6 +14,7 @@ from sfm_shapefit.adjustment import (
     CenterPrior,
     Ending,
     Lens,
+    LensPrior,
     Rig,
     RotationPrior,
     adjust,
@@ -384,6 +385,8 @@ def test_wrong_priors_lenses_and_options_are_refused():
         replace(
             start, rotation_prior=RotationPrior(rotations=np.eye(3)[None], information=np.zeros((1, 3, 3)))
         )
+    with pytest.raises(InputError, match="lens prior must have 1 x 8"):
+        replace(start, lens_prior=LensPrior(values=np.ones((1, 8)), information=np.full((1, 8), -1.0)))
     with pytest.raises(InputError, match="undistort it"):
         Lens("THIN_PRISM_FISHEYE", (1.0,))
     with pytest.raises(InputError, match="4 finite"):

@@ -64,6 +64,7 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole_matrix(case, solver)
         problem, num_free = replace(problem, center_prior=prior), 0
     found = estimate_covariances(problem, options)
     assert found.free_similarities == num_free
+    assert (found.lens_sigmas > 0.0).any() == (case == "lenses")
     layout, inverse, rows = expected_covariances(problem, options, num_free)
     for frame in range(n):
         node = layout.node_of_frame[frame]
@@ -75,6 +76,9 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole_matrix(case, solver)
                 continue
             own = inverse[np.ix_(rows[node, slots], rows[node, slots])]
             np.testing.assert_allclose(block, own, atol=1e-6 * np.abs(own).max())
+    for lens, value in np.argwhere(layout.lens_slots >= 0):
+        row = rows[layout.node_of_lens[lens], layout.lens_slots[lens, value]]
+        assert found.lens_sigmas[lens, value] == pytest.approx(np.sqrt(inverse[row, row]), rel=1e-5)
 
 
 def test_drawn_noise_scatters_as_the_covariances_say():

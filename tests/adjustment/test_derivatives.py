@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from sfm_shapefit.adjustment import AdjustmentOptions, CenterPrior, RotationPrior, isotropic_information
+from sfm_shapefit.adjustment import (
+    AdjustmentOptions,
+    CenterPrior,
+    LensPrior,
+    RotationPrior,
+    isotropic_information,
+)
 from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.priors import sum_priors
 from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals, sum_losses
@@ -35,6 +41,12 @@ def with_priors(problem, rng):
         rotation_prior=RotationPrior(rotations=turns @ problem.rotations, information=information[0]),
         center_prior=CenterPrior(
             centers=problem.centers + 0.1 * rng.standard_normal((n, 3)), information=information[1]
+        ),
+        lens_prior=LensPrior(
+            values=np.array([1.1 * lens.values() for lens in problem.lenses]),
+            information=rng.uniform(
+                0.0, [100.0, 100.0, 1.0, 1.0, 1e6, 1e6, 1e6, 1e6], (len(problem.lenses), 8)
+            ),
         ),
     )
 

@@ -8,9 +8,17 @@ import pytest
 
 import sfm_shapefit
 from sfm_shapefit import InputError
-from sfm_shapefit.adjustment import reprojection_errors_px
+from sfm_shapefit.adjustment import free_lenses, reprojection_errors_px
+from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
-from sfm_shapefit.colmap.adjustment import collect_tracks, read_bundle, read_frames, with_points, with_poses
+from sfm_shapefit.colmap.adjustment import (
+    collect_tracks,
+    lens_of,
+    read_bundle,
+    read_frames,
+    with_points,
+    with_poses,
+)
 from sfm_shapefit.colmap.bundle_adjustment import adjust_thinly
 from sfm_shapefit.geometry import fit_similarity
 from tests.scenes import BUNDLED
@@ -251,3 +259,21 @@ def test_thin_adjustment_straightens_coarse_poses_and_holds_fixed_ones(source):
     assert errors[1] < 0.2 * errors[0]
     poses = [m.frame(fixed[0]).rig_from_world.matrix() for m in (found, truth)]
     np.testing.assert_array_equal(*poses)
+
+
+@pytest.mark.parametrize("source", ["matches", "tracks"])
+def test_thin_adjustment_finds_a_lens_in_doubt_or_gives_back_what_was_given(source, monkeypatch):
+    truth = scene("RADIAL")
+    start = disturbed(truth)
+    start.camera(1).params = np.array([460.0, 320.0, 240.0, 0.0, 0.0])
+    tracks = start if source == "tracks" else graph_of(truth)
+    free = FreeLenses({1: LensDoubt(lens_of(start.camera(1)), 0.3, 0.1)}, distortion=True)
+    found = adjust_thinly(start, tracks, lenses=free)
+    # 0.3 px on 7 views of 80 points
+    assert found.reconstruction.camera(1).params[0] == pytest.approx(400.0, rel=0.005)
+    assert found.lenses.undetermined == ()
+    assert 0.0 < found.lenses.sigmas[1] < 0.01
+    monkeypatch.setattr(free_lenses, "LARGEST_SIGMA", 0.0)
+    held = adjust_thinly(start, tracks, lenses=free)
+    assert held.lenses.undetermined == (1,)
+    assert held.reconstruction.camera(1).params.tolist() == start.camera(1).params.tolist()

@@ -13,8 +13,10 @@ import pycolmap
 import pytest
 
 from sfm_shapefit import LocateOptions, locate
+from sfm_shapefit.adjustment.free_lenses import FreeLenses, LensDoubt
 from sfm_shapefit.atomic_folder import atomic_folder
-from sfm_shapefit.colmap.bundle_adjustment import bundle_adjust
+from sfm_shapefit.colmap.adjustment import lens_of
+from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.quiet import hear_pycolmap, quiet_stderr
 from sfm_shapefit.colmap.seed import build_seed, write_model
@@ -448,13 +450,24 @@ def test_adjustment_of_a_disturbed_seed_of_exact_data_finds_the_truth(source, ad
         assert bytes(np.array(adjusted.reconstruction.camera(i).params)) == bytes(np.array(camera.params))
 
 
-def test_intrinsics_stay_what_they_are():
+def test_intrinsics_stay_what_they_are_unless_they_are_in_doubt():
     original, _ = ring_model()
-    for camera in original.cameras.values():
-        camera.params = np.array(camera.params) * [1.01, 1.0, 1.0, 1.0]
+    camera = original.camera(3)
+    camera.params = np.array(camera.params) * [1.01, 1.0, 1.0, 1.0]
     seed, graph = seeded(original)
     fixed = bundle_adjust(seed, graph)
     assert fixed.reconstruction.camera(3).params[0] == 808.0
+    doubts = {3: LensDoubt(lens_of(original.camera(3)), 0.1, 0.1)}
+    for adjuster in ("own", "ceres"):
+        given = GivenPoses(lenses=FreeLenses(doubts, distortion=False))
+        found = bundle_adjust(seed, graph, adjuster=adjuster, given=given)
+        for camera_id, camera in found.reconstruction.cameras.items():
+            if camera_id == 3:
+                assert camera.params[0] == pytest.approx(800.0, rel=5e-4)
+            else:
+                assert camera.params.tolist() == original.camera(camera_id).params.tolist()
+        assert set(found.lenses.sigmas) == {3}
+        assert (found.lenses.sigmas[3] < 0.01) == (adjuster == "own")  # Ceres does not say
 
 
 def test_adjusted_points_satisfy_the_same_filters():

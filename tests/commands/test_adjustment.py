@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model, with_frame_rotations
-from tests.scenes import COURTYARD, RING, real_scene
+from tests.scenes import COURTYARD, RING, copied, edit_database, real_scene
 
 DATABASE, TRUTH = COURTYARD / "database.db", COURTYARD / "truth"
 
@@ -141,3 +141,20 @@ def test_a_real_scene_gains_from_weighted_rotations_and_no_camera_is_lost(name, 
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "gt")
     assert not errors.missing
     assert errors.position.mean < mean
+
+
+def test_a_focal_length_that_is_the_databases_guess_is_found(tmp_path):
+    guess = np.array([1150.0, 1150.0, 600.0, 450.0])
+    change = f"UPDATE cameras SET params = x'{guess.astype('<f8').tobytes().hex()}', prior_focal_length = 0"
+    path = edit_database(copied(RING, tmp_path) / "database.db", change)
+    model = pycolmap.Reconstruction(RING / "sparse" / "0")
+    calibrated = sfm_shapefit.locate(model, path)
+    assert calibrated.summary()["intrinsics"] == []
+    model.camera(1).params = guess
+    found = sfm_shapefit.locate(model, path)
+    (row,) = found.summary()["intrinsics"]
+    assert row["decided_by"] == "adjusted"
+    assert row["focal_px"] == pytest.approx(1000.0, rel=1e-3)
+    errors = sfm_shapefit.evaluate(found.reconstruction, RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    assert not any("focal" in warning for warning in found.warnings)

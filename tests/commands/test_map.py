@@ -15,6 +15,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
+from sfm_shapefit.results.intrinsics import describe_intrinsics
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -246,10 +247,38 @@ def test_inlier_matches_are_enough(tmp_path):
         sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(relative_rotations="stored"))
 
 
-def test_guessed_focal_lengths_are_told(tmp_path):
-    path = changed(RING, tmp_path, "UPDATE cameras SET prior_focal_length = 0")
-    found = sfm_shapefit.map_database(path, sfm_shapefit.MapOptions(**FAST))
-    assert any("1 cameras have a guessed focal length" in warning for warning in found.warnings)
+def wrong_focal_length(factor):
+    """A statement that makes a factor's worth of the focal length of the ring's camera COLMAP's guess."""
+    params = np.array([1000.0 * factor, 1000.0 * factor, 600.0, 450.0], dtype="<f8").tobytes().hex()
+    return f"UPDATE cameras SET params = x'{params}', prior_focal_length = 0"
+
+
+def test_a_guessed_focal_length_is_found_and_told(tmp_path):
+    path = changed(RING, tmp_path, wrong_focal_length(0.85))
+    before = path.read_bytes()
+    found = sfm_shapefit.map_database(path, **FAST)
+    assert path.read_bytes() == before
+    located = found.models[0].located
+    (row,) = located.summary()["intrinsics"]
+    told = row["origin"], row["decided_by"], row["given_focal_px"], row["num_images"]
+    assert told == ("a guess", "adjusted", 850.0, 8)
+    assert row["focal_px"] == pytest.approx(1000.0, rel=1e-3)
+    assert 0.0 < row["focal_sigma_px"] < 20.0
+    assert row["parameters"] == located.reconstruction.camera(1).params.tolist()
+    errors = sfm_shapefit.evaluate(located.reconstruction, RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    (line,) = describe_intrinsics([row])
+    assert line.startswith("camera 1: focal length 850.0 px (a guess) became 1,000.")
+    assert "(+17.6%) by adjustment" in line
+
+
+def test_a_focal_length_that_is_not_to_be_refined_stays_and_is_named(tmp_path):
+    path = changed(RING, tmp_path, wrong_focal_length(1.01))
+    found = sfm_shapefit.map_database(path, refine_intrinsics="none", **FAST)
+    located = found.models[0].located
+    assert located.reconstruction.camera(1).params.tolist() == [1010.0, 1010.0, 600.0, 450.0]
+    assert any("camera 1 kept a focal length that was never" in warning for warning in located.warnings)
+    assert located.summary()["intrinsics"][0]["decided_by"] == "held"
 
 
 UNTYPED = "CREATE TABLE u AS SELECT * FROM {0}; DROP TABLE {0}; ALTER TABLE u RENAME TO {0};"

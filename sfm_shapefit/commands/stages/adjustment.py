@@ -15,7 +15,6 @@ from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import KnownCenters
 from sfm_shapefit.colmap.bundle_adjustment import (
     AdjustedPlacement,
-    GivenPoses,
     Uncertainty,
     adjust_placement,
 )
@@ -53,7 +52,7 @@ def pull_cameras(
     pulled = pull_to_priors(located.placement, located.gauge, priors, options)
     nodes, positions, information = pulled.anchors
     frame_ids = model.frame_ids[pulled.placement.nodes[nodes]]
-    given = GivenPoses(centers=KnownCenters(frame_ids, positions, information))
+    given = located.given._replace(centers=KnownCenters(frame_ids, positions, information))
     return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 
@@ -87,14 +86,12 @@ def adjust_placed(
     fixed = () if located.fixed is None else model.frame_ids[located.fixed].tolist()
     everyone = located._replace(kept=np.ones(len(placement.cameras), dtype=np.bool_))
     seed, tracks = seed_and_tracks(source, everyone, clock.advance)
-    adjusted = adjust_placement(
-        seed, tracks, options, weight, fixed_frames=fixed, known=located.given.centers
-    )
+    adjusted = adjust_placement(seed, tracks, options, weight, fixed_frames=fixed, given=located.given)
     images = [adjusted.reconstruction.image(i) for i in model.image_ids[placement.cameras].tolist()]
     centers = np.array([image.projection_center() for image in images])
     similarity = located.gauge.similarity
     locations = (centers - similarity.translation) / similarity.scale
-    if not adjusted.weight.hold:
+    if not adjusted.weight.hold or adjusted.lenses.sigmas:
         source = source.turned(with_frame_rotations(model, adjusted.reconstruction))
         directions = _measure_again(source, directions, options, clock)
         turns = source.model.rotations.transpose(0, 2, 1) @ model.rotations

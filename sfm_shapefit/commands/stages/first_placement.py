@@ -5,10 +5,13 @@ them all the same, then rotations, centers and points are adjusted together. Wha
 directions, verdicts and trust are measured anew from it.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
+from sfm_shapefit.adjustment.free_lenses import FreeLenses
 from sfm_shapefit.arrays import BoolArray, FloatArray
-from sfm_shapefit.colmap.bundle_adjustment import Uncertainty, adjust_thinly
+from sfm_shapefit.colmap.bundle_adjustment import AdjustedPlacement, adjust_thinly
 from sfm_shapefit.colmap.database_images import rotations_of
 from sfm_shapefit.commands.stages.clock import Clock
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule
@@ -20,13 +23,34 @@ from sfm_shapefit.geometry import mean_rotation_l1
 from sfm_shapefit.placement.gauge import unit_gauge
 
 
-def adjust_first_placement(
-    source: MatchSource, rule: GaugeRule, clock: Clock
-) -> tuple[FloatArray, FloatArray, Uncertainty]:
-    """Return rotations (n, 3, 3) cam_from_world and centers (n, 3), adjusted, and how well these are known.
+class FirstPlacement(NamedTuple):
+    """What comes out of the adjustment of a first placement."""
 
-    Images that the first placement lacks keep their averaged rotations, turned as the others were on average,
-    and have NaN for a center.
+    adjusted: AdjustedPlacement
+    """With the intrinsics that it ended with, and how well the centers are known."""
+    rotations: FloatArray
+    """(n, 3, 3) cam_from_world. Images that the first placement lacks keep their averaged rotations, turned
+    as the others were on average."""
+    centers: FloatArray
+    """(n, 3); NaN for images that the first placement lacks."""
+
+    def parameters(self) -> dict[int, list[float]]:
+        """Return the parameters of the cameras that were free, or turned out to be left open, by their id."""
+        cameras = [*self.adjusted.lenses.sigmas, *self.adjusted.lenses.undetermined]
+        return {i: self.adjusted.reconstruction.camera(i).params.tolist() for i in sorted(set(cameras))}
+
+
+def adjust_first_placement(
+    source: MatchSource, rule: GaugeRule, clock: Clock, lenses: FreeLenses, *, thorough: bool = True
+) -> FirstPlacement:
+    """Place the images of a source by their averaged rotations, and adjust all on few tracks.
+
+    Args:
+        source: at the averaged rotations.
+        rule: what sets the gauge, with the options of the run.
+        clock: hears of progress.
+        lenses: that change with the poses.
+        thorough: as in `adjust_thinly`.
 
     Raises:
         UnsolvableError: if no camera can be placed, or nothing can be triangulated.
@@ -40,12 +64,13 @@ def adjust_first_placement(
     if placement.unit is not None:  # the offsets of sensors have theirs
         gauge = rule.choose(placement.cameras, placement.locations, placement.unit)
     located = Located(placement, everyone, gauge)
-    adjusted = adjust_thinly(*seed_and_tracks(source, located, clock.advance), options)
+    seed, tracks = seed_and_tracks(source, located, clock.advance)
+    adjusted = adjust_thinly(seed, tracks, options, lenses=lenses, thorough=thorough)
     rotations, posed = rotations_of(adjusted.reconstruction, model.image_ids.tolist())
     centers = np.full((model.num_images, 3), np.nan)
     for k in np.flatnonzero(posed).tolist():
         centers[k] = adjusted.reconstruction.image(int(model.image_ids[k])).projection_center()
-    return _turn_the_others(model.rotations, rotations, posed), centers, adjusted.uncertainty
+    return FirstPlacement(adjusted, _turn_the_others(model.rotations, rotations, posed), centers)
 
 
 def _turn_the_others(averaged: FloatArray, adjusted: FloatArray, posed: BoolArray) -> FloatArray:

@@ -1,0 +1,93 @@
+"""Lenses in doubt: what was given pulls by its weight, and what the points do not tell is not believed."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sfm_shapefit.adjustment import AdjustmentOptions, Lens, adjust
+from sfm_shapefit.adjustment.free_lenses import ALL_HELD, FreeLenses, LensDoubt, focal_sigmas
+from tests.adjustment.made import disturb, look_at, ring_problem
+
+OPTIONS = AdjustmentOptions(loss_scale_px=2.0, cost_tolerance=1e-9)
+TRUE_PX = 500.0
+
+
+def doubted(problem, given_px, sigma, *, distortion=False):
+    """All lenses of a problem in doubt, as given with another focal length, and the problem started there."""
+    model, (_, *others) = problem.lenses[0].model, problem.lenses[0].parameters
+    given = Lens(model, (given_px, *others))
+    free = FreeLenses({7: LensDoubt(given, sigma, 0.1)}, distortion=distortion)
+    return free, free.apply(replace(problem, lenses=[given]), [7])
+
+
+def solve(free, problem):
+    """The adjusted lens and the standard deviation of its focal length."""
+    found = adjust(problem, OPTIONS, **free.overrides()).problem
+    return found.lenses[0], focal_sigmas(found, replace(OPTIONS, **free.overrides()))[0]
+
+
+def facing_a_wall(rng):
+    """Cameras that look straight at a wall, side by side: any focal length fits, at its own distance."""
+    problem = ring_problem(rng, 8, 200, share=1.0)
+    centers = np.column_stack([np.linspace(-0.5, 0.5, 8), np.full(8, -4.0), 0.2 * (np.arange(8) % 2)])
+    points = problem.points * [1.0, 0.0, 1.0]
+    rotations = look_at(centers, centers + np.array([0.0, 1.0, 0.0]))
+    cameras, seen = problem.cameras_seeing, problem.points_seen
+    x = np.einsum("mab,mb->ma", rotations[cameras], points[seen] - centers[cameras])
+    pixels = TRUE_PX * x[:, :2] / x[:, 2:] + [320.0, 240.0] + 0.3 * rng.standard_normal((len(x), 2))
+    return replace(problem, centers=centers, points=points, rotations=rotations, pixels=pixels)
+
+
+def test_a_weak_prior_gives_way_and_a_strong_one_holds():
+    rng = np.random.default_rng(0)
+    start = disturb(ring_problem(rng, noise_px=0.3), rng, 0.01, 0.002, 0.01)
+    for sigma, low, high in ((0.3, 498.5, 501.5), (1e-7, 574.9, 575.1)):
+        lens, _ = solve(*doubted(start, 575.0, sigma))
+        assert low < lens.parameters[0] < high
+    # Between: the pull of what was given balances that of the pixels.
+    _, known = solve(*doubted(start, TRUE_PX, 10.0))
+    lens, _ = solve(*doubted(start, 510.0, known * TRUE_PX / 510.0))
+    assert lens.parameters[0] == pytest.approx(505.0, abs=3.0)
+
+
+def test_errors_of_focal_lengths_are_as_large_as_their_standard_deviations():
+    errors = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        problem = ring_problem(rng, 8, 60, noise_px=OPTIONS.noise_px)
+        lens, sigma = solve(*doubted(problem, TRUE_PX, 0.3))
+        errors.append((lens.parameters[0] / TRUE_PX - 1.0) / sigma)
+    assert 0.6 < np.sqrt(np.mean(np.square(errors))) < 1.5
+
+
+def test_what_the_points_do_not_tell_is_not_accepted():
+    rng = np.random.default_rng(0)
+    for problem, is_known in ((facing_a_wall(rng), False), (ring_problem(rng, noise_px=0.3), True)):
+        free, start = doubted(problem, 510.0, 0.3)
+        lens, sigma = solve(free, start)
+        assert free.doubts[7].accepts(lens, sigma) == is_known
+    doubt = LensDoubt(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)), 0.3, 0.1)
+    assert doubt.accepts(Lens("SIMPLE_RADIAL", (700.0, 320.0, 240.0, -0.3)), 0.001)
+    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (700.0, 320.0, 240.0, -3.0)), 0.001)
+    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (5000.0, 320.0, 240.0, 0.0)), 0.001)
+    assert not doubt.accepts(Lens("SIMPLE_RADIAL", (500.0, 320.0, 240.0, 0.0)), np.inf)
+    # What was calibrated stays if the noise alone makes an error of its size, and goes if it cannot be right.
+    calibrated = LensDoubt(Lens("SIMPLE_PINHOLE", (500.0, 320.0, 240.0)), 0.01, 0.01)
+    for focal_px, sigma, is_taken in ((517.0, 0.005, False), (560.0, 0.005, True), (503.0, 0.001, True)):
+        assert calibrated.accepts(Lens("SIMPLE_PINHOLE", (focal_px, 320.0, 240.0)), sigma) == is_taken
+
+
+def test_lenses_without_a_doubt_stay_to_the_bit_and_distortion_only_if_asked():
+    rng = np.random.default_rng(0)
+    problem = ring_problem(rng, models=("SIMPLE_RADIAL", "SIMPLE_RADIAL"), noise_px=0.3)
+    given = Lens("SIMPLE_RADIAL", (520.0, 320.0, 240.0, 0.0))
+    start = replace(problem, lenses=[given, problem.lenses[1]])
+    for distortion in (False, True):
+        free = FreeLenses({3: LensDoubt(given, 0.3, 0.1)}, distortion=distortion)
+        found = adjust(free.apply(start, [3, 5]), OPTIONS, **free.overrides()).problem.lenses
+        assert found[1].parameters == problem.lenses[1].parameters
+        assert (found[0].parameters[3] != 0.0) == distortion
+        assert abs(found[0].parameters[0] - TRUE_PX) < 2.0
+    assert ALL_HELD.apply(start, [3, 5]) is start
+    assert free.without([3]).overrides() == {"free_focal_lengths": False, "free_distortion": False}
