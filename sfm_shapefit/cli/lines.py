@@ -56,6 +56,6 @@ def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str
     from sfm_shapefit.report.headline import next_step
 
     _, command = next_step(facts["verdict"]["grade"], facts)
-    filled = re.sub(r"\{out(?:/([\w.]+))?\}", lambda found: shlex.quote(str(out / (found[1] or ""))), command)
+    filled = re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)
     opened = [f"open {shlex.quote(str(out / 'report.html'))}"] if flags.report else []
     return [*opened, filled]

@@ -40,7 +40,7 @@ def input_of(facts: dict[str, Any]) -> str:
 def banner(drawing: Drawing, facts: dict[str, Any]) -> dict[str, str]:
     """Return the verdict in a headline and a sentence, and the next step with its command.
 
-    In the command, {out} stands for the folder of the page, and {out/further} for one inside it.
+    In the command, {out} stands for the folder of the page, and {out_further} for one beside it.
     """
     verdict = facts.get("verdict", {})
     grade = str(verdict.get("grade", ""))
@@ -82,12 +82,12 @@ def next_step(grade: str, facts: dict[str, Any]) -> tuple[str, str]:
     if facts.get("bundle_adjustment"):
         return (
             "Next: it is bundle-adjusted already; undistort the images for dense reconstruction.",
-            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out/dense}",
+            "colmap image_undistorter --image_path IMAGES --input_path {out} --output_path {out_dense}",
         )
     first = "Next: bundle adjustment" + (", once you have looked." if grade == "look" else ".")
     return (
         first,
-        "mkdir -p {out/adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out/adjusted}",
+        "mkdir -p {out_adjusted} && colmap bundle_adjuster --input_path {out} --output_path {out_adjusted}",
     )
 
 

@@ -48,8 +48,8 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     *_, verdict, report, command = result.stdout.splitlines()
     assert verdict == "verdict: good"
     assert report == f"next:    open {out / 'report.html'}"
-    adjust = f"colmap bundle_adjuster --input_path {out} --output_path {out}/adjusted"
-    assert command == f"         mkdir -p {out}/adjusted && {adjust}"
+    adjust = f"colmap bundle_adjuster --input_path {out} --output_path {out}_adjusted"
+    assert command == f"         mkdir -p {out}_adjusted && {adjust}"
     assert result.stderr == ""
 
 

@@ -244,5 +244,5 @@ def test_a_thousand_cameras_are_there_in_two_seconds(driver, tmp_path):
     write_report(*make_drawing(1000, 20_000, 20_000), tmp_path / "report.html")
     start = time.perf_counter()
     opened(driver, tmp_path / "report.html")
-    assert time.perf_counter() - start < 8.0  # 2 s are required of a machine with a graphics card, 1 s here
+    assert time.perf_counter() - start < 8.0  # 2 s with a graphics card; drawing by software takes up to 4 s
     assert complaints(driver) == []

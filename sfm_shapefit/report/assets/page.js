@@ -19,7 +19,7 @@ const drawHead = () => {
 const commandHere = (command) => {
   const inside = location.protocol === "file:" ? decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") : "OUT";
   const quote = (path) => (/^[\w@%+=:,./-]+$/.test(path) ? path : `'${path.replaceAll("'", "'\\''")}'`);
-  return command.replaceAll(/\{out([^\s}]*)\}/g, (_, further) => quote(inside + further));
+  return command.replaceAll(/\{out(\w*)\}/g, (_, further) => quote(inside + further));
 };
 const copyCommand = async () => {
   const text = $("command").textContent;
