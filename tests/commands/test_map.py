@@ -208,7 +208,7 @@ def test_components_become_models_of_their_own_and_single_images_are_named(tmp_p
     ]
     assert list(found.left_out) == ["0008.jpg"]
     assert "no matches" in found.left_out["0008.jpg"]
-    assert any("1 images are in no model" in warning for warning in found.warnings)
+    assert any("is in no model" in warning for warning in found.warnings)
     sfm_shapefit.write_map_result(found, tmp_path / "out")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["0", "1", "map.json"]
     assert "give one of them, such as" in run("report", tmp_path / "out", code=3).output
