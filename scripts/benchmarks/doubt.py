@@ -98,7 +98,7 @@ def cases(args: argparse.Namespace) -> dict[str, Case]:
     folders = {name: (args.data / name.split(" ")[0], *models) for name, models in SETS.items()}
     folders |= {name: (ROOT / "data_synthetic" / name, "sparse/0", "truth") for name in BUNDLED}
     if args.quick:
-        folders = {"courtyard": folders["courtyard"]}
+        folders = {"ring8": (ROOT / "data_synthetic" / "ring8", "sparse/0", "sparse/0")}
     found: dict[str, Case] = {}
     for name, (folder, given, truth) in folders.items():
         scene = Scene(name, folder / given, folder / "database.db", folder / truth)

@@ -169,7 +169,7 @@ def pull(placement, priors, **options):
 
 def test_a_camera_that_was_put_back_stays_undetermined_after_priors_pulled_the_others(reset):
     placement, positions = reset
-    pulled, gauge = pull(placement, priors_for(np.arange(40), positions))
+    pulled, gauge, _ = pull(placement, priors_for(np.arange(40), positions))
     assert "the priors moved cameras by" in gauge.statement
     assert np.isinf(pulled.assessment.sigmas[40]).all()
     assert pulled.assessment.trust[40] == 0.0
@@ -182,17 +182,17 @@ def test_a_camera_that_was_put_back_is_determined_where_its_prior_holds_it(reset
     placement, positions = reset
     gauge = prior_gauge(placement.locations, priors_for(np.arange(40), positions))
     positions = np.concatenate([positions[:40], gauge.apply(placement.locations)[40:]])
-    held, _ = pull(placement, priors_for(np.arange(41), positions))
-    assert held.refined.reset_nodes.tolist() == []
+    held = pull(placement, priors_for(np.arange(41), positions))
+    assert held.placement.refined.reset_nodes.tolist() == []
     positions[40] += 100.0
-    lost, _ = pull(placement, priors_for(np.arange(41), positions))
-    assert lost.refined.reset_nodes.tolist() == [40]
+    lost = pull(placement, priors_for(np.arange(41), positions))
+    assert lost.placement.refined.reset_nodes.tolist() == [40]
 
 
 def test_what_the_rejected_pairs_agree_on_is_asked_anew_after_priors_pulled():
     other = 4.0 * np.random.default_rng(8).normal(size=(N, 3))
     placement = place(measure("plain", 0.3, other))
-    pulled, _ = pull(placement, priors_for(np.arange(N), placement.locations))
+    pulled = pull(placement, priors_for(np.arange(N), placement.locations)).placement
     assert placement.second_configuration is not None
     assert pulled.second_configuration is not None
     assert pulled.second_configuration is not placement.second_configuration

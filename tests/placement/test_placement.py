@@ -111,4 +111,4 @@ def test_a_loose_camera_is_named():
     noise = 1e-3 * np.random.default_rng(4).standard_normal((len(edges), 3))
     v = normalized(normalized(differences(t, edges)) + noise)
     graph = ViewGraph(12, edges, v, names=[f"image{k}" for k in range(12)])
-    assert any("above all image11" in warning for warning in quality_warnings(place(graph)))
+    assert any("image11 is uncertain" in warning for warning in quality_warnings(place(graph)))
