@@ -10,7 +10,7 @@ from typing import Literal
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
-from sfm_shapefit.rotations.averaged import Averaging
+from sfm_shapefit.rotations.options import Averaging
 from sfm_shapefit.settings import explained, option
 
 Rotations = Literal["auto", "measured", "free"]

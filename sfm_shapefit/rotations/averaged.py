@@ -1,15 +1,13 @@
 """Rotations averaged from relative ones, and how far they can be believed."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.display import Displayed
-
-Averaging = Literal["own", "pycolmap"]
-"""Who averages: this package, or pycolmap."""
+from sfm_shapefit.rotations.options import Averaging
 
 AGREEMENT_DEG = 5.0
 """Pairs agree with averaged rotations up to here."""

@@ -30,7 +30,8 @@ from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import rotation_angles_deg
 from sfm_shapefit.locate_options import LEAST_MATCHES
 from sfm_shapefit.rotations.average import average_relative_rotations
-from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations, Averaging
+from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.options import Averaging
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
 _LIMITS = (LEAST_MATCHES, 20, 30, 50, 80)
