@@ -150,12 +150,11 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             placement = with_uncertainty(placement, model, known.uncertainty, scale)
         given = GivenPoses(lenses=known.intrinsics.free)
         located = _choose(placement, GaugeRule(model, rigid, options, known.priors))._replace(given=given)
-        pulls = known.priors is not None and options.refine_with_priors
-        if known.priors is not None and pulls:
+        if known.priors is not None and options.refine_with_priors:
             located = pull_cameras(model, located, known.priors, options)
             placement = located.placement
     adjustment, intrinsics = None, known.intrinsics
-    is_adjusted = known.centers is not None and not pulls
+    is_adjusted = known.centers is not None and located.given.centers is None
     if not is_adjusted and options.adjusts_cameras(len(placement.cameras)):
         weight = weight_of_rotations(options) if known.centers is None else RotationWeight()
         with clock("adjustment"), suppress(UnsolvableError):  # without points there is nothing to adjust
