@@ -43,6 +43,9 @@ from sfm_shapefit.geometry import normalized
 MAX_NUM_IMAGES = 2147483647
 """COLMAP's kMaxNumImages: pair_id = MAX_NUM_IMAGES * smaller id + larger id."""
 
+NO_ID = 2**32 - 1
+"""COLMAP's ids are 32-bit, and this one is none."""
+
 KEPT_MATCHES = 1_000_000
 """So many are kept, in 80 MB, for reading and sorting them takes half as long as measuring directions."""
 
@@ -108,6 +111,11 @@ def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabas
             _check_schema(file, connection)
             database = MatchDatabase(file, connection, model)
         yield database
+
+
+def is_between(value: object, least: int, bound: int) -> bool:
+    """Return whether a value of a row is an integer from `least` to below `bound`."""
+    return isinstance(value, int) and least <= value < bound
 
 
 def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -> list[tuple[Any, ...]]:
@@ -547,7 +555,7 @@ def _match_names(path: Path, connection: sqlite3.Connection, model: PosedModel) 
     index_of_id: dict[int, int] = {}
     example, matched = None, set()
     for image_id, name in connection.execute("SELECT image_id, name FROM images ORDER BY image_id"):
-        if not (isinstance(image_id, int) and 0 <= image_id < MAX_NUM_IMAGES and isinstance(name, str)):
+        if not (is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid id and name; it is damaged"
             )

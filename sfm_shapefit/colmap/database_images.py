@@ -14,12 +14,10 @@ import numpy as np
 import pycolmap
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
-from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, readonly_rows
+from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, NO_ID, is_between, readonly_rows
 from sfm_shapefit.colmap.database_rigs import DatabaseRigs, read_rigs
 from sfm_shapefit.errors import InputError
 
-# COLMAP's ids are 32-bit, and this one is none.
-_NO_ID = 2**32 - 1
 # No image has a side of so many pixels.
 _LARGEST_SIDE = 2**31
 
@@ -34,12 +32,15 @@ class UnposedImages:
     """Which of the images were taken together; the model here does not have them."""
 
     def frames(self, image_ids: list[int]) -> tuple[IntArray, FloatArray]:
-        """Return the frame of each image (n,), 0, 1, ..., and the sensor_from_rig of its camera (n, 3, 3)."""
+        """Return the frame of each image (n,) and the sensor_from_rig of its camera (n, 3, 3).
+
+        Frames are numbered as their first images stand: without rigs each image is its own frame.
+        """
         known, places = self.reconstruction, self.rigs.place_of_image
         frame_ids = [places[i].frame_id if i in places else i for i in image_ids]
         sensors = [self.rigs.sensor_from_rig(known.image(i)).rotation.matrix() for i in image_ids]
-        _, labels = np.unique(frame_ids, return_inverse=True)
-        return labels.ravel().astype(np.int64), np.array(sensors)
+        number = {frame_id: k for k, frame_id in enumerate(dict.fromkeys(frame_ids))}
+        return np.array([number[i] for i in frame_ids], dtype=np.int64), np.array(sensors)
 
 
 def read_images(path: Path) -> UnposedImages:
@@ -65,8 +66,8 @@ def read_images(path: Path) -> UnposedImages:
             raise InputError(f"{path}: camera {camera.camera_id} stands twice; remove one of them")
         model.add_camera_with_trivial_rig(camera)
     for image_id, name, camera_id in images:
-        is_sound = _is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
-        if not (is_sound and _is_between(camera_id, 0, _NO_ID) and model.exists_camera(camera_id)):
+        is_sound = is_between(image_id, 0, MAX_NUM_IMAGES) and isinstance(name, str)
+        if not (is_sound and is_between(camera_id, 0, NO_ID) and model.exists_camera(camera_id)):
             raise InputError(
                 f"{path}: the image with id {image_id!r} has no valid name and camera; it is damaged"
             )
@@ -158,16 +159,11 @@ def rotations_of(model: pycolmap.Reconstruction, image_ids: list[int]) -> tuple[
     return rotations, posed
 
 
-def _is_between(value: object, least: int, bound: int) -> bool:
-    """Return whether a value of a row is an integer from `least` to below `bound`."""
-    return isinstance(value, int) and least <= value < bound
-
-
 def _camera(path: Path, row: tuple[object, ...]) -> pycolmap.Camera:
     """Return the camera of a row of the table cameras."""
     camera_id, model_id, width, height, params, prior = row
-    sizes = _is_between(width, 0, _LARGEST_SIDE) and _is_between(height, 0, _LARGEST_SIDE)
-    sound = _is_between(camera_id, 0, _NO_ID) and isinstance(model_id, int) and sizes
+    sizes = is_between(width, 0, _LARGEST_SIDE) and is_between(height, 0, _LARGEST_SIDE)
+    sound = is_between(camera_id, 0, NO_ID) and isinstance(model_id, int) and sizes
     if not (sound and isinstance(params, bytes) and len(params) % 8 == 0):
         raise InputError(f"{path}: the camera with id {camera_id!r} is damaged; extract features again")
     values = np.frombuffer(params, dtype="<f8")

@@ -17,7 +17,7 @@ import pycolmap
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.check import UNIT_QUATERNION_TOLERANCE
-from sfm_shapefit.colmap.database import readonly_rows
+from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, NO_ID, is_between, readonly_rows
 from sfm_shapefit.errors import InputError
 
 _CAMERA = 0
@@ -117,15 +117,11 @@ def _sensor(camera_id: int) -> pycolmap.sensor_t:
 
 
 def _refuse_unknown_camera(
-    path: Path, images: pycolmap.Reconstruction, rig_id: object, *camera_ids: object
+    path: Path, images: pycolmap.Reconstruction, rig_id: object, *camera_ids: Any
 ) -> None:
     """Raise InputError if a rig has a camera that the database has not."""
     for camera_id in camera_ids:
-        if (
-            not isinstance(camera_id, int)
-            or not 0 <= camera_id < 2**32 - 1
-            or not images.exists_camera(camera_id)
-        ):
+        if not (is_between(camera_id, 0, NO_ID) and images.exists_camera(camera_id)):
             raise InputError(f"{path}: rig {rig_id} refers to camera {camera_id!r}, which is not there")
 
 
@@ -150,7 +146,7 @@ def _places(
     """Return the frame of each image, by its id; a frame's id is that of its first image."""
     members: dict[int, list[int]] = {}
     for frame_id, image_id, camera_id in data:
-        known = isinstance(image_id, int) and 0 <= image_id < 2**31 and images.exists_image(image_id)
+        known = is_between(image_id, 0, MAX_NUM_IMAGES) and images.exists_image(image_id)
         if known and images.image(image_id).camera_id != camera_id:
             raise InputError(f"{path}: frame {frame_id} has image {image_id} at another camera's place")
         if known:

@@ -84,7 +84,8 @@ def map_database(
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
         positions = read_priors(unposed, inputs, options, priors)
-    run = _Run(options, clock, path, images, unposed, intrinsics, positions)
+    frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
+    run = _Run(options, clock, path, images, unposed, frame_of_image, sensor_rotations, intrinsics, positions)
     relative = run.measure()
     if options.adjust and intrinsics.free.doubts:
         known = run.refine_intrinsics(relative)
@@ -93,7 +94,6 @@ def map_database(
             relative = run.measure()
     scores = score_triplets(unposed.num_images, relative).tolist()
     run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
-    frame_of_image, _ = images.frames(unposed.image_ids.tolist())
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
@@ -147,6 +147,10 @@ class _Run(NamedTuple):
     images: UnposedImages
     unposed: PosedModel
     """The images as a model."""
+    frame_of_image: IntArray
+    """(n,)"""
+    sensor_rotations: FloatArray
+    """(n, 3, 3) sensor_from_rig of each image."""
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
@@ -184,12 +188,12 @@ class _Run(NamedTuple):
         self, relative: RelativeRotations, reasons: dict[int, str]
     ) -> Iterator[tuple[IntArray, IntArray, AveragedRotations]]:
         """Yield the frames of each component, and its images with their rotations."""
-        frame_of_image, sensor_rotations = self.images.frames(self.unposed.image_ids.tolist())
-        of_frames = relative_rotations_of_frames(relative, frame_of_image, sensor_rotations)
-        for frames, averaged in self.average_components(int(frame_of_image.max()) + 1, of_frames, reasons):
-            members = np.flatnonzero(np.isin(frame_of_image, frames))
-            places = np.searchsorted(frames, frame_of_image[members])
-            yield frames, members, averaged.turned(places, sensor_rotations[members])
+        of_image, sensors = self.frame_of_image, self.sensor_rotations
+        of_frames = relative_rotations_of_frames(relative, of_image, sensors)
+        for frames, averaged in self.average_components(int(of_image.max()) + 1, of_frames, reasons):
+            members = np.flatnonzero(np.isin(of_image, frames))
+            places = np.searchsorted(frames, of_image[members])
+            yield frames, members, averaged.turned(places, sensors[members])
 
     def average_components(
         self, num_frames: int, relative: RelativeRotations, reasons: dict[int, str]

@@ -27,8 +27,12 @@ def relative_rotations_of_frames(
     Args:
         relative: of images; pairs inside a frame say nothing of frames.
         frame_of_image: (n,) 0..f-1.
-        sensor_rotations: (n, 3, 3) sensor_from_rig of each image.
+        sensor_rotations: (n, 3, 3) sensor_from_rig of each image. Where each image is its own frame,
+            `relative` is the answer as it is.
     """
+    is_rigged = (frame_of_image != np.arange(len(frame_of_image))).any()
+    if not (is_rigged or (sensor_rotations != np.eye(3)).any()):
+        return relative
     frames = frame_of_image[relative.pairs]
     between = relative.subset(frames[:, 0] != frames[:, 1])
     i, j = between.pairs.T
