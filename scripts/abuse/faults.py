@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from abuse import verdicts
-from abuse.fuzz import caches, command_line, make_base, warm
+from abuse.fuzz import caches, command_line, make_base, warm_locate
 from abuse.sandbox import Child, Outcome, run_forked, start_forked
 
 HELP = "signals, full disks, little memory, rivals and locks while a command runs"
@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
                     (cold_signals, args.cold, " of a cold process"),
                 )
                 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+                if count
             },
             "files that may not grow": partial(starve, bench, resource.RLIMIT_FSIZE, _FILE_SIZES),
             "a full disk": partial(full_disk, bench),
@@ -85,7 +86,7 @@ class Bench:
 
     def __init__(self, work: Path) -> None:
         self.base = make_base(work / "base")
-        self.expected = warm(self.base)["database"]
+        self.expected = warm_locate(self.base)["database"]
         self.folder = work / "case"
         self.writable = [self.folder, *caches()]
         self.endings: Counter[str] = Counter()

@@ -101,10 +101,10 @@ def make_base(folder: Path) -> Path:
     return folder
 
 
-def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
-    """Run every command once in this process, so that the children find all code loaded and compiled.
+def warm_locate(base: Path) -> dict[str, list[tuple[float, ...]]]:
+    """Run `locate` once on every form of the model, and return the positions that each form leads to.
 
-    Returns the positions that each form of the input leads to.
+    So this process has loaded what its children call.
     """
     expected = {}
     out = base.parent / "warm"
@@ -113,6 +113,17 @@ def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
         _command("locate", str(base / form), str(out), *extra, "--threads", "1", "-q")
         expected["database" if extra else form] = positions(out)
         shutil.rmtree(out)
+    return expected
+
+
+def warm(base: Path) -> dict[str, list[tuple[float, ...]]]:
+    """Run every command once in this process, so that the children find all code loaded and compiled.
+
+    Returns the positions that each form of the input leads to.
+    """
+    expected = warm_locate(base)
+    out = base.parent / "warm"
+    database = ("--database", str(base / "database.db"))
     old = ("locate", str(base / "old"), str(out), "--overwrite", "--threads", "1", "-q")
     poses = ("--directions", "relative-poses")
     for command in (

@@ -186,9 +186,11 @@ def draw_edges(spec: GraphSpec) -> "IntArray":
 def measure(problem: Problem, asked: str, threads: int) -> Measured:
     """Solve a problem that another process draws; to be called once per process.
 
-    A small graph of the family is solved before by every method that the problem may call for.
+    A small graph of the family, none larger than the problem's, is solved before by every method that the
+    problem may call for.
     """
-    small = GraphSpec(family=problem.spec.family, n=1000, degree=min(problem.spec.degree, 40.0), sigma=0.01)
+    spec = problem.spec
+    small = GraphSpec(family=spec.family, n=min(spec.n, 1000), degree=min(spec.degree, 40.0), sigma=0.01)
     for method in ("auto", "newton", "admm"):
         _trace(view_graph(draw(small)), method, 1e-4, threads)
     graph, truth = call(draw_graph, problem.spec)

@@ -7,10 +7,12 @@ from importlib import import_module
 import pytest
 
 import benchmark
-from benchmarks import INDEX
+import sfm_shapefit
+from benchmarks import INDEX, endtoend
 from harness import driver
 from harness.driver import RESULTS
 from peers import on_graphs, on_scenes
+from tests.program import run
 from tests.scenes import RING, ROOT, fingerprint
 
 SCRIPTS = ROOT / "scripts"
@@ -53,6 +55,8 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
     for module in (driver, on_graphs, on_scenes, import_module(f"benchmarks.{name}")):
         if hasattr(module, "call"):
             monkeypatch.setattr(module, "call", call_here)
+        if hasattr(module, "run_command"):
+            monkeypatch.setattr(module, "run_command", lambda *words: run(*words, code=0).stdout)
     before = fingerprint(RING)
     out = tmp_path / "section.md"
     assert benchmark.main([name, "--quick", "--out", str(out)]) == 0
@@ -62,6 +66,12 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
     assert "failed" not in text
     assert str(ROOT) not in text
     assert fingerprint(RING) == before
+
+
+def test_a_command_of_a_benchmark_is_run_and_one_that_fails_says_why():
+    assert endtoend.run_command("--version") == f"{sfm_shapefit.__version__}\n"
+    with pytest.raises(RuntimeError, match="inspect ended with code 3: .*nowhere"):
+        endtoend.run_command("inspect", "nowhere")
 
 
 def test_missing_data_is_a_sentence_per_case_and_no_failure(tmp_path, capsys):
