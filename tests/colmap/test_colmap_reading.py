@@ -12,6 +12,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from sfm_shapefit.colmap import database as colmap_database
 from sfm_shapefit.colmap.check import check_model_files
 from sfm_shapefit.colmap.database import MAX_NUM_IMAGES, find_database, open_database
 from sfm_shapefit.colmap.model import PosedModel, camera_rays, read_model, track_matches, world_rays
@@ -776,7 +777,9 @@ def test_a_truncated_database_is_an_input_error_at_any_length(path, model):
             read_all(cut, model)
 
 
-def test_a_locked_database_is_refused_in_seconds(path, model):
+def test_a_locked_database_is_refused_in_seconds(path, model, monkeypatch):
+    assert 1.0 <= colmap_database._LOCK_TIMEOUT_S <= 5.0
+    monkeypatch.setattr(colmap_database, "_LOCK_TIMEOUT_S", 0.1)
     writer = begin_writing(path, "BEGIN EXCLUSIVE")
     with pytest.raises(InputError, match="locked by another program"), open_database(path, model):
         pass

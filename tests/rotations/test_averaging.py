@@ -48,7 +48,8 @@ def covariances(problem):
     matrix = np.zeros((n, 3, n, 3))
     for sign, a, b in ((1, i, i), (1, j, j), (-1, i, j), (-1, j, i)):
         np.add.at(matrix, (a, slice(None), b), sign * blocks)
-    full = np.linalg.pinv(matrix.reshape(3 * n, 3 * n)).reshape(n, 3, n, 3)
+    common = np.tile(np.eye(3), (n, n)) / n  # onto turns of all cameras alike, which no pair tells
+    full = (np.linalg.inv(matrix.reshape(3 * n, 3 * n) + common) - common).reshape(n, 3, n, 3)
     return full[np.arange(n), :, np.arange(n)]
 
 

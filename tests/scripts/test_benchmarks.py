@@ -69,8 +69,8 @@ def test_the_quick_version_writes_its_section(name, tmp_path, monkeypatch):
 
 
 def test_a_command_of_a_benchmark_is_run_and_one_that_fails_says_why():
-    assert endtoend.run_command("--version") == f"{sfm_shapefit.__version__}\n"
-    with pytest.raises(RuntimeError, match="inspect ended with code 3: .*nowhere"):
+    assert endtoend.run_command("--version") == f"sfm-shapefit {sfm_shapefit.__version__}\n"
+    with pytest.raises(RuntimeError, match=r"inspect ended with code 3: .*nowhere"):
         endtoend.run_command("inspect", "nowhere")
 
 

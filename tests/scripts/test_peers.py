@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 
 import sfm_shapefit
@@ -45,14 +46,18 @@ def test_a_database_is_copied_with_its_log_and_without_relative_poses_glomap_fai
 
 
 @pytest.mark.slow
-def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie():
-    scene = real_scene("liberty-calibrated")
-    found = colmap.position(scene / "database.db", scene / "sparse" / "0", colmap.SETTINGS[1])
+def test_glomap_loses_the_cameras_that_its_valid_pairs_do_not_tie(tmp_path):
+    scene = real_scene("brighton-beach")
+    given = pycolmap.Reconstruction(scene / "sparse" / "0")
+    image = given.image(min(given.reg_image_ids()))
+    turn = pycolmap.Rigid3d(pycolmap.Rotation3d([1.5, 0.0, 0.0]), np.zeros(3))  # no pair of it agrees
+    given.frame(image.frame_id).set_cam_from_world(image.camera_id, turn * image.cam_from_world())
+    given.write(tmp_path)
+    with quiet_log():
+        found = colmap.position(scene / "database.db", tmp_path, colmap.SETTINGS[1])
     errors = sfm_shapefit.evaluate(found.reconstruction, scene / "sparse" / "0")
-    # Recorded for the data: 106 of 108 cameras, 0.0114 / 0.0351. With stray cameras the mean is above 0.5.
-    assert len(errors.names) == 106
-    assert errors.position.median == pytest.approx(0.0114, rel=0.2)
-    assert errors.position.mean == pytest.approx(0.0351, rel=0.2)
+    assert sorted([*errors.names, image.name]) == sorted(one.name for one in given.images.values())
+    assert errors.position.mean < 1e-3 * errors.extent  # measured: 0.6e-3; a stray camera alone adds 1e-2
 
 
 def test_both_forms_of_the_rival_solve_the_program_and_the_direct_one_proves_it():

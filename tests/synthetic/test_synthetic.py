@@ -424,13 +424,13 @@ def test_bundled_scenes_stay_under_five_megabytes_and_the_ring_has_enough_pairs_
 
 
 @pytest.mark.slow
-def test_500_cameras_and_20000_points_make_a_workspace(tmp_path):
+def test_100_cameras_and_4000_points_make_a_workspace(tmp_path):
     options = synthetic.SceneOptions(
-        num_images=500, num_points=20_000, corrupted_pair_fraction=0.25, wrong_match_fraction=0.1
+        num_images=100, num_points=4000, corrupted_pair_fraction=0.25, wrong_match_fraction=0.1
     )
     scene = synthetic.make_scene(options)
     write_workspace(scene, tmp_path / "out")
-    assert np.bincount(scene.pairs.ravel(), minlength=500).min() >= options.max_pairs_per_image
+    assert np.bincount(scene.pairs.ravel(), minlength=100).min() >= options.max_pairs_per_image
 
 
 FAMILIES = {
