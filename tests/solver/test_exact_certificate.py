@@ -72,6 +72,7 @@ def test_the_bound_of_any_dual_made_feasible_holds_exactly_and_one_that_claims_m
 
 
 def test_splitting_asked_for_on_a_tiny_graph_proves_its_answer_too():
-    for seed in range(200):  # 54, 66, 162, 174: accelerated, it leads to locations of 1e10 and more
+    # Accelerated, the last four lead to locations of 1e10 and more.
+    for seed in (*range(0, 200, 20), 54, 66, 162, 174):
         found = solve(problem(seed), SolverOptions(solver="admm"))
         assert found.status is Status.CONVERGED, seed
