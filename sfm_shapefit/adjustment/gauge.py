@@ -17,10 +17,12 @@ from sfm_shapefit.adjustment.priors import cross_matrices
 from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import Values
 from sfm_shapefit.arrays import FloatArray
+from sfm_shapefit.geometry import fit_similarity
 
 _DIMENSION = 7
 _NONE = 1e-10  # share of the largest: what holds less holds nothing
-_MAX_ROUNDS = 20
+_MAX_ROUNDS = 100
+_ROUNDING = 1e-12  # of a sum of squares
 
 
 def small_similarities(rotations: FloatArray, centers: FloatArray, origin: FloatArray) -> FloatArray:
@@ -74,17 +76,47 @@ def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) 
         values: an adjustment's answer.
         free: from `free_similarities`.
     """
+    find = _best_similarity if free.shape[1] == _DIMENSION else _best_free_similarity
+    motion = find(problem, values, free) if free.size else np.eye(4)
+    return _apply(problem, values, motion, turned=bool(free[3:6].any()))
+
+
+def _best_similarity(problem: AdjustmentProblem, values: Values, _free: FloatArray) -> FloatArray:
+    """Return the similarity, 4 x 4, that maps the centers best to the start's; the identity if mirrored."""
+    fit, motion = fit_similarity(values.centers, problem.centers), np.eye(4)
+    if fit.scale > 0.0:
+        motion[:3, :3], motion[:3, 3] = fit.scale * fit.rotation, fit.translation
+    return motion
+
+
+def _best_free_similarity(problem: AdjustmentProblem, values: Values, free: FloatArray) -> FloatArray:
+    """Return the best one of those that are free, by Gauss-Newton steps."""
     origin = problem.centers.mean(axis=0)
-    motion = np.eye(4)
-    for _ in range(_MAX_ROUNDS if free.size else 0):
-        centers = values.centers @ motion[:3, :3].T + motion[:3, 3]
+    motion, apart = np.eye(4), _apart(problem, values, np.eye(4))
+    for _ in range(_MAX_ROUNDS):
+        centers = _moved(values.centers, motion)
         moves = small_similarities(values.rotations, centers, origin)[:, :3] @ free
         lead = (problem.centers - centers).ravel()
         step = free @ np.linalg.lstsq(moves.reshape(-1, free.shape[1]), lead, rcond=_NONE)[0]
-        motion = _similarity(step, origin) @ motion
+        nearer = _similarity(step, origin) @ motion
+        # A camera that ran far away asks for a scaling of many times, where the linear step is no guide.
+        while step.any() and not _apart(problem, values, nearer) <= (1.0 + _ROUNDING) * apart:
+            step *= 0.5
+            nearer = _similarity(step, origin) @ motion
+        motion, apart = nearer, _apart(problem, values, nearer)
         if np.abs(step[3:]).max() < 1e-15:
             break
-    return _apply(problem, values, motion, turned=bool(free[3:6].any()))
+    return motion
+
+
+def _moved(centers: FloatArray, motion: FloatArray) -> FloatArray:
+    """Return centers (n, 3) after a similarity, given as a 4 x 4 matrix."""
+    return centers @ motion[:3, :3].T + motion[:3, 3]
+
+
+def _apart(problem: AdjustmentProblem, values: Values, motion: FloatArray) -> float:
+    """Return the sum of squared distances of the centers, after a similarity, from the start's."""
+    return float(np.sum((problem.centers - _moved(values.centers, motion)) ** 2))
 
 
 def _similarity(step: FloatArray, origin: FloatArray) -> FloatArray:
@@ -100,9 +132,9 @@ def _apply(problem: AdjustmentProblem, values: Values, motion: FloatArray, *, tu
     size = np.cbrt(np.linalg.det(motion[:3, :3]))
     moves = ~problem.is_fixed()
     centers, rotations = values.centers.copy(), values.rotations
-    centers[moves] = values.centers[moves] @ motion[:3, :3].T + motion[:3, 3]
+    centers[moves] = _moved(values.centers[moves], motion)
     if turned:
         rotations = rotations.copy()
         rotations[moves] = rotations[moves] @ (motion[:3, :3] / size).T
-    points = values.points @ motion[:3, :3].T + motion[:3, 3]
+    points = _moved(values.points, motion)
     return Values(rotations=rotations, centers=centers, points=points, lenses=values.lenses)

@@ -3,7 +3,7 @@
 Lengths count up to six; the longest come first, in random order among equals: by length alone small scenes
 are held by few, coarse features. A track is taken if two of its images, or half of them, still want
 observations, or if one has less than a third of what it wants. Each image wants 200, in small scenes its
-share of 20,000.
+share of 20,000, or some times that.
 
 What is random is a hash of the pixels, so the choice depends neither on the order of the tracks nor on the
 order of the images.
@@ -23,7 +23,9 @@ _MIX = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 _TURN = np.uint64(0x9E3779B97F4A7C15)
 
 
-def choose_thin_tracks(offsets: IntArray, images: IntArray, pixels: FloatArray, num_images: int) -> IntArray:
+def choose_thin_tracks(
+    offsets: IntArray, images: IntArray, pixels: FloatArray, num_images: int, times: int = 1
+) -> IntArray:
     """Return tracks that together hold every image, ascending.
 
     Args:
@@ -31,10 +33,11 @@ def choose_thin_tracks(offsets: IntArray, images: IntArray, pixels: FloatArray, 
         images: (m,) the image of each observation.
         pixels: (m, 2) where it was seen.
         num_images: n.
+        times: as many as each image usually wants.
     """
     lengths = np.minimum(np.diff(offsets), _LONG)
     order = np.lexsort((_draw(offsets, pixels), -lengths))
-    wanted = max(_WANTED, _WANTED_IN_ALL // max(num_images, 1))
+    wanted = times * max(_WANTED, _WANTED_IN_ALL // max(num_images, 1))
     taken = np.zeros(len(lengths), dtype=np.bool_)
     _choose(order, offsets, images, wanted, np.zeros(num_images, dtype=np.int64), taken)
     return np.flatnonzero(taken)

@@ -3,7 +3,8 @@
 COLMAP sets a focal length to 1.2 times the larger side of the image where it knows none, and to that of the
 EXIF data where there is one; the database says of the first that it is no prior. Of the second it says that
 it is one, but such a camera has never been calibrated either: its distortion is 0 in a model that has some,
-and its principal point the very middle of the image.
+and its principal point the very middle of the image. Where most cameras of a database were calibrated, all
+were.
 
 A fundamental matrix knows the focal lengths of its two images (Fetzer, Reisert, Kanatani, "Stable intrinsic
 auto-calibration from fundamental matrices of devices with uncorrelated camera parameters", WACV 2020).
@@ -45,6 +46,9 @@ _WITH_DEPTH = (2, 3)
 _FEWEST_PAIRS, _LEAST_SHARE = 5, 0.3
 # Pairs of most matches that take part: 100 bytes each, and the time is in proportion to them.
 _MOST_PAIRS = 50_000
+# Of the factors that pycolmap finds: it adds up in the order in which its threads end, so the thirteenth
+# digit differs from run to run, and an adjustment from there in more.
+_DIGITS = 8
 # Of unit rays: what makes relative rotations worth measuring anew.
 _SAME_RAYS = 0.01
 
@@ -75,15 +79,19 @@ def find_uncalibrated(database: Path, model: PosedModel) -> dict[int, Uncalibrat
     for image_id, name in zip(model.image_ids.tolist(), model.names, strict=True):
         camera = model.reconstruction.camera(model.reconstruction.image(image_id).camera_id)
         if camera.camera_id not in found and name in rows:
-            database_id, *row = rows[name]
-            found[camera.camera_id] = Uncalibrated(_origin(camera, *row), database_id)
-    return {camera: one for camera, one in found.items() if one.origin is not Origin.CALIBRATION}
+            database_id, width, height, params, prior = rows[name]
+            if camera.params.astype("<f8").tobytes() == params:
+                found[camera.camera_id] = Uncalibrated(_origin(camera, width, height, prior), database_id)
+    origins = [one.origin for one in found.values()]
+    known = {Origin.CALIBRATION}
+    if origins.count(Origin.EXIF) < origins.count(Origin.CALIBRATION):
+        # A calibration leaves the distortion 0 where the images do not tell it; EXIF leaves it 0 everywhere.
+        known.add(Origin.EXIF)
+    return {camera: one for camera, one in found.items() if one.origin not in known}
 
 
-def _origin(camera: pycolmap.Camera, width: Any, height: Any, params: Any, prior: Any) -> Origin:
-    """Return where intrinsics come from, given a row of the table cameras."""
-    if camera.params.astype("<f8").tobytes() != params:
-        return Origin.CALIBRATION
+def _origin(camera: pycolmap.Camera, width: Any, height: Any, prior: Any) -> Origin:
+    """Return where the intrinsics of a row of the table cameras come from, by that row alone."""
     if not prior:
         return Origin.GUESS
     principal = camera.params[camera.principal_point_idxs()]
@@ -169,7 +177,7 @@ def calibrate_view_graph(database: Path, cameras: Collection[int]) -> dict[int, 
         except PYCOLMAP_ERRORS:
             return {}
         after = _focal_lengths(private)
-    factors = {camera: after[camera] / before[camera] for camera in asked}
+    factors = {camera: round(after[camera] / before[camera], _DIGITS) for camera in asked}
     return {i: f for i, f in sorted(factors.items()) if done and np.isfinite(f) and f not in (0.0, 1.0)}
 
 

@@ -22,7 +22,9 @@ from sfm_shapefit.adjustment import (
     isotropic_information,
     reprojection_errors_px,
 )
+from sfm_shapefit.adjustment.gauge import free_similarities, restore_gauge, small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
+from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import fit_similarity
 from tests.adjustment.made import disturb, look_at, ring_problem
@@ -132,6 +134,23 @@ def test_the_gauge_is_that_of_the_start(hold):
     fit = fit_similarity(found.centers, start.centers, rotate=not hold)
     np.testing.assert_allclose([fit.scale, *fit.translation, *fit.rotation.ravel()],
                                [1.0, 0.0, 0.0, 0.0, *np.eye(3).ravel()], atol=1e-12)  # fmt: skip
+
+
+@pytest.mark.parametrize("fixed", [(), (2,)])
+@pytest.mark.parametrize("far", [-40.0, 3.0, 500.0])
+def test_the_gauge_holds_where_a_camera_ran_far_away(far, fixed):
+    _, start = make_start(fixed=fixed)
+    centers = start.centers.copy()
+    centers[0] *= far
+    values = values_of(replace(start, centers=centers))
+    free = free_similarities(start, TIGHT)
+    found = restore_gauge(start, values, free).centers
+    moves = small_similarities(start.rotations, found, start.centers.mean(axis=0))[:, :3] @ free
+    left = np.einsum("nai,na->i", moves, start.centers - found)
+    sizes = np.sqrt(np.sum(moves**2, axis=(0, 1)) * np.sum((start.centers - found) ** 2))
+    assert np.abs(left / sizes).max() < 1e-9
+    before = np.sum((start.centers - centers) ** 2)
+    assert np.sum((start.centers - found) ** 2) < before
 
 
 def test_one_fixed_frame_leaves_the_scale_which_stays():
