@@ -66,6 +66,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         "of the input, for new images in a solved model. With two or more the scale is theirs, with "
         "one only the origin.",
     )
+    without: str = option(
+        "",
+        "Pairs that are left out, as wrong ones of repeated structure: a file with the names of two images "
+        "per line, as pairs.csv or doubtful_pairs.csv has them.",
+    )
     refine_with_priors: bool = option(
         False,
         "Let the position priors that set the scale also pull the cameras, each by its standard "

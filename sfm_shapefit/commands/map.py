@@ -26,15 +26,16 @@ from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
-from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
-from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
@@ -83,9 +84,21 @@ def map_database(
         images = read_images(path)
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
+        without = read_left_out(inputs, unposed.names, options).left_out
         positions = read_priors(unposed, inputs, options, priors)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-    run = _Run(options, clock, path, images, unposed, frame_of_image, sensor_rotations, intrinsics, positions)
+    run = _Run(
+        options,
+        clock,
+        path,
+        images,
+        unposed,
+        frame_of_image,
+        sensor_rotations,
+        intrinsics,
+        positions,
+        without,
+    )
     relative = run.measure()
     if options.adjust and intrinsics.free.doubts:
         known = run.refine_intrinsics(relative)
@@ -154,6 +167,8 @@ class _Run(NamedTuple):
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
+    without: PairNames
+    """Pairs that are taken for unmatched."""
     triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
     """Of the pairs with a relative rotation."""
 
@@ -162,7 +177,9 @@ class _Run(NamedTuple):
         with self.clock("relative rotations"):
             sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
             source = self.options.relative_rotations
-            return measure_rotations(self.database, self.unposed, LEAST_MATCHES, source, sharing)
+            return measure_rotations(
+                self.database, self.unposed, LEAST_MATCHES, source, sharing, self.without
+            )
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
@@ -175,7 +192,7 @@ class _Run(NamedTuple):
         for _, members, averaging in self.average_images(relative, {}):
             options = self._options_of(members, has_priors=False)
             model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
-            inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+            inputs = self.inputs_of(model)
             rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
             with open_source(model, inputs, options) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
@@ -242,7 +259,7 @@ class _Run(NamedTuple):
             priors = None
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
-        inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+        inputs = self.inputs_of(model)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
@@ -263,6 +280,11 @@ class _Run(NamedTuple):
         ends = members[found.directions.pairs].tolist()
         scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
         return replace(found, triplet_scores=scores)
+
+    def inputs_of(self, model: PosedModel) -> Inputs:
+        """Return what the images of a component are located from."""
+        inputs = choose_inputs(model.reconstruction, self.database, self.options.directions)
+        return replace(inputs, left_out=self.without)
 
     def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
         """Return the options of one component, whose scale is what is known of its own images."""

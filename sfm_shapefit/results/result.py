@@ -14,6 +14,7 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
@@ -53,6 +54,8 @@ class Inputs:
     """Where the directions came from; never "auto"."""
     statement: str
     """How that choice was made, for the user."""
+    left_out: PairNames = frozenset()
+    """Pairs that are taken for unmatched."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

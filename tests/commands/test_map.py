@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -196,6 +197,39 @@ def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, wor
     assert words in said
     assert "Traceback" not in said
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("executor", [None, "processes"])
+def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor):
+    truth = read_model(RING / "sparse" / "0")
+    listed, ids = [(0, 1), (4, 3)], truth.image_ids.tolist()
+    gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
+    without = tmp_path / "without.csv"
+    without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
+    database = changed(
+        RING, tmp_path / "edited", f"DELETE FROM two_view_geometries WHERE {' OR '.join(gone)}"
+    )
+    if executor is None:
+        given = (
+            sfm_shapefit.map_database(RING / "database.db", without=str(without), **FAST).models[0].located
+        )
+        gone = sfm_shapefit.map_database(database, **FAST).models[0].located
+    else:
+        with ThreadPoolExecutor(2) as pool:
+            model = RING / "sparse" / "0"
+            given = sfm_shapefit.locate(model, without=str(without), executor=pool, **FAST)
+            gone = sfm_shapefit.locate(model, database, **FAST)
+    np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
+    assert len(given.directions.pairs) > 0
+    centers = [found.table("cameras")["x"] for found in (given, gone)]
+    np.testing.assert_array_equal(*centers)
+
+
+def test_pairs_are_left_out_of_databases_only(tmp_path):
+    listed = tmp_path / "without.txt"
+    listed.write_text("0000.jpg 0001.jpg\n")
+    with pytest.raises(InputError, match="of a database only"):
+        sfm_shapefit.locate(RING / "sparse" / "0", directions="tracks", without=str(listed))
 
 
 def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):
