@@ -32,6 +32,14 @@ def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     return [("intrinsics", shorten(lines))] if lines else []
 
 
+def loops_rows(facts: dict[str, Any]) -> Rows:
+    """Return a row on the loops of videos, if there are any."""
+    from sfm_shapefit.results.loops import describe_loops
+
+    said = describe_loops(facts["loops"])
+    return [("video", said)] if said else []
+
+
 def describe_points(facts: dict[str, Any]) -> str:
     """Say how many points there are, and how far they are off their keypoints."""
     if not facts["num_points"]:

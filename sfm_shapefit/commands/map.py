@@ -6,7 +6,7 @@
 Images that the averaging drops form components of their own.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -35,10 +35,11 @@ from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
-from sfm_shapefit.results.result import Inputs, LocateResult
+from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
@@ -105,6 +106,8 @@ def map_database(
         if differ_in_rays(known, unposed):
             run = run._replace(unposed=known)
             relative = run.measure()
+    videos = run.find_videos(relative)
+    run, relative, visits = run.judge_loops(videos, relative)
     scores = score_triplets(unposed.num_images, relative).tolist()
     run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
@@ -115,6 +118,7 @@ def map_database(
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
+        found = replace(found, loops=tuple(_loops_of(visits, unposed.names, set(names))))
         models.append(MappedModel(located=found, averaging=averaging, names=names))
         for k in frames.tolist():
             del reasons[k]
@@ -132,6 +136,7 @@ def map_database(
         models=tuple(models),
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
+        num_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
@@ -180,6 +185,27 @@ class _Run(NamedTuple):
             return measure_rotations(
                 self.database, self.unposed, LEAST_MATCHES, source, sharing, self.without
             )
+
+    def find_videos(self, relative: RelativeRotations) -> Videos:
+        """Return the videos among the images, as far as the options want to know of them."""
+        asked = self.options.sequence
+        nothing = Videos(np.full(self.unposed.num_images, -1), np.full(self.unposed.num_images, -1))
+        videos = nothing if asked == "none" else find_videos(self.unposed.names)
+        return confirm_videos(videos, relative) if asked == "auto" else videos
+
+    def judge_loops(
+        self, videos: Videos, relative: RelativeRotations
+    ) -> tuple["_Run", RelativeRotations, tuple[Visit, ...]]:
+        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
+        if not videos.num_videos:
+            return self, relative, ()
+        with self.clock("rotation averaging"):
+            loops = judge_loops(videos, relative, self.options.num_threads())
+        names = self.unposed.names
+        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
+        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
+        without = self.without | {(min(pair), max(pair)) for pair in refused}
+        return self._replace(without=without), relative.subset(kept), loops.visits
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
@@ -314,6 +340,22 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
+
+
+def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
+    """Yield the visits that begin among some images, by name."""
+    for visit in visits:
+        first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
+        if first[0] in among:
+            yield Loop(
+                first=first,
+                second=second,
+                num_pairs=visit.num_pairs,
+                num_matches=visit.num_matches,
+                num_refused=visit.num_refused,
+                angle_deg=visit.angle_deg,
+                tolerance_deg=visit.tolerance_deg,
+            )
 
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:

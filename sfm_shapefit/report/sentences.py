@@ -15,6 +15,7 @@ import numpy as np
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.results.intrinsics import describe_intrinsics
+from sfm_shapefit.results.loops import describe_loops
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -57,6 +58,7 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         *_certainty(drawing, facts),
         _units(facts),
         *_intrinsics(facts),
+        *_loops(facts),
     ]
 
 
@@ -133,6 +135,13 @@ def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
     lines = describe_intrinsics(facts.get("intrinsics", []))
     if lines:
         yield f"Intrinsics: {'; '.join(lines)}."
+
+
+def _loops(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what became of the loops of videos, which earlier outputs lack."""
+    said = describe_loops(facts.get("loops", []))
+    if said:
+        yield f"Video: {shorten(said, 2 * MAX_TEXT)}."
 
 
 def _units(facts: dict[str, Any]) -> str:

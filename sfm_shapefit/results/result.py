@@ -58,6 +58,24 @@ class Inputs:
     """Pairs that are taken for unmatched."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
+
+    first: tuple[str, str]
+    """The first and the last frame of the earlier stretch."""
+    second: tuple[str, str]
+    """Those of the later one."""
+    num_pairs: int
+    num_matches: int
+    num_refused: int
+    """Pairs that were left out, because they do not agree with the chain of pairs near in time."""
+    angle_deg: float
+    """Median angle between the relative rotations of these pairs and those of the chain."""
+    tolerance_deg: float
+    """Up to where they agree with it."""
+
+
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class LocateResult(Displayed):
     """The seeded model and the evidence for it: that of piece 0, the largest, and `further` ones."""
@@ -96,6 +114,8 @@ class LocateResult(Displayed):
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     triplet_scores: FloatArray | None = None
     """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
+    loops: tuple[Loop, ...] = ()
+    """Of the videos among the images, where `map` looked for some."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
     agreeing_observations: float = math.nan

@@ -13,10 +13,12 @@ from abuse import determinism
 from abuse.verdicts import read_cameras
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands.relative_rotations import measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.results.intrinsics import describe_intrinsics
+from sfm_shapefit.results.loops import describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -223,6 +225,37 @@ def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor)
     assert len(given.directions.pairs) > 0
     centers = [found.table("cameras")["x"] for found in (given, gone)]
     np.testing.assert_array_equal(*centers)
+
+
+def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowhere(tmp_path, monkeypatch):
+    size = {"num_images": 16, "num_points": 900, "max_pairs_per_image": 15, "max_keypoints_per_image": 300}
+    write_workspace(make_scene(SceneOptions(shape="ring", seed=2, **size)), tmp_path / "made")
+    database = tmp_path / "made" / "database.db"
+
+    def with_a_false_loop(*given):
+        found = measure_rotations(*given)
+        turn = Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
+        rotations, counts = found.rotations.copy(), found.num_matches.copy()
+        far = found.pairs[:, 1] - found.pairs[:, 0] == 15
+        assert far.sum() == 1
+        rotations[far], counts[far] = turn, 300
+        # Without pairs between, the first and the last frame are beyond the reach of all.
+        kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
+        return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
+
+    monkeypatch.setattr("sfm_shapefit.commands.map.measure_rotations", with_a_false_loop)
+    found = sfm_shapefit.map_database(database, sequence="names", **FAST)
+    (loop,) = found.models[0].located.loops
+    names = found.models[0].names
+    assert (loop.first, loop.second, loop.num_refused) == ((names[0],) * 2, (names[15],) * 2, 1)
+    assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
+    assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
+    assert describe_loops(found.models[0].located.summary()["loops"]).endswith(f"{names[0]} to {names[15]}")
+    blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
+    assert (blind.num_frames, blind.models[0].located.loops) == (0, ())
+    assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
 
 
 def test_pairs_are_left_out_of_databases_only(tmp_path):
