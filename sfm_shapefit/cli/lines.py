@@ -32,12 +32,16 @@ def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     return [("intrinsics", shorten(lines))] if lines else []
 
 
-def loops_rows(facts: dict[str, Any]) -> Rows:
-    """Return a row on the loops of videos, if there are any."""
-    from sfm_shapefit.results.loops import describe_loops
+def scene_rows(facts: dict[str, Any]) -> Rows:
+    """Return rows on straight drives, loops of videos, and doubtful pairs, if there are any."""
+    from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
-    said = describe_loops(facts["loops"])
-    return [("video", said)] if said else []
+    said = {
+        "straight": describe_line(facts["line_sigma"]),
+        "video": describe_loops(facts["loops"]),
+        "doubtful pairs": describe_doubtful_pairs(facts["num_doubtful_pairs"]),
+    }
+    return [(label, text) for label, text in said.items() if text]
 
 
 def describe_points(facts: dict[str, Any]) -> str:

@@ -21,8 +21,8 @@ from sfm_shapefit.cli.lines import (
     describe_adjustment,
     describe_points,
     intrinsics_rows,
-    loops_rows,
     next_steps,
+    scene_rows,
 )
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.wording import counted
@@ -78,7 +78,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *headline_of_model(located).rows(),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
-            *loops_rows(located.summary()),
+            *scene_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]
         details += [

@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
+from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
@@ -38,6 +39,7 @@ from sfm_shapefit.results.map_result import MappedModel, MapResult
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.rotations.triplets import score_triplets
@@ -49,6 +51,9 @@ from sfm_shapefit.wording import counted
 # 0.89), an image if a smaller share of its own does.
 _ALARMING_SHARE = 0.7
 _DOUBTFUL_SHARE = 0.25
+# The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
+# again.
+_MOST_SCORED_PAIRS = 20_000
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 
@@ -108,8 +113,7 @@ def map_database(
             relative = run.measure()
     videos = run.find_videos(relative)
     run, relative, visits = run.judge_loops(videos, relative)
-    scores = score_triplets(unposed.num_images, relative).tolist()
-    run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
+    run = run.score_pairs(relative)
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
@@ -174,8 +178,8 @@ class _Run(NamedTuple):
     priors: PositionPriors | None
     without: PairNames
     """Pairs that are taken for unmatched."""
-    triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
-    """Of the pairs with a relative rotation."""
+    scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
+    """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
@@ -206,6 +210,24 @@ class _Run(NamedTuple):
         kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
         without = self.without | {(min(pair), max(pair)) for pair in refused}
         return self._replace(without=without), relative.subset(kept), loops.visits
+
+    def score_pairs(self, relative: RelativeRotations) -> "_Run":
+        """Return the run with the scores by which pairs of repeated structure are told."""
+        pairs = list(map(tuple, relative.pairs.tolist()))
+        triplets = score_triplets(self.unposed.num_images, relative).tolist()
+        shares: dict[tuple[int, int], float] = {}
+        if len(pairs) <= _MOST_SCORED_PAIRS:
+            with (
+                self.clock("scores of pairs"),
+                open_database(self.database, self.unposed, self.without) as opened,
+            ):
+                pixels = [opened.keypoints(k) for k in range(self.unposed.num_images)]
+                partners = count_partners([len(own) for own in pixels], opened.iter_matches(LEAST_MATCHES))
+                for batch in opened.iter_matches(LEAST_MATCHES):
+                    found = matched_shares(pixels, partners, batch).tolist()
+                    shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
+        both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
+        return self._replace(scores=dict(zip(pairs, both, strict=True)))
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
@@ -304,8 +326,9 @@ class _Run(NamedTuple):
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
-        scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
-        return replace(found, triplet_scores=scores)
+        unknown = (np.nan, np.nan)
+        scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
+        return replace(found, triplet_scores=scores[:, 0], matched_shares=scores[:, 1])
 
     def inputs_of(self, model: PosedModel) -> Inputs:
         """Return what the images of a component are located from."""

@@ -35,7 +35,7 @@ from sfm_shapefit.report.sentences import (
     summary_sentences,
 )
 from sfm_shapefit.results.json_types import LoopOfVideo
-from sfm_shapefit.results.loops import loop_cells
+from sfm_shapefit.results.scene_words import loop_cells
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""

@@ -15,7 +15,7 @@ import numpy as np
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.results.intrinsics import describe_intrinsics
-from sfm_shapefit.results.loops import describe_loops
+from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -138,10 +138,16 @@ def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
 
 
 def _loops(facts: dict[str, Any]) -> Iterator[str]:
-    """Yield what became of the loops of videos, which earlier outputs lack."""
+    """Yield what there is to say of loops, straight drives and doubtful pairs; earlier outputs lack them."""
     said = describe_loops(facts.get("loops", []))
     if said:
         yield f"Video: {shorten(said, 2 * MAX_TEXT)}."
+    line = describe_line(facts.get("line_sigma"))
+    if line:
+        yield f"{line[:1].upper()}{line[1:]}."
+    doubtful = describe_doubtful_pairs(facts.get("num_doubtful_pairs", 0))
+    if doubtful:
+        yield f"{doubtful}."
 
 
 def _units(facts: dict[str, Any]) -> str:

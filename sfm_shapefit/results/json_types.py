@@ -265,6 +265,14 @@ class LocateSummary(PlacementSummary):
     intrinsics: Annotated[
         list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
     ]
+    line_sigma: Annotated[
+        float | None,
+        "Median standard deviation of a position along the line on which all cameras stand, as a share of "
+        "its length; null where they stand on none, or where it is not known.",
+    ]
+    num_doubtful_pairs: Annotated[
+        int, "Pairs of doubtful_pairs.csv: used, but with far smaller scores than others."
+    ]
     loops: Annotated[list[LoopOfVideo], "Of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]

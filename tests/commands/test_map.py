@@ -18,7 +18,7 @@ from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.results.intrinsics import describe_intrinsics
-from sfm_shapefit.results.loops import describe_loops
+from sfm_shapefit.results.scene_words import describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 from sfm_shapefit.synthetic import SceneOptions, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace

@@ -1,4 +1,4 @@
-"""What became of the loops of videos, in words that terminal and report share."""
+"""Loops of videos, straight drives and doubtful pairs, in words that terminal and report share."""
 
 from collections.abc import Sequence
 
@@ -19,6 +19,27 @@ def describe_loops(loops: Sequence[LoopOfVideo]) -> str:
     return (
         f"{said}, {lost} refused as the frames between contradict {'it' if lost == 1 else 'them'}: above all "
         f"from {_stretch(worst['first'])} to {_stretch(worst['second'])}"
+    )
+
+
+def describe_line(sigma: float | None) -> str:
+    """Say how well lengths along a straight drive are known; empty where cameras do not stand on a line."""
+    if sigma is None:
+        return ""
+    return (
+        "the cameras stand on one line, along which points alone tell lengths: positions along it are known "
+        f"to {100.0 * sigma:.2g}% of its length (standard deviation)"
+    )
+
+
+def describe_doubtful_pairs(count: int) -> str:
+    """Say what to do with pairs that look like repeated structure; empty where there are none."""
+    if not count:
+        return ""
+    look = "looks" if count == 1 else "look"
+    return (
+        f"{counted(count, 'pair')} that the model uses {look} like repeated structure; --without "
+        f"doubtful_pairs.csv leaves {'it' if count == 1 else 'them'} out"
     )
 
 
