@@ -36,11 +36,9 @@ def describe_doubtful_pairs(count: int) -> str:
     """Say what to do with pairs that look like repeated structure; empty where there are none."""
     if not count:
         return ""
-    look = "looks" if count == 1 else "look"
-    return (
-        f"{counted(count, 'pair')} that the model uses {look} like repeated structure; --without "
-        f"doubtful_pairs.csv leaves {'it' if count == 1 else 'them'} out"
-    )
+    if count == 1:
+        return "1 pair in use looks like repeated structure; --without doubtful_pairs.csv leaves it out"
+    return f"{count} pairs in use look like repeated structure; --without doubtful_pairs.csv leaves them out"
 
 
 def loop_cells(loop: LoopOfVideo) -> list[str]:

@@ -16,6 +16,7 @@ from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.relative_rotations import measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.results.intrinsics import describe_intrinsics
 from sfm_shapefit.results.scene_words import describe_loops
@@ -48,6 +49,25 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
     facts = json.loads((tmp_path / "out" / "map.json").read_text())
     assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
+    # The pairs whose baselines were made false are told by the matches that are missing in their overlap.
+    pairs = {name: np.array(column) for name, column in model.located.table("pairs").items()}
+    false = pairs["residual_deg"] > 10.0
+    assert false.sum() > 30
+    assert np.nanmax(pairs["pair_score"][false]) < np.nanmedian(pairs["pair_score"][~false])
+    assert not (tmp_path / "out" / "0" / "doubtful_pairs.csv").exists()
+
+
+def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", points="never")
+    located = found.models[0].located
+    shares, row = located.matched_shares.copy(), next(r for r in located.pairs if r.verdict == "inlier")
+    names = [(pair.name1, pair.name2) for pair in located.pairs]
+    shares[names.index((row.name1, row.name2))] = 1e-4
+    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, matched_shares=shares))
+    sfm_shapefit.write_map_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
+    listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
+    assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}
+    assert "1 pair in use looks like repeated" in (tmp_path / "out" / "0" / "report.html").read_text()
 
 
 def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
