@@ -19,9 +19,9 @@ from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.results.intrinsics import describe_intrinsics
-from sfm_shapefit.results.scene_words import describe_loops
+from sfm_shapefit.results.scene_words import describe_line, describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
-from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run, run_python
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
@@ -276,6 +276,28 @@ def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowh
     blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
     assert (blind.num_frames, blind.models[0].located.loops) == (0, ())
     assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
+
+
+def test_a_straight_drive_is_placed_by_points_and_says_how_sure_lengths_are(tmp_path, monkeypatch):
+    drawn = layouts.LAYOUTS["drive"]
+
+    def straight(*given):
+        layout = drawn(*given)
+        return dataclasses.replace(layout, centers=layout.centers * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.5])
+
+    def street(x):
+        along, left = np.tile([[1.0, 0.0, 0.0]], (len(x), 1)), np.tile([[0.0, 1.0, 0.0]], (len(x), 1))
+        return along * x[:, None], along, left
+
+    monkeypatch.setattr(layouts, "street", street)
+    monkeypatch.setitem(layouts.LAYOUTS, "drive", straight)
+    write_workspace(make_scene(SceneOptions(shape="drive", num_images=8, seed=2)), tmp_path / "made")
+    located = sfm_shapefit.map_database(tmp_path / "made" / "database.db").models[0].located
+    errors = sfm_shapefit.evaluate(located.reconstruction, tmp_path / "made" / "sparse" / "0")
+    assert errors.position.max < 0.01 * errors.extent
+    assert 1e-5 < located.line_sigma < 0.01
+    said = describe_line(located.summary()["line_sigma"])
+    assert f"known to {100.0 * located.line_sigma:.2g}% of its length" in said
 
 
 def test_pairs_are_left_out_of_databases_only(tmp_path):

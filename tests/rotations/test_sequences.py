@@ -64,6 +64,14 @@ def test_reach_ends_at_a_gap_and_doubles_without_one():
     assert loops.tolist() == [[10, 50]]
 
 
+def test_weak_pairs_at_every_distance_do_not_extend_the_reach():
+    given = measured(neighbors() + [(0, lag) for lag in range(6, FRAMES)])
+    weak = replace(given, num_matches=np.where(given.num_matches == 300, 30, given.num_matches))
+    assert not loop_pairs(find_videos(NAMES), given).any()
+    loops = weak.pairs[loop_pairs(find_videos(NAMES), weak)]
+    assert loops.tolist() == [[0, lag] for lag in range(16, FRAMES)]
+
+
 def test_loops_are_taken_where_the_chain_says_the_same_and_refused_where_not():
     right, wrong = visit(0, 30), visit(10, 50)
     given = measured(neighbors() + right + wrong, wrong)
