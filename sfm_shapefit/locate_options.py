@@ -10,7 +10,7 @@ from typing import Literal
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
-from sfm_shapefit.rotations.options import Averaging
+from sfm_shapefit.rotations.options import Averaging, Sequencing
 from sfm_shapefit.settings import explained, option
 
 Rotations = Literal["auto", "measured", "free"]
@@ -65,6 +65,11 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         'a text file with one image name per line, or "solved": every image that observes a 3D point '
         "of the input, for new images in a solved model. With two or more the scale is theirs, with "
         "one only the origin.",
+    )
+    without: str = option(
+        "",
+        "Pairs that are left out, as wrong ones of repeated structure: a file with the names of two images "
+        "per line, as pairs.csv or doubtful_pairs.csv has them.",
     )
     refine_with_priors: bool = option(
         False,
@@ -210,6 +215,12 @@ class MapOptions(LocateOptions):
         0,
         "Pairs with fewer inlier matches are left out of the averaging. 0 leaves none out; pycolmap's "
         "averaging then tries 15, 20, 30, 50 and 80 and keeps the rotations that agree with most matches.",
+    )
+    sequence: Sequencing = option(
+        "auto",
+        "Images that are frames of a video, told by a running number in their names: pairs far apart in time "
+        'must agree with the chain of those near in time, or they are left out. "auto" asks that the matches '
+        'look like a video too; "names" believes the names; "none" takes all pairs alike.',
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
 

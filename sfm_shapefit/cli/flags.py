@@ -58,6 +58,7 @@ _SHORT = {"quiet": "-q", "verbose": "-v"}
 _METAVARS: dict[Any, str] = {
     "known_distance": "NAME NAME DISTANCE",
     "fix": "FILE|solved",
+    "without": "FILE",
     "config": "FILE",
     "images": "FOLDER",
     int: "INTEGER",

@@ -32,6 +32,18 @@ def intrinsics_rows(facts: dict[str, Any]) -> Rows:
     return [("intrinsics", shorten(lines))] if lines else []
 
 
+def scene_rows(facts: dict[str, Any]) -> Rows:
+    """Return rows on straight drives, loops of videos, and doubtful pairs, if there are any."""
+    from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
+
+    said = {
+        "straight": describe_line(facts["line_sigma"]),
+        "video": describe_loops(facts["loops"]),
+        "doubtful pairs": describe_doubtful_pairs(facts["num_doubtful_pairs"]),
+    }
+    return [(label, text) for label, text in said.items() if text]
+
+
 def describe_points(facts: dict[str, Any]) -> str:
     """Say how many points there are, and how far they are off their keypoints."""
     if not facts["num_points"]:

@@ -27,6 +27,7 @@ from sfm_shapefit.cli.lines import (
     intrinsics_rows,
     name_pictures,
     next_steps,
+    scene_rows,
 )
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.wording import counted
@@ -93,6 +94,7 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
             *intrinsics_rows(facts),
+            *scene_rows(facts),
             *[("warning", warning) for warning in found.warnings],
         ],
         details=[

@@ -17,7 +17,13 @@ from sfm_shapefit.cli.flags import (
     takes,
 )
 from sfm_shapefit.cli.frame import Told, command_run
-from sfm_shapefit.cli.lines import describe_adjustment, describe_points, intrinsics_rows, next_steps
+from sfm_shapefit.cli.lines import (
+    describe_adjustment,
+    describe_points,
+    intrinsics_rows,
+    next_steps,
+    scene_rows,
+)
 from sfm_shapefit.locate_options import MapOptions
 from sfm_shapefit.wording import counted
 
@@ -72,6 +78,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *headline_of_model(located).rows(),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
+            *scene_rows(located.summary()),
             *[("warning", warning) for warning in located.warnings],
         ]
         details += [

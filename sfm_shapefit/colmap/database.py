@@ -38,6 +38,7 @@ from sfm_shapefit.colmap.model import PosedModel, batch_ranges, rotation_matrice
 from sfm_shapefit.directions.matches import MatchBatch, RelativePoses
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import refuse_irregular_file
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.geometry import normalized
 
 MAX_NUM_IMAGES = 2147483647
@@ -100,8 +101,12 @@ def find_database(model_folder: Path) -> Path | None:
 
 
 @contextmanager
-def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabase"]:
+def open_database(
+    path: Path | str, model: PosedModel, left_out: PairNames = frozenset()
+) -> Iterator["MatchDatabase"]:
     """Open a COLMAP database, for the matches of a model's images; neither it nor its folder is changed.
+
+    Pairs `left_out` are taken for unmatched.
 
     Raises:
         InputError: if the file is missing, is no COLMAP database, is locked or damaged, or has fewer
@@ -112,7 +117,7 @@ def open_database(path: Path | str, model: PosedModel) -> Iterator["MatchDatabas
         with _sqlite_errors(file):
             connection = stack.enter_context(_readonly_connection(file))
             _check_schema(file, connection)
-            database = MatchDatabase(file, connection, model)
+            database = MatchDatabase(file, connection, model, left_out)
         yield database
 
 
@@ -146,8 +151,14 @@ def readonly_rows(path: Path, table: str, queries: dict[tuple[str, ...], str]) -
 class MatchDatabase:
     """The matches of a database between the images of a model; made by `open_database`."""
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, model: PosedModel) -> None:
-        self.path = path
+    def __init__(
+        self,
+        path: Path,
+        connection: sqlite3.Connection,
+        model: PosedModel,
+        left_out: PairNames = frozenset(),
+    ) -> None:
+        self.path, self.left_out = path, left_out
         self._connection = connection
         self._model = model
         self._cache_bytes = _CACHE_BYTES
@@ -156,7 +167,7 @@ class MatchDatabase:
         self._kept: dict[int, list[MatchBatch]] = {}
         index_of_id = _match_names(path, connection, model)
         self._id_of_index = {index: i for i, index in index_of_id.items() if index >= 0}
-        self._pairs = _read_pairs(path, connection, index_of_id)
+        self._pairs = _read_pairs(path, connection, index_of_id).without(_indices_of_names(model, left_out))
 
     @property
     def unmatched_names(self) -> tuple[str, ...]:
@@ -516,6 +527,14 @@ class _Pairs(NamedTuple):
     configs: IntArray
     num_inliers: IntArray
 
+    def without(self, left_out: set[tuple[int, int]]) -> "_Pairs":
+        """Return all pairs but some (i, j), i < j."""
+        if not left_out:
+            return self
+        kept = np.array([(i, j) not in left_out for i, j in self.pairs.tolist()], dtype=np.bool_)
+        ends, rowids, swapped, configs, counts = self
+        return _Pairs(ends[kept], rowids[kept], swapped[kept], configs[kept], counts[kept])
+
     @property
     def has_matches(self) -> BoolArray:
         """Whether the pair's inlier matches may be used, (k,)."""
@@ -623,6 +642,13 @@ def _indices_of_pairs(path: Path, pair_ids: IntArray, index_of_id: dict[int, int
         raise InputError(f"{path}: a two-view geometry joins the images with ids {a} and {b}; it is damaged")
     indices = np.array([index_of_id[i] for i in known.tolist()], dtype=np.int64)
     return indices[position]
+
+
+def _indices_of_names(model: PosedModel, pairs: PairNames) -> set[tuple[int, int]]:
+    """Return pairs of names as pairs (i, j) of a model's images, i < j; those of other images are dropped."""
+    index = {name: k for k, name in enumerate(model.names)}
+    ends = [(index[a], index[b]) for a, b in pairs if a in index and b in index]
+    return {(min(pair), max(pair)) for pair in ends}
 
 
 def _is_blob(data: object, rows: object, cols: int, *, itemsize: int) -> bool:

@@ -26,7 +26,7 @@ from sfm_shapefit.commands.stages.adjustment import (
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.doubts import ask_pairs, doubt_cameras, question_focal_lengths
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
-from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source
+from sfm_shapefit.commands.stages.inputs import MatchSource, choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.measure import add_evidence, build_graph, count_work, measure_directions
 from sfm_shapefit.commands.stages.memory import keep_within_memory
@@ -105,6 +105,7 @@ def locate(
     with clock("read"):
         model = read_model(reconstruction)
         inputs = choose_inputs(reconstruction, database, options.directions)
+        inputs = read_left_out(inputs, model.names, options)
         model, intrinsics = settle_intrinsics(model, inputs.database, options)
         priors_known = read_priors(model, inputs, options, priors)
         rigid = find_rigid_parts(model, options, has_priors=priors_known is not None)

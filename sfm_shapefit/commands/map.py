@@ -6,7 +6,7 @@
 Images that the averaging drops form components of their own.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
@@ -17,6 +17,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Uncertainty
+from sfm_shapefit.colmap.database import open_database
 from sfm_shapefit.colmap.database_images import UnposedImages, pose_at_origin, read_images
 from sfm_shapefit.colmap.intrinsics import differ_in_rays, with_parameters
 from sfm_shapefit.colmap.model import PosedModel, read_model
@@ -26,18 +27,21 @@ from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
-from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
+from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.map_result import MappedModel, MapResult
-from sfm_shapefit.results.result import LocateResult
+from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
+from sfm_shapefit.rotations.missing_matches import count_partners, matched_shares
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.rotations.sequences import Videos, Visit, confirm_videos, find_videos, judge_loops
 from sfm_shapefit.rotations.triplets import score_triplets
 from sfm_shapefit.settings import merge_options
 from sfm_shapefit.viewgraph import connected_components
@@ -47,6 +51,9 @@ from sfm_shapefit.wording import counted
 # 0.89), an image if a smaller share of its own does.
 _ALARMING_SHARE = 0.7
 _DOUBTFUL_SHARE = 0.25
+# The shares of more pairs would take longer than they are worth: 0.2 ms each, and their matches are read
+# again.
+_MOST_SCORED_PAIRS = 20_000
 _UNMATCHED = f"no matches: fewer than {LEAST_MATCHES} inliers with every other image"
 
 
@@ -83,17 +90,30 @@ def map_database(
         images = read_images(path)
         unposed, intrinsics = settle_intrinsics(read_model(images.reconstruction), path, options)
         inputs = choose_inputs(images.reconstruction, path, options.directions)
+        without = read_left_out(inputs, unposed.names, options).left_out
         positions = read_priors(unposed, inputs, options, priors)
     frame_of_image, sensor_rotations = images.frames(unposed.image_ids.tolist())
-    run = _Run(options, clock, path, images, unposed, frame_of_image, sensor_rotations, intrinsics, positions)
+    run = _Run(
+        options,
+        clock,
+        path,
+        images,
+        unposed,
+        frame_of_image,
+        sensor_rotations,
+        intrinsics,
+        positions,
+        without,
+    )
     relative = run.measure()
     if options.adjust and intrinsics.free.doubts:
         known = run.refine_intrinsics(relative)
         if differ_in_rays(known, unposed):
             run = run._replace(unposed=known)
             relative = run.measure()
-    scores = score_triplets(unposed.num_images, relative).tolist()
-    run = run._replace(triplet_scores=dict(zip(map(tuple, relative.pairs.tolist()), scores, strict=True)))
+    videos = run.find_videos(relative)
+    run, relative, visits = run.judge_loops(videos, relative)
+    run = run.score_pairs(relative)
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
@@ -102,6 +122,7 @@ def map_database(
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
+        found = replace(found, loops=tuple(_loops_of(visits, unposed.names, set(names))))
         models.append(MappedModel(located=found, averaging=averaging, names=names))
         for k in frames.tolist():
             del reasons[k]
@@ -119,6 +140,7 @@ def map_database(
         models=tuple(models),
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
+        num_frames=videos.num_frames,
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
@@ -154,15 +176,58 @@ class _Run(NamedTuple):
     intrinsics: Intrinsics
     """Which of theirs are in doubt."""
     priors: PositionPriors | None
-    triplet_scores: Mapping[tuple[int, int], float] = MappingProxyType({})
-    """Of the pairs with a relative rotation."""
+    without: PairNames
+    """Pairs that are taken for unmatched."""
+    scores: Mapping[tuple[int, int], tuple[float, float]] = MappingProxyType({})
+    """Of the pairs with a relative rotation: by their triangles, and the matched share of their overlap."""
 
     def measure(self) -> RelativeRotations:
         """Return the relative rotations of all pairs, by the intrinsics that the images have."""
         with self.clock("relative rotations"):
             sharing = Sharing(self.options.num_threads(), advance=self.clock.advance)
             source = self.options.relative_rotations
-            return measure_rotations(self.database, self.unposed, LEAST_MATCHES, source, sharing)
+            return measure_rotations(
+                self.database, self.unposed, LEAST_MATCHES, source, sharing, self.without
+            )
+
+    def find_videos(self, relative: RelativeRotations) -> Videos:
+        """Return the videos among the images, as far as the options want to know of them."""
+        asked = self.options.sequence
+        nothing = Videos(np.full(self.unposed.num_images, -1), np.full(self.unposed.num_images, -1))
+        videos = nothing if asked == "none" else find_videos(self.unposed.names)
+        return confirm_videos(videos, relative) if asked == "auto" else videos
+
+    def judge_loops(
+        self, videos: Videos, relative: RelativeRotations
+    ) -> tuple["_Run", RelativeRotations, tuple[Visit, ...]]:
+        """Return run and pairs without loop pairs that the chains of their videos contradict, and visits."""
+        if not videos.num_videos:
+            return self, relative, ()
+        with self.clock("rotation averaging"):
+            loops = judge_loops(videos, relative, self.options.num_threads())
+        names = self.unposed.names
+        refused = {(names[i], names[j]) for i, j in relative.pairs[loops.refused].tolist()}
+        kept = np.delete(np.arange(len(relative.pairs)), loops.refused)
+        without = self.without | {(min(pair), max(pair)) for pair in refused}
+        return self._replace(without=without), relative.subset(kept), loops.visits
+
+    def score_pairs(self, relative: RelativeRotations) -> "_Run":
+        """Return the run with the scores by which pairs of repeated structure are told."""
+        pairs = list(map(tuple, relative.pairs.tolist()))
+        triplets = score_triplets(self.unposed.num_images, relative).tolist()
+        shares: dict[tuple[int, int], float] = {}
+        if len(pairs) <= _MOST_SCORED_PAIRS:
+            with (
+                self.clock("scores of pairs"),
+                open_database(self.database, self.unposed, self.without) as opened,
+            ):
+                pixels = [opened.keypoints(k) for k in range(self.unposed.num_images)]
+                partners = count_partners([len(own) for own in pixels], opened.iter_matches(LEAST_MATCHES))
+                for batch in opened.iter_matches(LEAST_MATCHES):
+                    found = matched_shares(pixels, partners, batch).tolist()
+                    shares |= zip(map(tuple, batch.pairs.tolist()), found, strict=True)
+        both = zip(triplets, (shares.get(pair, np.nan) for pair in pairs), strict=True)
+        return self._replace(scores=dict(zip(pairs, both, strict=True)))
 
     def refine_intrinsics(self, relative: RelativeRotations) -> PosedModel:
         """Return the images with the intrinsics that first placements of all components find.
@@ -175,7 +240,7 @@ class _Run(NamedTuple):
         for _, members, averaging in self.average_images(relative, {}):
             options = self._options_of(members, has_priors=False)
             model = self._pose(self.unposed.image_ids[members].tolist(), averaging.rotations)
-            inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+            inputs = self.inputs_of(model)
             rule = GaugeRule(model, find_rigid_parts(model, options, has_priors=False), options, None)
             with open_source(model, inputs, options) as source, suppress(UnsolvableError):
                 with self.clock("first placement"):
@@ -242,7 +307,7 @@ class _Run(NamedTuple):
             priors = None
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
-        inputs = choose_inputs(model.reconstruction, self.database, options.directions)
+        inputs = self.inputs_of(model)
         rigid = find_rigid_parts(model, options, has_priors=priors is not None)
         with open_source(model, inputs, options) as averaged:
             source, centers, uncertainty = averaged, None, Uncertainty()
@@ -261,8 +326,14 @@ class _Run(NamedTuple):
             with self.clock("locate"):
                 found = locate_source(source, locating, options, Clock(self.clock.progress))
         ends = members[found.directions.pairs].tolist()
-        scores = np.array([self.triplet_scores.get((i, j), np.nan) for i, j in ends])
-        return replace(found, triplet_scores=scores)
+        unknown = (np.nan, np.nan)
+        scores = np.array([self.scores.get((i, j), unknown) for i, j in ends]).reshape(-1, 2)
+        return replace(found, triplet_scores=scores[:, 0], matched_shares=scores[:, 1])
+
+    def inputs_of(self, model: PosedModel) -> Inputs:
+        """Return what the images of a component are located from."""
+        inputs = choose_inputs(model.reconstruction, self.database, self.options.directions)
+        return replace(inputs, left_out=self.without)
 
     def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
         """Return the options of one component, whose scale is what is known of its own images."""
@@ -292,6 +363,22 @@ class _Run(NamedTuple):
         known = with_parameters(self.unposed, found or {})
         images = replace(self.images, reconstruction=known.reconstruction)
         return read_model(pose_at_origin(images, image_ids, rotations))
+
+
+def _loops_of(visits: Iterable[Visit], names: Sequence[str], among: set[str]) -> Iterator[Loop]:
+    """Yield the visits that begin among some images, by name."""
+    for visit in visits:
+        first, second = ((names[a], names[b]) for a, b in (visit.first, visit.second))
+        if first[0] in among:
+            yield Loop(
+                first=first,
+                second=second,
+                num_pairs=visit.num_pairs,
+                num_matches=visit.num_matches,
+                num_refused=visit.num_refused,
+                angle_deg=visit.angle_deg,
+                tolerance_deg=visit.tolerance_deg,
+            )
 
 
 def _group_frames(num_frames: int, pairs: IntArray) -> list[IntArray]:

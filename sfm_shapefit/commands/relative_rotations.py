@@ -16,6 +16,7 @@ from sfm_shapefit.colmap.relative_rotations import (
 )
 from sfm_shapefit.commands.stages.clock import Clock, Progress
 from sfm_shapefit.commands.stages.execution import PairWork, measure_with_workers
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, MapOptions, Relative
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
 
@@ -91,6 +92,7 @@ def measure_rotations(
     min_matches: int = LEAST_MATCHES,
     source: Relative = "matches",
     sharing: Sharing | None = None,
+    left_out: PairNames = frozenset(),
 ) -> RelativeRotations:
     """Return the relative rotations of a database; pairs are indices into the model's images.
 
@@ -100,13 +102,14 @@ def measure_rotations(
         min_matches: pairs with fewer inlier matches are left out.
         source: estimated from the matches, or as stored.
         sharing: one thread if None.
+        left_out: pairs that are taken for unmatched.
 
     Raises:
         InputError: if the database cannot be read, or a row of it is damaged.
         WorkerError: if a worker died and the executor does not replace it.
     """
     sharing = sharing or Sharing()
-    with open_database(path, model) as database:
+    with open_database(path, model, left_out) as database:
         if source == "stored":
             return stored_relative_rotations(database, model, min_matches)
         if sharing.executor is None:

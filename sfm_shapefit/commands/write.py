@@ -94,6 +94,8 @@ def _write_files(found: LocateResult | GraphResult, folder: Path, options: Write
         write_rows(rows, CameraRow, dimension, subfolder / "cameras.csv")
     write_rows(found.cameras, CameraRow, dimension, folder / "cameras.csv")
     write_rows(found.pairs, PairRow, dimension, folder / "pairs.csv")
+    if isinstance(found, LocateResult) and found.doubtful_pairs:
+        write_rows(found.doubtful_pairs, PairRow, dimension, folder / "doubtful_pairs.csv")
     write_json(facts, folder / MARKER)
     if options.report or options.scene:
         _draw(found, folder, options)

@@ -34,6 +34,8 @@ from sfm_shapefit.report.sentences import (
     shorten,
     summary_sentences,
 )
+from sfm_shapefit.results.json_types import LoopOfVideo
+from sfm_shapefit.results.scene_words import loop_cells
 
 MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
@@ -43,6 +45,8 @@ _HIGH_TRUST = 0.95
 _MAX_HINGES = 20
 # The objectives of the first iterations may be far out of scale.
 _STARTING_ITERATIONS = 2
+# So many loops are listed.
+_MAX_LOOPS = 50
 _AXES = "xyz"
 _TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
 
@@ -124,6 +128,7 @@ def page_data(
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
+        "loops": [[shorten(cell) for cell in loop_cells(loop)] for loop in _loops(facts)],
         "pieces": [_piece(k, piece) for k, piece in enumerate(facts["pieces"])],
         "timings": [[name, f"{seconds:.2f} s"] for name, seconds in facts["timings_s"].items()],
         "options": _options(facts["options"]),
@@ -255,6 +260,12 @@ def _convergence(drawing: Drawing) -> dict[str, Any]:
     }
 
 
+def _loops(facts: dict[str, Any]) -> list[LoopOfVideo]:
+    """Return the loops of videos, which earlier outputs lack, those that were refused first."""
+    loops: list[LoopOfVideo] = facts.get("loops", [])
+    return sorted(loops, key=lambda loop: (-loop["num_refused"], -loop["num_matches"]))[:_MAX_LOOPS]
+
+
 # --- words -----------------------------------------------------------------------------------------
 
 
@@ -305,6 +316,7 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
+        "loops": "Pairs of frames far apart in time are used where the frames between say the same.",
         "pieces": "Nothing fixes size and place of one piece against another; they share the cameras named.",
     }
 

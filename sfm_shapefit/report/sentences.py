@@ -15,6 +15,7 @@ import numpy as np
 from sfm_shapefit.arrays import IntArray
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.results.intrinsics import describe_intrinsics
+from sfm_shapefit.results.scene_words import describe_doubtful_pairs, describe_line, describe_loops
 
 MAX_TEXT = 160
 """Characters of a name or sentence that are shown."""
@@ -57,6 +58,7 @@ def summary_sentences(drawing: Drawing, facts: dict[str, Any]) -> list[str]:
         *_certainty(drawing, facts),
         _units(facts),
         *_intrinsics(facts),
+        *_loops(facts),
     ]
 
 
@@ -133,6 +135,19 @@ def _intrinsics(facts: dict[str, Any]) -> Iterator[str]:
     lines = describe_intrinsics(facts.get("intrinsics", []))
     if lines:
         yield f"Intrinsics: {'; '.join(lines)}."
+
+
+def _loops(facts: dict[str, Any]) -> Iterator[str]:
+    """Yield what there is to say of loops, straight drives and doubtful pairs; earlier outputs lack them."""
+    said = describe_loops(facts.get("loops", []))
+    if said:
+        yield f"Video: {shorten(said, 2 * MAX_TEXT)}."
+    line = describe_line(facts.get("line_sigma"))
+    if line:
+        yield f"{line[:1].upper()}{line[1:]}."
+    doubtful = describe_doubtful_pairs(facts.get("num_doubtful_pairs", 0))
+    if doubtful:
+        yield f"{doubtful}."
 
 
 def _units(facts: dict[str, Any]) -> str:

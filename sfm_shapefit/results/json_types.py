@@ -228,6 +228,18 @@ class Agreement(TypedDict):
     ]
 
 
+class LoopOfVideo(TypedDict):
+    """Pairs between two stretches of a video that are far apart in time."""
+
+    first: Annotated[list[str], "First and last frame of the earlier stretch."]
+    second: Annotated[list[str], "First and last frame of the later stretch."]
+    num_pairs: Annotated[int, "Pairs between the two."]
+    num_matches: Annotated[int, "Their inlier matches."]
+    num_refused: Annotated[int, "Pairs left out, as they do not agree with the chain of pairs near in time."]
+    angle_deg: Annotated[float, "Median angle between their relative rotations and the chain's."]
+    tolerance_deg: Annotated[float, "Up to where they agree with it."]
+
+
 class LocateSummary(PlacementSummary):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
 
@@ -253,6 +265,15 @@ class LocateSummary(PlacementSummary):
     intrinsics: Annotated[
         list[CameraIntrinsics], "Cameras that were never calibrated, or were asked to be refined."
     ]
+    line_sigma: Annotated[
+        float | None,
+        "Median standard deviation of a position along the line on which all cameras stand, as a share of "
+        "its length; null where they stand on none, or where it is not known.",
+    ]
+    num_doubtful_pairs: Annotated[
+        int, "Pairs of doubtful_pairs.csv: used, but with far smaller scores than others."
+    ]
+    loops: Annotated[list[LoopOfVideo], "Of the videos among the images of `map`."]
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
@@ -312,6 +333,7 @@ class MapSummary(TypedDict):
     options: Options
     num_images: Annotated[int, "Images of the database."]
     num_placed: Annotated[int, "Cameras in all models."]
+    num_frames: Annotated[int, "Images that are frames of a video."]
     num_pairs: Annotated[int, "Pairs with a relative rotation."]
     models: Annotated[list[Model], "One per connected component, most cameras first."]
     left_out: Annotated[dict[str, str], "Images in no model, and why."]

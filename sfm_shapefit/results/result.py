@@ -14,7 +14,10 @@ from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.directions.pair_directions import CONTRADICTIONS, DirectionStatus, PairDirections
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.formats.onedsfm import EpipolarGeometries
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt
+from sfm_shapefit.judgement.straight import find_line, sigma_along
+from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
@@ -30,6 +33,7 @@ from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, w
 from sfm_shapefit.results.summary import summarize_graph, summarize_model
 from sfm_shapefit.results.tables import CameraRow, PairRow
 from sfm_shapefit.rigidity import RigidPiece
+from sfm_shapefit.rotations.missing_matches import doubtful_pairs, score_pairs
 from sfm_shapefit.solver.options import SolverResult
 from sfm_shapefit.wording import counted
 
@@ -53,6 +57,26 @@ class Inputs:
     """Where the directions came from; never "auto"."""
     statement: str
     """How that choice was made, for the user."""
+    left_out: PairNames = frozenset()
+    """Pairs that are taken for unmatched."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loop:
+    """Pairs between two stretches of a video that are far apart in time, by the names of their frames."""
+
+    first: tuple[str, str]
+    """The first and the last frame of the earlier stretch."""
+    second: tuple[str, str]
+    """Those of the later one."""
+    num_pairs: int
+    num_matches: int
+    num_refused: int
+    """Pairs that were left out, because they do not agree with the chain of pairs near in time."""
+    angle_deg: float
+    """Median angle between the relative rotations of these pairs and those of the chain."""
+    tolerance_deg: float
+    """Up to where they agree with it."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -93,6 +117,10 @@ class LocateResult(Displayed):
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     triplet_scores: FloatArray | None = None
     """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
+    matched_shares: FloatArray | None = None
+    """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
+    loops: tuple[Loop, ...] = ()
+    """Of the videos among the images, where `map` looked for some."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
     agreeing_observations: float = math.nan
@@ -223,10 +251,35 @@ class LocateResult(Displayed):
                 strict=True,
             )
         ]
-        if self.triplet_scores is None:
+        if self.triplet_scores is None or self.matched_shares is None:
             return rows
-        scores = self.triplet_scores.tolist()
-        return [replace(row, triplet_score=score) for row, score in zip(rows, scores, strict=True)]
+        scores = score_pairs(self.triplet_scores, self.matched_shares)
+        columns = (self.triplet_scores.tolist(), self.matched_shares.tolist(), scores.tolist())
+        return [
+            replace(row, triplet_score=triplet, matched_share=share, pair_score=score)
+            for row, triplet, share, score in zip(rows, *columns, strict=True)
+        ]
+
+    @cached_property
+    def line_sigma(self) -> float | None:
+        """Median standard deviation along the line on which all cameras stand, as a share of its length.
+
+        None where they do not stand on one, or where it is not known.
+        """
+        placement = self.placement
+        line = find_line(placement.graph.directions[placement.edges[placement.pairs]])
+        if line is None:
+            return None
+        sigma = sigma_along(line, placement.locations, placement.covariances)
+        return sigma if math.isfinite(sigma) else None
+
+    @cached_property
+    def doubtful_pairs(self) -> list[PairRow]:
+        """The pairs that agree with the model and look like repeated structure all the same, worst first."""
+        doubtful = doubtful_pairs(np.array([row.pair_score for row in self.pairs])).tolist()
+        rows = [row for row, is_doubtful in zip(self.pairs, doubtful, strict=True) if is_doubtful]
+        used = [row for row in rows if row.verdict == Verdict.INLIER.value]
+        return sorted(used, key=lambda row: (row.pair_score, row.name1, row.name2))
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:

@@ -16,6 +16,7 @@ from sfm_shapefit.results.json_types import (
     EarthDatum,
     GraphSummary,
     LocateSummary,
+    LoopOfVideo,
     Lud,
     PlacementAdjustment,
     PlacementSummary,
@@ -28,7 +29,7 @@ from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.results.warnings import graph_warnings
 
 if TYPE_CHECKING:
-    from sfm_shapefit.results.result import GraphResult, LocateResult
+    from sfm_shapefit.results.result import GraphResult, LocateResult, Loop
 
 _SOLVER_SCALE = "solver: the weighted mean length along the directions is 1, the centroid 0"
 _QUANTILES = (25, 50, 75, 90)
@@ -72,6 +73,9 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
+        "line_sigma": found.line_sigma,
+        "num_doubtful_pairs": len(found.doubtful_pairs),
+        "loops": [_summarize_loop(loop) for loop in found.loops],
         "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),
@@ -209,3 +213,9 @@ def _summarize_rotations(turned_deg: FloatArray | None) -> RotationRefinement | 
         "median_change_deg": float(np.median(changed)) if len(changed) else 0.0,
         "max_change_deg": float(changed.max(initial=0.0)),
     }
+
+
+def _summarize_loop(loop: "Loop") -> LoopOfVideo:
+    """Return a loop of a video in plain values."""
+    facts = asdict(loop) | {"first": list(loop.first), "second": list(loop.second)}
+    return cast("LoopOfVideo", facts)

@@ -72,6 +72,12 @@ class PairRow:
     triplet_score: float = math.nan
     """Weighted share of the triangles of relative rotations that close with it; only where `map` averaged and
     the pair is in a triangle. A low one is a sign of repeated structure."""
+    matched_share: float = math.nan
+    """Of the keypoints in the overlap of its images that are matched with third images, the share matched
+    here; the smaller one of its two images. Only from `map`."""
+    pair_score: float = math.nan
+    """`triplet_score` (0.5 where there is none) times `matched_share`: the lowest of a scene are the
+    likeliest to be repeated structure."""
 
 
 Row = TypeVar("Row", CameraRow, PairRow)
@@ -85,7 +91,7 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
-_ADDED_COLUMNS = {"triplet_score"}
+_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score"}
 """What earlier outputs lack."""
 
 

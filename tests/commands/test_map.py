@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -12,12 +13,15 @@ from abuse import determinism
 from abuse.verdicts import read_cameras
 from sfm_shapefit.colmap.database_images import read_images
 from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.commands.relative_rotations import measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
 from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.geometry import mean_rotation_l1, rotation_angles_deg
 from sfm_shapefit.results.intrinsics import describe_intrinsics
+from sfm_shapefit.results.scene_words import describe_line, describe_loops
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
-from sfm_shapefit.synthetic import SceneOptions, make_scene
+from sfm_shapefit.synthetic import SceneOptions, layouts, make_scene
 from sfm_shapefit.synthetic.workspace import write_workspace
 from tests.program import run, run_python
 from tests.scenes import COURTYARD, RING, copied, edit_database, fingerprint
@@ -45,6 +49,25 @@ def test_the_courtyard_is_mapped_from_its_database_alone(tmp_path):
     assert (tmp_path / "out" / "0" / "cameras.csv").is_file()
     facts = json.loads((tmp_path / "out" / "map.json").read_text())
     assert facts["num_placed"] == facts["models"][0]["num_placed"] == 25
+    # The pairs whose baselines were made false are told by the matches that are missing in their overlap.
+    pairs = {name: np.array(column) for name, column in model.located.table("pairs").items()}
+    false = pairs["residual_deg"] > 10.0
+    assert false.sum() > 30
+    assert np.nanmax(pairs["pair_score"][false]) < np.nanmedian(pairs["pair_score"][~false])
+    assert not (tmp_path / "out" / "0" / "doubtful_pairs.csv").exists()
+
+
+def test_used_pairs_of_tiny_scores_are_listed_and_can_be_left_out(tmp_path):
+    found = sfm_shapefit.map_database(COURTYARD / "database.db", points="never")
+    located = found.models[0].located
+    shares, row = located.matched_shares.copy(), next(r for r in located.pairs if r.verdict == "inlier")
+    names = [(pair.name1, pair.name2) for pair in located.pairs]
+    shares[names.index((row.name1, row.name2))] = 1e-4
+    model = dataclasses.replace(found.models[0], located=dataclasses.replace(located, matched_shares=shares))
+    sfm_shapefit.write_map_result(dataclasses.replace(found, models=(model,)), tmp_path / "out")
+    listed = tmp_path / "out" / "0" / "doubtful_pairs.csv"
+    assert read_pair_list(listed, model.names) == {(row.name1, row.name2)}
+    assert "1 pair in use looks like repeated" in (tmp_path / "out" / "0" / "report.html").read_text()
 
 
 def test_priors_set_scale_origin_and_axes_of_the_component_that_has_them(tmp_path):
@@ -196,6 +219,92 @@ def test_what_map_cannot_be_told_is_refused_in_one_sentence(tmp_path, flags, wor
     assert words in said
     assert "Traceback" not in said
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("executor", [None, "processes"])
+def test_pairs_that_are_to_be_left_out_take_no_part_anywhere(tmp_path, executor):
+    truth = read_model(RING / "sparse" / "0")
+    listed, ids = [(0, 1), (4, 3)], truth.image_ids.tolist()
+    gone = [f"pair_id = {ids[min(pair)] * PAIR + ids[max(pair)]}" for pair in listed]
+    without = tmp_path / "without.csv"
+    without.write_text("\n".join(f"{truth.names[i]},{truth.names[j]}" for i, j in listed))
+    database = changed(
+        RING, tmp_path / "edited", f"DELETE FROM two_view_geometries WHERE {' OR '.join(gone)}"
+    )
+    if executor is None:
+        given = (
+            sfm_shapefit.map_database(RING / "database.db", without=str(without), **FAST).models[0].located
+        )
+        gone = sfm_shapefit.map_database(database, **FAST).models[0].located
+    else:
+        with ThreadPoolExecutor(2) as pool:
+            model = RING / "sparse" / "0"
+            given = sfm_shapefit.locate(model, without=str(without), executor=pool, **FAST)
+            gone = sfm_shapefit.locate(model, database, **FAST)
+    np.testing.assert_array_equal(given.directions.pairs, gone.directions.pairs)
+    assert len(given.directions.pairs) > 0
+    centers = [found.table("cameras")["x"] for found in (given, gone)]
+    np.testing.assert_array_equal(*centers)
+
+
+def test_a_loop_that_the_frames_between_contradict_is_refused_told_and_used_nowhere(tmp_path, monkeypatch):
+    size = {"num_images": 16, "num_points": 900, "max_pairs_per_image": 15, "max_keypoints_per_image": 300}
+    write_workspace(make_scene(SceneOptions(shape="ring", seed=2, **size)), tmp_path / "made")
+    database = tmp_path / "made" / "database.db"
+
+    def with_a_false_loop(*given):
+        found = measure_rotations(*given)
+        turn = Rotation.from_euler("y", 60.0, degrees=True).as_matrix()
+        rotations, counts = found.rotations.copy(), found.num_matches.copy()
+        far = found.pairs[:, 1] - found.pairs[:, 0] == 15
+        assert far.sum() == 1
+        rotations[far], counts[far] = turn, 300
+        # Without pairs between, the first and the last frame are beyond the reach of all.
+        kept = far | (found.pairs[:, 1] - found.pairs[:, 0] <= 3)
+        return dataclasses.replace(found, rotations=rotations, num_matches=counts).subset(kept)
+
+    monkeypatch.setattr("sfm_shapefit.commands.map.measure_rotations", with_a_false_loop)
+    found = sfm_shapefit.map_database(database, sequence="names", **FAST)
+    (loop,) = found.models[0].located.loops
+    names = found.models[0].names
+    assert (loop.first, loop.second, loop.num_refused) == ((names[0],) * 2, (names[15],) * 2, 1)
+    assert [0, 15] not in found.models[0].located.directions.pairs.tolist()
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["loops"][0]["num_refused"] == 1
+    assert "1 refused as the frames between contradict it" in (tmp_path / "out/0/report.html").read_text()
+    assert describe_loops(found.models[0].located.summary()["loops"]).endswith(f"{names[0]} to {names[15]}")
+    blind = sfm_shapefit.map_database(database, sequence="none", **FAST)
+    assert (blind.num_frames, blind.models[0].located.loops) == (0, ())
+    assert [0, 15] in blind.models[0].located.directions.pairs.tolist()
+
+
+def test_a_straight_drive_is_placed_by_points_and_says_how_sure_lengths_are(tmp_path, monkeypatch):
+    drawn = layouts.LAYOUTS["drive"]
+
+    def straight(*given):
+        layout = drawn(*given)
+        return dataclasses.replace(layout, centers=layout.centers * [1.0, 0.0, 0.0] + [0.0, 0.0, 1.5])
+
+    def street(x):
+        along, left = np.tile([[1.0, 0.0, 0.0]], (len(x), 1)), np.tile([[0.0, 1.0, 0.0]], (len(x), 1))
+        return along * x[:, None], along, left
+
+    monkeypatch.setattr(layouts, "street", street)
+    monkeypatch.setitem(layouts.LAYOUTS, "drive", straight)
+    write_workspace(make_scene(SceneOptions(shape="drive", num_images=8, seed=2)), tmp_path / "made")
+    located = sfm_shapefit.map_database(tmp_path / "made" / "database.db").models[0].located
+    errors = sfm_shapefit.evaluate(located.reconstruction, tmp_path / "made" / "sparse" / "0")
+    assert errors.position.max < 0.01 * errors.extent
+    assert 1e-5 < located.line_sigma < 0.01
+    said = describe_line(located.summary()["line_sigma"])
+    assert f"known to {100.0 * located.line_sigma:.2g}% of its length" in said
+
+
+def test_pairs_are_left_out_of_databases_only(tmp_path):
+    listed = tmp_path / "without.txt"
+    listed.write_text("0000.jpg 0001.jpg\n")
+    with pytest.raises(InputError, match="of a database only"):
+        sfm_shapefit.locate(RING / "sparse" / "0", directions="tracks", without=str(listed))
 
 
 def test_components_become_models_of_their_own_and_single_images_are_named(tmp_path):

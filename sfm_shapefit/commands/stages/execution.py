@@ -26,6 +26,7 @@ from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.executors import WorkerError, answers
 from sfm_shapefit.extras import MissingExtraError
+from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.formats.posed_model import PosedModelFile
 
 Measured = TypeVar("Measured")
@@ -59,6 +60,8 @@ class PairTask(Generic[Measured]):
     cameras: PosedModelFile
     """Of the whole model: the indices of pairs refer to them."""
     work: PairWork[Measured]
+    left_out: PairNames = frozenset()
+    """Pairs that are taken for unmatched."""
 
 
 def measure_with_workers(
@@ -78,7 +81,10 @@ def measure_with_workers(
     """
     cameras, path = posed_cameras(model), Path(os.path.abspath(database.path))
     parts = database.parts(work.matches_per_task)
-    tasks = [PairTask(database=path, part=part, cameras=cameras, work=work) for part in parts]
+    tasks = [
+        PairTask(database=path, part=part, cameras=cameras, work=work, left_out=database.left_out)
+        for part in parts
+    ]
     found: list[Measured] = []
     for (_, stop), measured in zip(parts, answers(executor, measure_task, tasks), strict=True):
         found += measured
@@ -89,7 +95,7 @@ def measure_with_workers(
 def measure_task(task: PairTask[Measured]) -> list[Measured]:
     """Return what is measured of a task's pairs, a value per batch; what a worker runs."""
     model = from_posed_cameras(task.cameras)
-    with open_database(task.database, model) as database:
+    with open_database(task.database, model, task.left_out) as database:
         batches = database.iter_matches(task.work.min_matches, part=task.part)
         return [task.work.estimate(batch) for batch in batches]
 

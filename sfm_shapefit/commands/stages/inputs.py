@@ -1,6 +1,6 @@
 """Where matches come from: a database, or the model's own tracks. One place decides, and opens it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +12,7 @@ from sfm_shapefit.colmap.model import PosedModel, track_matches
 from sfm_shapefit.commands.stages.memory import ECONOMIES, Economy, Workload, choose_economy
 from sfm_shapefit.directions.matches import MatchBatch
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.formats.pair_list import read_pair_list
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.results.result import Inputs
 
@@ -89,7 +90,7 @@ def open_source(
     if inputs.database is None:
         yield MatchSource(model=model, kind=inputs.source, database=None)
         return
-    with open_database(inputs.database, model) as database:
+    with open_database(inputs.database, model, inputs.left_out) as database:
         source = MatchSource(model=model, kind=inputs.source, database=database)
         if options is not None and options.max_memory_mb:
             bare = replace(
@@ -100,6 +101,19 @@ def open_source(
             work = replace(bare, has_points=options.uses_points(model.num_images))
             source = source.with_economy(choose_economy(work, bare, options.max_memory_mb))
         yield source
+
+
+def read_left_out(inputs: Inputs, names: Collection[str], options: LocateOptions) -> Inputs:
+    """Return the inputs without the pairs that the user wants to be left out.
+
+    Raises:
+        InputError: if the list cannot be read, names an unknown image, or there is no database.
+    """
+    if not options.without:
+        return inputs
+    if inputs.database is None:
+        raise InputError("pairs can be left out of the matches of a database only; give one with --database")
+    return replace(inputs, left_out=read_pair_list(Path(options.without), names))
 
 
 def choose_inputs(

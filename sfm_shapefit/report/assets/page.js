@@ -70,21 +70,29 @@ const drawFacts = () => {
   const rest = folded(`${counted(unchanged.length, "option")} as by default`, factTable(unchanged));
   fill("options", changed.length ? factTable(changed) : element("p", "None.", "muted"), rest);
 };
-const drawPieces = () => {
-  $("pieces-card").hidden = data.pieces.length < 2;
+const plainTable = (names, rows) => {
   const table = element("table");
   const head = table.createTHead().insertRow();
-  for (const name of ["Piece", "Cameras", "Placed", "Shared with others", "Scale", "Where"]) head.append(element("th", name));
+  for (const name of names) head.append(element("th", name));
   const body = table.createTBody();
-  for (const piece of data.pieces) {
-    const where = piece.folder === "." ? "this folder" : piece.folder || "not written";
-    const texts = [String(piece.number), count(piece.cameras), count(piece.placed), piece.hinges || "none", piece.scale, where];
-    body.insertRow().append(...texts.map((text) => element("td", text)));
-  }
+  for (const texts of rows) body.insertRow().append(...texts.map((text) => element("td", text)));
   const scroll = element("div", "", "scroll");
   scroll.append(table);
-  fill("pieces", scroll);
+  return scroll;
+};
+const drawPieces = () => {
+  $("pieces-card").hidden = data.pieces.length < 2;
+  const rows = data.pieces.map((piece) => {
+    const where = piece.folder === "." ? "this folder" : piece.folder || "not written";
+    return [String(piece.number), count(piece.cameras), count(piece.placed), piece.hinges || "none", piece.scale, where];
+  });
+  fill("pieces", plainTable(["Piece", "Cameras", "Placed", "Shared with others", "Scale", "Where"], rows));
   $("pieces-note").textContent = data.notes.pieces;
+};
+const drawLoops = () => {
+  $("loops-card").hidden = !data.loops.length;
+  fill("loops", plainTable(["From", "To", "Pairs", "Matches", "Off the chain", "What became of it"], data.loops));
+  $("loops-note").textContent = data.notes.loops;
 };
 
 // --- what is chosen --------------------------------------------------------------------------------
@@ -179,6 +187,7 @@ matchMedia("(prefers-color-scheme: dark)").addEventListener("change", recolor);
 drawHead();
 drawFacts();
 drawPieces();
+drawLoops();
 tables = drawTables(select);
 drawDetails();
 $("pairs-note").textContent = data.pairsNote;

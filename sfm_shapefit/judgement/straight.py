@@ -1,0 +1,43 @@
+"""Cameras on one line, as of a straight drive: directions between them say nothing of lengths along it."""
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray
+
+# All but a few directions lie within this angle of the line.
+_MOST_DEG, _SHARE = 1.0, 0.95
+_FEWEST_DIRECTIONS = 3
+
+
+def find_line(directions: FloatArray) -> FloatArray | None:
+    """Return the line, (d,), within a degree of which the unit directions (m, d) lie; None if there is none.
+
+    One in twenty may be off, as wrong directions are.
+    """
+    if len(directions) < _FEWEST_DIRECTIONS:
+        return None
+    _, _, axes = np.linalg.svd(directions, full_matrices=False)
+    line = axes[0]
+    for _ in range(2):  # the second time without those that are far off
+        along = directions @ line
+        across = np.linalg.norm(directions - along[:, None] * line, axis=1)
+        angles_deg = np.degrees(np.arctan2(across, np.abs(along)))
+        near = angles_deg <= np.quantile(angles_deg, _SHARE)
+        line = np.linalg.svd(directions[near], full_matrices=False)[2][0]
+    return line if bool(angles_deg[near].max() <= _MOST_DEG) else None
+
+
+def sigma_along(line: FloatArray, locations: FloatArray, covariances: FloatArray) -> float:
+    """Return the median standard deviation along a line, as a share of the cameras' extent along it.
+
+    Args:
+        line: (d,) unit.
+        locations: (n, d)
+        covariances: (n, d, d) of the locations, NaN where not known.
+    """
+    variances = np.einsum("a,kab,b->k", line, covariances, line)
+    known = np.isfinite(variances) & (variances >= 0.0)
+    extent = float(np.ptp(locations @ line)) if len(locations) else 0.0
+    if not known.any() or extent == 0.0:
+        return float("nan")
+    return float(np.median(np.sqrt(variances[known]))) / extent

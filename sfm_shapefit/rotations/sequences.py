@@ -1,0 +1,272 @@
+"""Videos among the images of a database, and whether their loops are to be believed.
+
+Frames of a video are named by a running number. Those next to one another share most of what they see: such
+pairs are hardly ever false. A pair of frames far apart in time is a loop where the camera came back, or
+repeated structure where it did not.
+
+    reach     of a frame: the last one that strong pairs of it lead to without a gap in time
+    neighbor  a pair within the reach of one of its frames; a loop pair otherwise
+    chain     the rotations averaged over neighbors alone
+    visit     loop pairs whose first frames are near one another in time, and whose second frames are
+
+A loop pair agrees with the chain if its relative rotation is that of the chain within its uncertainty. A
+visit is taken if most of its matches are of pairs that agree, and then only these pairs are: what agrees with
+the chain agrees with one another. Of the pairs refused so, against the truth: castle-P30 33 of 33 are wrong,
+kitti-turn 1 of 1; of those taken on castle-P30, none of 37.
+"""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
+from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.geometry import rotation_angles_deg
+from sfm_shapefit.rotations.average import average_relative_rotations
+from sfm_shapefit.rotations.averaged import AGREEMENT_DEG, AveragedRotations
+from sfm_shapefit.rotations.relative_rotations import RelativeRotations
+from sfm_shapefit.viewgraph import connected_components
+
+_LAST_NUMBER = re.compile(r"^(.*?)(\d+)(\D*)$", re.DOTALL)
+# Fewer images with running numbers are no video.
+_FEWEST_FRAMES = 10
+# Of successive frames, the share that must be matched, and how many times more matches these pairs have than
+# pairs that are farther apart, on average.
+_MATCHED_SHARE, _MORE_MATCHES = 0.8, 2.0
+# Matching takes the next frames, and then some whose distances double: a wider gap ends a frame's reach.
+_STEP, _DOUBLING = 10, 2.0
+# Of the matches of successive frames, the share that extends a frame's reach: with all pairs matched, false
+# ones are at every distance.
+_STRONG_SHARE = 0.1
+# Frames so near in time are of one visit.
+_NEAR = 10
+# Standard deviations that a loop may be off the chain, which drifts so many degrees a frame besides.
+_MOST_SIGMAS, _DRIFT_DEG = 5.0, 0.02
+
+
+class Videos(NamedTuple):
+    """Which images are frames of a video, and when."""
+
+    video_of: IntArray
+    """(n,) its number; -1 for images of none."""
+    time_of: IntArray
+    """(n,) place in its video, from 0; -1 for images of none."""
+
+    @property
+    def num_videos(self) -> int:
+        """Number of videos."""
+        return int(self.video_of.max(initial=-1)) + 1
+
+    @property
+    def num_frames(self) -> int:
+        """Number of images in videos."""
+        return int(np.sum(self.video_of >= 0))
+
+    def subset(self, chosen: BoolArray) -> "Videos":
+        """Return the same with some of the videos only, renumbered."""
+        number = np.where(chosen, np.cumsum(chosen) - 1, -1)
+        video_of = np.where(self.video_of >= 0, number[self.video_of], -1) if len(chosen) else self.video_of
+        return Videos(video_of, np.where(video_of >= 0, self.time_of, -1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Visit:
+    """Loop pairs between two stretches of a video."""
+
+    first: tuple[int, int]
+    """The first and the last image of the earlier stretch."""
+    second: tuple[int, int]
+    """Those of the later one."""
+    num_pairs: int
+    num_matches: int
+    num_refused: int
+    """Of its pairs: all, or those that do not agree with the chain."""
+    angle_deg: float
+    """Median angle between the relative rotations of its pairs and those of the chain."""
+    tolerance_deg: float
+    """Up to where these pairs would agree with the chain, on average."""
+
+    @property
+    def taken(self) -> bool:
+        """Whether any of its pairs is used."""
+        return self.num_refused < self.num_pairs
+
+
+class Loops(NamedTuple):
+    """What became of the loops of all videos."""
+
+    visits: tuple[Visit, ...]
+    """By the time of their first frames."""
+    refused: IntArray
+    """Rows of the pairs that are not to be used."""
+
+
+def find_videos(names: Sequence[str]) -> Videos:
+    """Return the videos that names tell: ten images or more that only differ by their last number."""
+    groups: dict[tuple[str, str], list[tuple[int, int]]] = {}
+    for image, name in enumerate(names):
+        found = _LAST_NUMBER.match(name)
+        if found:
+            groups.setdefault((found[1], found[3]), []).append((int(found[2]), image))
+    video_of, time_of = np.full(len(names), -1), np.full(len(names), -1)
+    frames = [sorted(group) for group in groups.values() if len(group) >= _FEWEST_FRAMES]
+    for video, group in enumerate(frames):
+        rows = [image for _, image in group]
+        video_of[rows], time_of[rows] = video, np.arange(len(rows))
+    return Videos(video_of, time_of)
+
+
+def confirm_videos(videos: Videos, relative: RelativeRotations) -> Videos:
+    """Return those whose successive frames are matched, and better than frames that are farther apart."""
+    confirmed = np.zeros(videos.num_videos, dtype=np.bool_)
+    inside, lags = _lags(videos, relative.pairs)
+    for video in range(videos.num_videos):
+        own = inside & (videos.video_of[relative.pairs[:, 0]] == video)
+        counts, lag = relative.num_matches[own], lags[own]
+        n = int(np.sum(videos.video_of == video))
+        near, num_far = counts[lag == 1], max((n - _NEAR) * (n - _NEAR - 1) // 2, 1)
+        matched = len(near) >= _MATCHED_SHARE * (n - 1)
+        # Frames that are not matched at all count, too: they have no matches.
+        far = float(counts[lag > _NEAR].sum()) / num_far
+        confirmed[video] = matched and float(near.sum()) / (n - 1) >= _MORE_MATCHES * far
+    return videos.subset(confirmed)
+
+
+def judge_loops(videos: Videos, relative: RelativeRotations, threads: int = 1) -> Loops:
+    """Return which loops agree with the chain of neighbors; pairs of other images are not judged.
+
+    Args:
+        videos: among n images.
+        relative: pairs of these.
+        threads: of the averaging.
+    """
+    is_loop = loop_pairs(videos, relative)
+    visits: list[Visit] = []
+    refused = [np.zeros(0, dtype=np.int64)]
+    for video in range(videos.num_videos):
+        rows = np.flatnonzero(videos.video_of[relative.pairs[:, 0]] == video)
+        rows = rows[videos.video_of[relative.pairs[rows, 1]] == video]
+        chain = relative.subset(rows[~is_loop[rows]])
+        loops = rows[is_loop[rows]]
+        if len(loops) == 0 or len(chain.pairs) == 0:
+            continue
+        try:
+            averaged = average_relative_rotations(len(videos.video_of), chain, threads)
+        except UnsolvableError:
+            continue
+        angles, tolerances = _compare(videos, averaged, relative.subset(loops))
+        known = np.isfinite(angles)
+        loops, angles, tolerances = loops[known], angles[known], tolerances[known]
+        found = _judge_visits(videos, relative.subset(loops), angles, tolerances)
+        visits += found[0]
+        refused.append(loops[found[1]])
+    return Loops(tuple(visits), np.sort(np.concatenate(refused)))
+
+
+def loop_pairs(videos: Videos, relative: RelativeRotations) -> BoolArray:
+    """Return which of k pairs join frames of one video beyond the reach of both, (k,)."""
+    pairs = relative.pairs
+    inside, lags = _lags(videos, pairs)
+    strong = relative.are_sound() & (relative.num_matches >= _least_matches(videos, relative))
+    beyond = np.zeros(len(pairs), dtype=np.bool_)
+    beyond[inside] = True
+    for forward in (True, False):
+        # In time, the frame whose reach is looked at comes first or last.
+        order = np.where((videos.time_of[pairs[:, 0]] < videos.time_of[pairs[:, 1]]) == forward, 0, 1)
+        frames = pairs[np.arange(len(pairs)), order]
+        rows = np.flatnonzero(inside)
+        rows = rows[np.lexsort((lags[rows], frames[rows]))]
+        reach = frame = -1
+        for row, lag in zip(rows.tolist(), lags[rows].tolist(), strict=True):
+            if frames[row] != frame:
+                frame, reach = int(frames[row]), 0
+            if lag <= max(_DOUBLING * reach, reach + _STEP):
+                reach = lag if strong[row] else reach
+                beyond[row] = False
+    return beyond
+
+
+def _least_matches(videos: Videos, relative: RelativeRotations) -> FloatArray:
+    """Return how many matches make a pair of a video strong, (k,): a share of those of successive frames."""
+    inside, lags = _lags(videos, relative.pairs)
+    video = videos.video_of[relative.pairs[:, 0]]
+    least = np.zeros(len(video))
+    for k in range(videos.num_videos):
+        near = inside & (video == k) & (lags == 1)
+        if near.any():
+            least[video == k] = _STRONG_SHARE * float(np.median(relative.num_matches[near]))
+    return least
+
+
+def _lags(videos: Videos, pairs: IntArray) -> tuple[BoolArray, IntArray]:
+    """Return which pairs are of one video, and how many frames they are apart, (k,) each."""
+    i, j = pairs.T
+    inside = (videos.video_of[i] == videos.video_of[j]) & (videos.video_of[i] >= 0)
+    return np.asarray(inside), np.abs(videos.time_of[i] - videos.time_of[j])
+
+
+def _compare(
+    videos: Videos, averaged: AveragedRotations, loops: RelativeRotations
+) -> tuple[FloatArray, FloatArray]:
+    """Return by how many degrees loops are off the chain, NaN where it ends, and by how many they may be."""
+    i, j = loops.pairs.T
+    predicted = averaged.rotations[j] @ averaged.rotations[i].transpose(0, 2, 1)
+    angles = rotation_angles_deg(loops.rotations.transpose(0, 2, 1) @ predicted)
+    variances = averaged.sigmas_deg[i] ** 2 + averaged.sigmas_deg[j] ** 2
+    _, lags = _lags(videos, loops.pairs)
+    tolerances = np.maximum(AGREEMENT_DEG, _MOST_SIGMAS * np.sqrt(variances)) + _DRIFT_DEG * lags
+    known = averaged.registered[i] & averaged.registered[j] & np.isfinite(tolerances)
+    return np.where(known, angles, np.nan), tolerances
+
+
+def _judge_visits(
+    videos: Videos, loops: RelativeRotations, angles: FloatArray, tolerances: FloatArray
+) -> tuple[list[Visit], BoolArray]:
+    """Return the visits of a video, and which of its loop pairs are refused."""
+    refused, visits = angles > tolerances, []
+    if len(loops.pairs) == 0:
+        return [], refused
+    times = np.sort(videos.time_of[loops.pairs], axis=1)
+    label = _group(times)
+    for visit in range(int(label.max()) + 1):
+        rows = np.flatnonzero(label == visit)
+        counts = loops.num_matches[rows]
+        if 2 * counts[~refused[rows]].sum() <= counts.sum():
+            refused[rows] = True
+        ends = np.sort(times[rows], axis=0)[[0, -1]]
+        image_at = dict(zip(times[rows].ravel().tolist(), _by_time(videos, loops.pairs[rows]), strict=True))
+        (a, b), (c, d) = ends.T.tolist()
+        visits.append(
+            Visit(
+                first=(image_at[a], image_at[b]),
+                second=(image_at[c], image_at[d]),
+                num_pairs=len(rows),
+                num_matches=int(counts.sum()),
+                num_refused=int(refused[rows].sum()),
+                angle_deg=float(np.median(angles[rows])),
+                tolerance_deg=float(np.mean(tolerances[rows])),
+            )
+        )
+    return sorted(visits, key=lambda visit: visit.first), refused
+
+
+def _by_time(videos: Videos, pairs: IntArray) -> list[int]:
+    """Return the images of pairs, the earlier one of each first."""
+    times = videos.time_of[pairs]
+    return [int(k) for k in np.take_along_axis(pairs, np.argsort(times, axis=1), axis=1).ravel()]
+
+
+def _group(times: IntArray) -> IntArray:
+    """Return the visit of each loop pair by the times (k, 2) of its frames, (k,)."""
+    order = np.lexsort((times[:, 1], times[:, 0]))
+    links, first = [], 0
+    for place, row in enumerate(order.tolist()):
+        while times[row, 0] - times[order[first], 0] > _NEAR:
+            first += 1
+        near = order[first:place]
+        links += [(other, row) for other in near[np.abs(times[near, 1] - times[row, 1]) <= _NEAR].tolist()]
+    joined = np.array(links, dtype=np.int64).reshape(-1, 2)
+    return connected_components(len(times), joined)
