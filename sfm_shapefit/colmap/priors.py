@@ -19,6 +19,7 @@ from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, text_of
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import Datum, PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -140,9 +141,7 @@ def _priors(
             f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
     return PositionPriors(
-        cameras=np.array(cameras, dtype=np.int64),
-        positions=positions,
-        covariances=covariances,
+        known=KnownPositions.measured(np.array(cameras, dtype=np.int64), positions, covariances),
         statement=statement,
         datum=datum,
     )

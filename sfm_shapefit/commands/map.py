@@ -238,7 +238,7 @@ class _Run(NamedTuple):
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
         priors = None if self.priors is None else self.priors.of(members)
-        if priors is not None and len(priors.cameras) < FEWEST_PRIORS:
+        if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)

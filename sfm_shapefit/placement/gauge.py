@@ -21,6 +21,7 @@ from sfm_shapefit.geometry import (
     median_spread,
     rotation_angles_deg,
 )
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.refinement.options import Scale
 
 # An input center that is farther off, of the spread of all, is lost and must not set the scale.
@@ -76,12 +77,8 @@ class Gauge:
 class PositionPriors:
     """Measured positions of some cameras, such as GPS, in axes and units of their own."""
 
-    cameras: IntArray
-    """(k,) whose they are, ascending indices without repetition."""
-    positions: FloatArray
-    """(k, 3)"""
-    covariances: FloatArray
-    """(k, 3, 3), in the positions' units squared; NaN where unknown."""
+    known: KnownPositions
+    """By camera."""
     statement: str
     """Where they come from, and what their axes are."""
     datum: Datum | None = None
@@ -89,10 +86,11 @@ class PositionPriors:
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
-        _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
-        return replace(
-            self, cameras=places, positions=self.positions[rows], covariances=self.covariances[rows]
-        )
+        return replace(self, known=self.known.among(cameras))
+
+    def __len__(self) -> int:
+        """Return how many cameras have one."""
+        return len(self.known.indices)
 
 
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
@@ -201,12 +199,12 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
     """
-    if len(priors.cameras) < FEWEST_PRIORS:
+    if len(priors) < FEWEST_PRIORS:
         raise InputError(
-            f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
+            f"{len(priors)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
         )
-    source, target = locations[priors.cameras], priors.positions
+    source, target = locations[priors.known.indices], priors.known.positions
     size = median_spread(target)
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise InputError("the position priors coincide, so they set no scale; choose another scale")
@@ -258,10 +256,9 @@ def _fit_to_priors(
     source: FloatArray, priors: PositionPriors, size: float, *, rotate: bool
 ) -> tuple[Similarity, FloatArray, float]:
     """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals."""
-    target = priors.positions
+    target = priors.known.positions
     found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
-    sigmas = np.sqrt(np.trace(priors.covariances, axis1=1, axis2=2) / 3.0)
-    sigmas = np.where(np.isfinite(sigmas), sigmas, 0.0)
+    sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)
     weights = np.ones(len(source))
     level = 0.0
     for _ in range(_REWEIGHTINGS):

@@ -12,8 +12,9 @@ from sfm_shapefit import InputError, locate
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
-from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
+from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.program import run, run_refused
@@ -30,9 +31,9 @@ def cameras(seed, n=12):
 def priors_of(positions, sigma=np.nan, rows=None):
     rows = np.arange(len(positions)) if rows is None else np.asarray(rows)
     return PositionPriors(
-        cameras=rows,
-        positions=positions[rows],
-        covariances=np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3)),
+        known=KnownPositions.measured(
+            rows, positions[rows], np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3))
+        ),
         statement="a test",
     )
 
@@ -146,11 +147,11 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
     path = tmp_path / "priors.txt"
     for sep in (" ", ","):
         write_table(path, ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep)
-        found = table_priors(path, ring)
+        found = table_priors(path, ring).known
         np.testing.assert_array_equal(found.positions, ring.centers)
-        assert np.isnan(found.covariances).all()
+        assert np.isnan(found.information).all()
     path.write_text(f"name,x,y,z,sx,sy,sz\n{ring.names[0]},1,2,3,0.5,0.25,2\n")
-    np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
+    np.testing.assert_array_equal(table_priors(path, ring).known.information, [np.diag([4.0, 16.0, 0.25])])
 
     names = ring.names[:3]
     path.write_text(
@@ -158,7 +159,7 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
     )
     priors = table_priors(path, ring)
     assert priors.datum == (48.0, 11.0, 500.0)  # medians of the three
-    found = priors.positions
+    found = priors.known.positions
     # WGS84 at 48 N: a degree of longitude is 74628 m, of latitude 111200 m.
     np.testing.assert_allclose(found[1] - found[0], [74.628, 0.0, 0.0], atol=2e-2)
     np.testing.assert_allclose(found[2] - found[0], [0.0, 111.20, 10.0], atol=2e-2)
@@ -232,15 +233,17 @@ def test_priors_of_a_database_of_any_version_are_read(ring, tmp_path, schema):
     rows = [
         (9, "0003.jpg", [1, 2, 3], np.diag([1.0, 4.0, 9.0]).ravel(), 1),
         (4, "0001.jpg", [4, 5, 6], None, 1),
+        (3, "0002.jpg", [4, 5, 7], np.zeros(9), 1),  # what is not positive definite is not known
     ]
-    rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0002.jpg", [np.nan, 0, 0], None, 1)]
-    found = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring)
+    rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0004.jpg", [np.nan, 0, 0], None, 1)]
+    known = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring).known
     by_name = {
-        ring.names[k]: p.tolist() for k, p in zip(found.cameras.tolist(), found.positions, strict=True)
+        ring.names[k]: p.tolist() for k, p in zip(known.indices.tolist(), known.positions, strict=True)
     }
-    assert by_name == {"0003.jpg": [1, 2, 3], "0001.jpg": [4, 5, 6]}
-    third = [ring.names[k] for k in found.cameras.tolist()].index("0003.jpg")
-    np.testing.assert_array_equal(found.covariances[third], np.diag([1.0, 4.0, 9.0]))
+    assert by_name == {"0003.jpg": [1, 2, 3], "0001.jpg": [4, 5, 6], "0002.jpg": [4, 5, 7]}
+    assert np.isfinite(known.information).all(axis=(1, 2)).sum() == 1
+    third = [ring.names[k] for k in known.indices.tolist()].index("0003.jpg")
+    np.testing.assert_array_equal(known.information[third], np.diag([1.0, 1.0 / 4.0, 1.0 / 9.0]))
 
 
 def test_a_database_without_usable_priors_is_refused(ring, tmp_path):
@@ -306,7 +309,7 @@ def drive(sigma):
     start = gauge.similarity.apply(found.locations)
     if gauge.axes is not None:
         positions, truth = positions @ gauge.axes, truth @ gauge.axes
-    anchors = Anchors(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
+    anchors = KnownPositions(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
     return (graph, start, metric, found.levels_rad), start, truth, anchors
 
 
