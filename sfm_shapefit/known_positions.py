@@ -4,7 +4,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 
 
 class KnownPositions(NamedTuple):
@@ -31,8 +31,12 @@ class KnownPositions(NamedTuple):
     def among(self, members: IntArray) -> Self:
         """Return those of some members (n,), ascending, numbered by their place among these."""
         _, rows, places = np.intersect1d(self.indices, members, assume_unique=True, return_indices=True)
+        return self.subset(rows)._replace(indices=places)
+
+    def subset(self, rows: IntArray | BoolArray) -> Self:
+        """Return the given ones, in that order."""
         return self._replace(
-            indices=places, positions=self.positions[rows], information=self.information[rows]
+            indices=self.indices[rows], positions=self.positions[rows], information=self.information[rows]
         )
 
     def sigmas(self) -> FloatArray:

@@ -18,6 +18,7 @@ Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 Relative = Literal["matches", "stored"]
 Refined = Literal["auto", "focal", "all", "none"]
+Join = Literal["never", "safe"]
 
 LEAST_MATCHES = 15
 """Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
@@ -212,6 +213,11 @@ class MapOptions(LocateOptions):
         "averaging then tries 15, 20, 30, 50 and 80 and keeps the rotations that agree with most matches.",
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
+    join: Join = option(
+        "safe",
+        'Models that stand apart: "safe" joins those that position priors or points seen by both tie '
+        'together beyond doubt, with a standard deviation, into a further folder; "never" joins none.',
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

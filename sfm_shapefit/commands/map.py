@@ -28,12 +28,13 @@ from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
+from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
-from sfm_shapefit.results.map_result import MappedModel, MapResult
+from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
@@ -97,32 +98,39 @@ def map_database(
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
-            found = run.locate_component(members, averaging)
+            located = run.locate_component(members, averaging)
         except UnsolvableError as error:
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
-        models.append(MappedModel(located=found, averaging=averaging, names=names))
+        models.append(MappedModel(located=located, averaging=averaging, names=names))
         for k in frames.tolist():
             del reasons[k]
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
+    found = JoinedModels((), ())
+    if options.join == "safe":
+        with clock("join"):
+            found = join_models(models, unposed, path, positions)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(unposed.names, frame_of_image.tolist(), strict=True)
         if frame in reasons
     }
-    return MapResult(
+    result = MapResult(
         database=path,
         options=options,
         models=tuple(models),
+        joins=found.joins,
+        joined=found.joined,
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
         left_out=left_out,
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
     )
+    return tell_joins(result)
 
 
 def database_in(path: Path) -> Path:

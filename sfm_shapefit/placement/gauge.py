@@ -209,11 +209,11 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise InputError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
-    found, weights, level = _fit_to_priors(source, priors, size, rotate=turns)
+    found, weights, level = fit_to_priors(source, priors, size, rotate=turns)
     across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
-        found, weights, level = _fit_to_priors(source, priors, size, rotate=False)
+        found, weights, level = fit_to_priors(source, priors, size, rotate=False)
     if found.scale <= 0.0:
         raise InputError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
@@ -252,10 +252,17 @@ def _keep_axes(scale: float, shift: FloatArray) -> Similarity:
     return Similarity(scale=scale, rotation=np.eye(3), translation=shift)
 
 
-def _fit_to_priors(
+def fit_to_priors(
     source: FloatArray, priors: PositionPriors, size: float, *, rotate: bool
 ) -> tuple[Similarity, FloatArray, float]:
-    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals."""
+    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals.
+
+    Args:
+        source: (k, 3) the locations of the cameras that have a prior.
+        priors: theirs.
+        size: the spread of the priors.
+        rotate: whether the axes are to be found too.
+    """
     target = priors.known.positions
     found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
     sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)

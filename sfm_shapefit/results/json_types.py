@@ -228,6 +228,32 @@ class Agreement(TypedDict):
     ]
 
 
+class Alignment(TypedDict):
+    """A similarity of the world: scale * rotation @ center + translation."""
+
+    scale: Annotated[float, "Units of the one world in one of the other."]
+    rotation: Annotated[list[list[float]], "3 rows."]
+    translation: Annotated[list[float], "In units of the world that is mapped to."]
+
+
+class Join(TypedDict):
+    """A model of `map` beside the largest, and what came of joining it to a larger one."""
+
+    model: Annotated[str, "Its folder."]
+    to: Annotated[str, "The folder of the model that it was to be joined to."]
+    joined: Annotated[bool, "Whether it was."]
+    folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."]
+    statement: Annotated[str, "How and how surely, or why not, in words."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."]
+    turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."]
+    center_sigma: Annotated[
+        float | None,
+        "Standard deviation of where its cameras come to lie, median, in units of the model that it is "
+        "joined to.",
+    ]
+    similarity: Annotated[Alignment | None, "From its world to that of the model that it is joined to."]
+
+
 class LocateSummary(PlacementSummary):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
 
@@ -256,6 +282,7 @@ class LocateSummary(PlacementSummary):
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
+    join: Annotated[Join | None, "Of a model of `map` beside the largest; else null."]
 
 
 class GraphInputs(TypedDict):
@@ -314,6 +341,7 @@ class MapSummary(TypedDict):
     num_placed: Annotated[int, "Cameras in all models."]
     num_pairs: Annotated[int, "Pairs with a relative rotation."]
     models: Annotated[list[Model], "One per connected component, most cameras first."]
+    joins: Annotated[list[Join], "What came of joining the models; one for each but the largest."]
     left_out: Annotated[dict[str, str], "Images in no model, and why."]
     timings_s: Timings
     warnings: Warnings
@@ -337,14 +365,6 @@ class InspectSummary(TypedDict):
     theory: Annotated[dict[str, Any] | None, "Constants of the recovery theorems, if asked for."]
     expected: Annotated[Expected | None, "What locate will take; null for a bare graph."]
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
-
-
-class Alignment(TypedDict):
-    """The robust similarity of the centers: scale * rotation @ center + translation."""
-
-    scale: Annotated[float, "The reference's units in one of the model."]
-    rotation: Annotated[list[list[float]], "3 rows."]
-    translation: Annotated[list[float], "In the reference's units."]
 
 
 class WorstCamera(TypedDict):

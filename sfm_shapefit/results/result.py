@@ -23,7 +23,7 @@ from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
 from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
 from sfm_shapefit.results.intrinsics import Intrinsics
-from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
+from sfm_shapefit.results.json_types import GraphSummary, Join, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
@@ -103,6 +103,8 @@ class LocateResult(Displayed):
 
     intrinsics: Intrinsics = field(default_factory=Intrinsics)
     """Cameras whose intrinsics were in doubt, and what became of them."""
+    join: Join | None = None
+    """What came of joining it to a larger model of `map`."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""

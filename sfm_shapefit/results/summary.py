@@ -75,6 +75,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),
+        "join": found.join,
     }
 
 
