@@ -347,6 +347,23 @@ class MapSummary(TypedDict):
     warnings: Warnings
 
 
+class PositionsSummary(TypedDict):
+    """What `sfm-shapefit evaluate --json` prints against a table of known positions."""
+
+    statement: Annotated[str, "What is compared with what, in words."]
+    num_reference: Annotated[int, "Cameras of the table."]
+    num_common: Annotated[int, "Cameras of both, by name."]
+    missing: Annotated[list[str], "Names of the cameras that the model lacks."]
+    position_error: Annotated[
+        ErrorSummary | None, "As they stand, in the table's units; null if the model has no datum."
+    ]
+    median_offset: Annotated[
+        list[float] | None, "Model minus table as they stand, the median of each axis; else null."
+    ]
+    aligned_position_error: Annotated[ErrorSummary, "After the robust similarity that fits best."]
+    ref_from_model: Annotated[Alignment, "From the model's world to the table's."]
+
+
 class Expected(TypedDict):
     """The memory that `locate` will take."""
 

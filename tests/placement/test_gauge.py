@@ -313,6 +313,35 @@ def drive(sigma):
     return (graph, start, metric, found.levels_rad), start, truth, anchors
 
 
+def test_a_model_with_a_datum_is_compared_with_latitudes_where_they_stand(ring, tmp_path):
+    """A degree of latitude is 111.20 m at 48 N, one of longitude 74.628 m a thousandth."""
+    degrees = ring.centers / [74628.0, 111200.0, 1.0]
+    table = tmp_path / "gps.csv"
+    rows = [
+        f"{n},{48.0 + y},{11.0 + x},{500.0 + z}" for n, (x, y, z) in zip(ring.names, degrees, strict=True)
+    ]
+    table.write_text("\n".join(["name,lat,lon,alt", *rows]))
+    run("locate", RING_MODEL, tmp_path / "out", "--priors", table, "--no-report")
+    facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
+    assert facts["num_common"] == len(ring.names)
+    assert facts["position_error"]["max"] < 0.01
+    higher = [f"{row.rsplit(',', 1)[0]},{float(row.rsplit(',', 1)[1]) - 2.0}" for row in rows]
+    table.write_text("\n".join(["name,lat,lon,alt", *higher]))
+    facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
+    np.testing.assert_allclose(facts["median_offset"], [0.0, 0.0, 2.0], atol=0.01)
+    assert facts["aligned_position_error"]["max"] < 0.01
+    without = json.loads(run("evaluate", RING_MODEL, table, "--json").stdout)
+    assert without["position_error"] is None
+    assert without["aligned_position_error"]["max"] < 0.01
+    shown = run("evaluate", RING_MODEL, table, "--csv", tmp_path / "errors.csv").output
+    assert "no datum" in shown
+    assert len((tmp_path / "errors.csv").read_text().splitlines()) == 1 + len(ring.names)
+    assert "leave these out" in run("evaluate", RING_MODEL, table, "--trajectory", code=3).output
+    write_table(tmp_path / "xyz.txt", ring, ring.centers + 1.0)
+    plain = json.loads(run("evaluate", RING_MODEL, tmp_path / "xyz.txt", "--json").stdout)
+    np.testing.assert_allclose(plain["median_offset"], [-1.0, -1.0, -1.0], atol=1e-9)
+
+
 def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
     rng = np.random.default_rng(3)
     sigma = 0.01
