@@ -275,20 +275,16 @@ class _Run(NamedTuple):
     def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
         """Return the options of one component, whose scale is what is known of its own images."""
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
-        known = self.options.known_distance
-        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
-            # The known distance belongs to another component.
-            known, settings["known_distance"] = None, None
-            settings["scale"] = "auto"
+        names = {self.unposed.names[k] for k in members.tolist()}
+        # Other known distances belong to other components.
+        known = tuple(one for one in self.options.known_distance if {*one[:2]} <= names)
+        if len(known) < len(self.options.known_distance):
+            settings["known_distance"] = known
+            settings["scale"] = settings["scale"] if known else "auto"
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
-        if (
-            known is None
-            and not has_priors
-            and not has_rigs
-            and settings["scale"] in ("auto", "input", "prior")
-        ):
+        if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)

@@ -5,6 +5,7 @@ the input's. A gauge is a scale and a shift of the centers and, with position pr
 whole model onto their axes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -15,6 +16,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     MEDIAN_NORMAL_LENGTH,
     METRIC_SIGMA,
+    SIGMA_PER_MEDIAN,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
@@ -164,25 +166,59 @@ def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:
     return Gauge(similarity=_keep_axes(scale, -scale * centroid), scale="unit", statement=statement)
 
 
-def distance_gauge(locations: FloatArray, first: int, second: int, distance: float, names: str) -> Gauge:
-    """Return the gauge in which two cameras are so far apart; origin: the centroid.
+def distance_gauge(
+    locations: FloatArray, pairs: IntArray, distances: FloatArray, names: Sequence[str]
+) -> Gauge:
+    """Return the gauge in which cameras are so far apart; origin: the centroid.
+
+    One distance becomes true. Of several the scale is the robust least-squares fit to all, weights
+    1 / (1 + (residual / 3 levels)^4), from the median of what each says alone.
 
     Args:
         locations: (n, 3) the solver's answer.
-        first, second: two of the cameras.
-        distance: their distance in the output's units, positive.
-        names: the two cameras, for the statement.
+        pairs: (k, 2) cameras, k >= 1.
+        distances: (k,) of each pair in the output's units, positive.
+        names: (k,) the cameras of each pair, for the statement.
 
     Raises:
-        InputError: if the two cameras coincide in the answer.
+        InputError: if the cameras of a pair coincide in the answer.
     """
-    apart = float(np.linalg.norm(locations[first] - locations[second]))
-    if apart <= _COINCIDENT * median_spread(locations):
-        raise InputError(f"the cameras {names} coincide, so their distance sets no scale; choose two others")
-    scale = distance / apart
+    apart = np.linalg.norm(locations[pairs[:, 0]] - locations[pairs[:, 1]], axis=1)
+    near = apart <= _COINCIDENT * median_spread(locations)
+    if near.any():
+        name = names[int(np.argmax(near))]
+        raise InputError(f"the cameras {name} coincide, so their distance sets no scale; choose two others")
+    scale, weights, sigma = _scale_of_distances(apart, distances)
+    residuals = scale * apart - distances
+    said = f"{names[0]} are {distances[0]:g} apart"
+    if len(distances) > 1:
+        worst = int(np.argmax(np.abs(residuals)))
+        said = (
+            f"{int(np.sum(weights >= 0.5))} of {len(distances)} known distances agree, on a scale known to "
+            f"{100.0 * sigma:.2g} %; {names[worst]} miss theirs most, by {residuals[worst]:.3g}"
+        )
     similarity = _keep_axes(scale, -scale * locations.mean(axis=0))
-    statement = f"distance: {names} are {distance:g} apart; origin: the cameras' centroid, axes: the input's"
-    return Gauge(similarity=similarity, scale="distance", statement=statement)
+    statement = f"distance: {said}; origin: the cameras' centroid, axes: the input's"
+    return Gauge(
+        similarity=similarity,
+        scale="distance",
+        statement=statement,
+        scale_sigma=sigma if len(distances) > 1 else None,
+        warning=f"the known distances contradict one another: {said}" if sigma > METRIC_SIGMA else "",
+    )
+
+
+def _scale_of_distances(apart: FloatArray, distances: FloatArray) -> tuple[float, FloatArray, float]:
+    """Return the scale, the weight of each distance in [0, 1], and the relative standard deviation."""
+    scale, weights = float(np.median(distances / apart)), np.ones(len(apart))
+    level = SIGMA_PER_MEDIAN * float(np.median(np.abs(scale * apart - distances)))
+    spread = max(level, 1e-12 * float(distances.max()))
+    for _ in range(_REWEIGHTINGS):
+        weights = 1.0 / (1.0 + ((scale * apart - distances) / (_KERNEL_WIDTH * spread)) ** 4)
+        scale = float(weights * apart @ distances / (weights * apart @ apart))
+    left = max(float(weights.sum()) - 1.0, 1e-3)
+    variance = float(weights @ (scale * apart - distances) ** 2) / left
+    return scale, weights, float(np.sqrt(variance / (weights * apart @ apart))) / scale
 
 
 def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:

@@ -228,6 +228,15 @@ class Agreement(TypedDict):
     ]
 
 
+class KnownDistance(TypedDict):
+    """A distance that was told."""
+
+    first: Annotated[str, "Name of an image."]
+    second: Annotated[str, "Name of another."]
+    known: Annotated[float, "How far apart they are, as told."]
+    found: Annotated[float | None, "In the output; null if one of them is not in it."]
+
+
 class Alignment(TypedDict):
     """A similarity of the world: scale * rotation @ center + translation."""
 
@@ -274,6 +283,7 @@ class LocateSummary(PlacementSummary):
     scale_sigma: Annotated[
         float | None, "Relative standard deviation of a scale that rigs or priors tell; else null."
     ]
+    known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[

@@ -65,12 +65,12 @@ def test_without_input_centers_or_with_contradicting_ones_the_scale_is_unit(cent
 
 def test_a_known_distance_becomes_true():
     t = cameras(1)
-    placed = distance_gauge(t, 3, 7, 12.5, "a and b").apply(t)
+    placed = distance_gauge(t, np.array([[3, 7]]), np.array([12.5]), ["a and b"]).apply(t)
     assert np.linalg.norm(placed[3] - placed[7]) == pytest.approx(12.5, rel=1e-14)
     np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-13)
     t[4] = t[5]  # cameras at one place
     with pytest.raises(InputError, match="a and b coincide"):
-        distance_gauge(t, 4, 5, 1.0, "a and b")
+        distance_gauge(t, np.array([[4, 5]]), np.ones(1), ["a and b"])
 
 
 def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_image(tmp_path):
@@ -82,6 +82,42 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
     assert "0003.jpg and 0007.jpg are 42.5 apart" in json.loads(result.stdout)["scale"]
     unknown = ("--known-distance", "0003.jpg", "x.jpg", "1")
     assert "no posed image x.jpg" in run_refused("locate", RING_MODEL, tmp_path / "none", *unknown)
+
+
+def test_several_known_distances_are_fitted_robustly_and_say_how_well():
+    rng = np.random.default_rng(2)
+    ratios = []
+    for seed in range(20):
+        t = cameras(seed)
+        pairs = rng.permuted(np.tile(np.arange(12), (8, 1)), axis=1)[:, :2]
+        distances = 4.0 * np.linalg.norm(t[pairs[:, 0]] - t[pairs[:, 1]], axis=1)
+        distances = distances + 0.02 * rng.standard_normal(8)
+        distances[5] *= 3.0  # read in feet
+        gauge = distance_gauge(t, pairs, distances, [str(k) for k in range(8)])
+        assert "5 miss theirs most" in gauge.statement
+        ratios.append((gauge.similarity.scale / 4.0 - 1.0) / gauge.scale_sigma)
+    assert 0.3 < np.median(np.abs(ratios)) < 1.5  # 0.67 where the deviation is known exactly
+    both = np.array([[0, 1], [2, 3]])
+    apart = np.linalg.norm(t[both[:, 0]] - t[both[:, 1]], axis=1)
+    assert "contradict" in distance_gauge(t, both, apart * [1.0, 2.0], ["a", "b"]).warning
+
+
+def test_locate_takes_several_known_distances_and_tells_each(ring, tmp_path):
+    told = [(1, 4, 1.0), (2, 7, 1.0), (3, 6, 1.0), (0, 5, 2.0)]
+    flags, known = [], []
+    for i, j, factor in told:
+        known.append(factor * 3.0 * np.linalg.norm(ring.centers[i] - ring.centers[j]))
+        flags += ["--known-distance", ring.names[i], ring.names[j], known[-1]]
+    facts = json.loads(run("locate", RING_MODEL, tmp_path / "out", "--json", "--no-report", *flags).stdout)
+    assert "3 of 4 known distances agree" in facts["scale"]
+    found = [row["found"] for row in facts["known_distances"]]
+    np.testing.assert_allclose(found[:3], known[:3], rtol=1e-4)
+    np.testing.assert_allclose(found[3], known[3] / 2.0, rtol=1e-4)
+    options = tmp_path / "options.toml"
+    rows = [[ring.names[i], ring.names[j], k] for (i, j, _), k in zip(told, known, strict=True)]
+    options.write_text(f"known_distance = {json.dumps(rows)}")
+    again = json.loads(run("locate", RING_MODEL, tmp_path / "two", "--json", "--config", options).stdout)
+    assert again["known_distances"] == facts["known_distances"]
 
 
 def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_stay():
