@@ -18,6 +18,7 @@ from sfm_shapefit.judgement.focal_lengths import FocalDoubt
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
@@ -93,6 +94,9 @@ class LocateResult(Displayed):
     """(n,) images that stay exactly where the input has them; None if that was not asked for."""
     triplet_scores: FloatArray | None = None
     """(m,) of each of the `directions`, NaN where a pair has none; None where `map` did not average."""
+    prior_angles: PriorAngles | None = None
+    """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
+    that set the axes."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
     agreeing_observations: float = math.nan
@@ -225,10 +229,13 @@ class LocateResult(Displayed):
                 strict=True,
             )
         ]
-        if self.triplet_scores is None:
-            return rows
-        scores = self.triplet_scores.tolist()
-        return [replace(row, triplet_score=score) for row, score in zip(rows, scores, strict=True)]
+        if self.triplet_scores is not None:
+            scores = self.triplet_scores.tolist()
+            rows = [replace(row, triplet_score=score) for row, score in zip(rows, scores, strict=True)]
+        if self.prior_angles is not None:
+            angles = self.prior_angles.angles_deg.tolist()
+            rows = [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
+        return rows
 
 
 def _turn(row: PairRow, axes: FloatArray | None) -> PairRow:

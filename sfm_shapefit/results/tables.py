@@ -72,6 +72,8 @@ class PairRow:
     triplet_score: float = math.nan
     """Weighted share of the triangles of relative rotations that close with it; only where `map` averaged and
     the pair is in a triangle. A low one is a sign of repeated structure."""
+    prior_angle_deg: float = math.nan
+    """Angle between the direction and the baseline of the position priors, where both cameras have one."""
 
 
 Row = TypeVar("Row", CameraRow, PairRow)
@@ -85,7 +87,7 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
-_ADDED_COLUMNS = {"triplet_score"}
+_ADDED_COLUMNS = {"triplet_score", "prior_angle_deg"}
 """What earlier outputs lack."""
 
 

@@ -1,5 +1,6 @@
 """Scale, origin and axes: of the input's centers, of a known distance, of position priors."""
 
+import csv
 import json
 import sqlite3
 
@@ -14,8 +15,10 @@ from sfm_shapefit.colmap.priors import database_priors, table_priors
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
+from sfm_shapefit.placement.prior_pairs import compare_with_priors
 from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.results.warnings import prior_warnings
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.program import run, run_refused
 from tests.scenes import RING
@@ -361,6 +364,8 @@ def test_a_model_with_a_datum_is_compared_with_latitudes_where_they_stand(ring, 
     facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
     assert facts["num_common"] == len(ring.names)
     assert facts["position_error"]["max"] < 0.01
+    with (tmp_path / "out" / "pairs.csv").open() as lines:
+        assert all(float(row["prior_angle_deg"]) < 0.1 for row in csv.DictReader(lines))
     higher = [f"{row.rsplit(',', 1)[0]},{float(row.rsplit(',', 1)[1]) - 2.0}" for row in rows]
     table.write_text("\n".join(["name,lat,lon,alt", *higher]))
     facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
@@ -394,3 +399,25 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
         centers = {image.name: image.projection_center() for image in model.images.values()}
         off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
     assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+
+
+def test_pairs_that_contradict_the_baselines_of_priors_are_named():
+    rng = np.random.default_rng(4)
+    t = cameras(4)
+    truth = 5.0 * t @ TURN.T
+    priors = priors_of(truth + 0.02 * rng.standard_normal(truth.shape), 0.02, rows=np.arange(10))
+    gauge = prior_gauge(t, priors)
+    pairs = np.array([(i, j) for i in range(12) for j in range(i)])
+    directions = normalized(t[pairs[:, 0]] - t[pairs[:, 1]])
+    directions[7] = normalized(np.cross(directions[7], directions[8]))
+    directions[9] = np.nan
+    found = compare_with_priors(pairs, directions, priors, gauge, gauge.apply(t))
+    without = (pairs >= 10).any(axis=1)
+    without[9] = True
+    np.testing.assert_array_equal(np.isnan(found.angles_deg), without)
+    assert np.flatnonzero(found.contradicting).tolist() == [7]
+    assert found.angles_deg[7] == pytest.approx(90.0, abs=2.0)
+    (sentence,) = prior_warnings(found, pairs, [f"{k}.jpg" for k in range(12)])
+    i, j = pairs[7]
+    assert f"1 of {int((~without).sum())} pairs contradict" in sentence
+    assert f"that of {i}.jpg and {j}.jpg most, by 90 deg" in sentence
