@@ -37,8 +37,9 @@ PriorsFile = Annotated[
     Path | None,
     typer.Option(
         "--priors",
-        metavar="FILE",
-        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+        metavar="FILE|FOLDER",
+        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; or the "
+        "folder of the images, for the GPS positions of their EXIF data.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]

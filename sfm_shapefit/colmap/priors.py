@@ -1,4 +1,4 @@
-"""Position priors of cameras: the pose priors of a COLMAP database, or a table of names and positions.
+"""Position priors of cameras: pose priors of a COLMAP database, a table of names and positions, or EXIF data.
 
 Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
 north and up of their median. Their covariances are taken as meters squared in those axes.
@@ -80,6 +80,31 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
     if not found:
         raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
     return _priors(found, f"{len(found)} positions of {path}", geodetic=geodetic)
+
+
+def exif_priors(folder: Path, model: PosedModel) -> PositionPriors:
+    """Read the GPS positions that the EXIF data of the model's images have, by pycolmap's own reader.
+
+    A position without altitude has that of the median.
+
+    Raises:
+        InputError: if no image of the model in the folder has a position.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for index, name in enumerate(model.names):
+        bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
+        if bitmap is not None:
+            read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
+            position = np.array([np.nan if value is None else value for value in read])
+            if np.isfinite(position[:2]).all():
+                found[index] = position, np.full((3, 3), np.nan)
+    if not found:
+        raise InputError(f"{folder} has no image of the model with a GPS position in its EXIF data")
+    altitudes = np.array([position[2] for position, _ in found.values()])
+    level = float(np.median(altitudes[np.isfinite(altitudes)])) if np.isfinite(altitudes).any() else 0.0
+    for position, _ in found.values():
+        position[2] = level if np.isnan(position[2]) else position[2]
+    return _priors(found, f"EXIF data of {len(found)} images of {folder}", geodetic=True)
 
 
 def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatArray]], bool]:

@@ -86,7 +86,8 @@ def locate(
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
-        priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
+        priors: a table of position priors, see `colmap.priors.table_priors`, or the folder of the images,
+            whose EXIF data have them; the database's own pose priors
             serve if the scale is "prior" and there is no table.
         executor: shares out the pairs of a database among its workers, which must see its file, or a model's
             own tracks, with the same answer to the bit. None: all is done here.

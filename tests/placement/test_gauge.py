@@ -3,6 +3,7 @@
 import csv
 import json
 import sqlite3
+import struct
 
 import numpy as np
 import pycolmap
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import InputError, locate
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.priors import database_priors, table_priors
+from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.geometry import normalized
 from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
@@ -421,3 +422,43 @@ def test_pairs_that_contradict_the_baselines_of_priors_are_named():
     i, j = pairs[7]
     assert f"1 of {int((~without).sum())} pairs contradict" in sentence
     assert f"that of {i}.jpg and {j}.jpg most, by 90 deg" in sentence
+
+
+def exif_segment(latitude, longitude, altitude):
+    """The APP1 segment of a JPEG file with a position, big-endian TIFF: IFD 0, the GPS IFD, rationals."""
+    numbers = []
+    for angle in (latitude, longitude):
+        minutes, degrees = 60.0 * (angle % 1.0), int(angle)
+        numbers += [degrees, 1, int(minutes), 1, round(60e6 * (minutes % 1.0)), 1_000_000]
+    numbers += [round(1000.0 * altitude), 1000]
+    start = 8 + 2 + 12 + 4 + 2 + 12 * 6 + 4
+    entries = [
+        struct.pack(">HHI4s", 1, 2, 2, b"N\0\0\0"),
+        struct.pack(">HHII", 2, 5, 3, start),
+        struct.pack(">HHI4s", 3, 2, 2, b"E\0\0\0"),
+        struct.pack(">HHII", 4, 5, 3, start + 24),
+        struct.pack(">HHI4s", 5, 1, 1, b"\0\0\0\0"),
+        struct.pack(">HHII", 6, 5, 1, start + 48),
+    ]
+    tiff = struct.pack(">2sHI", b"MM", 42, 8) + struct.pack(">HHHIII", 1, 0x8825, 4, 1, 26, 0)
+    tiff += struct.pack(">H", 6) + b"".join(entries) + struct.pack(">I", 0) + struct.pack(">14I", *numbers)
+    return b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
+
+
+def test_positions_of_exif_data_are_priors(ring, tmp_path):
+    assert "no image of the model with a GPS position" in run_refused(
+        "locate", RING_MODEL, tmp_path / "none", "--priors", tmp_path
+    )
+    pycolmap.Bitmap.from_array(np.zeros((8, 8, 3), np.uint8)).write(tmp_path / "black.jpg")
+    plain = (tmp_path / "black.jpg").read_bytes()
+    for name, (x, y, z) in zip(ring.names[:6], ring.centers, strict=False):
+        place = exif_segment(48.0 + (y + 10.0) / 111200.0, 11.0 + (x + 10.0) / 74628.0, 500.0 + z)
+        (tmp_path / name).write_bytes(plain[:2] + place + plain[2:])
+    (tmp_path / ring.names[6]).write_bytes(plain)
+    found = exif_priors(tmp_path, ring)
+    assert found.known.indices.tolist() == list(range(6))
+    positions, truth = found.known.positions, ring.centers[:6]
+    np.testing.assert_allclose(positions - positions[0], truth - truth[0], atol=0.01)
+    facts = json.loads(run("locate", RING_MODEL, tmp_path / "out", "--priors", tmp_path, "--json").stdout)
+    assert "EXIF data of 6 images" in facts["scale"]
+    assert facts["datum"]["latitude_deg"] == pytest.approx(48.0, abs=1e-3)

@@ -8,7 +8,7 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.colmap.priors import database_priors, table_priors
+from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.commands.stages.rigs import Rigid
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1
@@ -38,7 +38,7 @@ def read_priors(
     if options.scale not in ("auto", "prior") and table is not None:
         raise InputError(f"priors have no effect with the scale {options.scale}; leave out one of the two")
     if table is not None:
-        return table_priors(Path(table), model)
+        return exif_priors(Path(table), model) if Path(table).is_dir() else table_priors(Path(table), model)
     if options.scale != "prior":
         if options.refine_with_priors:
             raise InputError("refine_with_priors needs priors; give a table, or the scale prior")
