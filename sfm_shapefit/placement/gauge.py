@@ -221,7 +221,7 @@ def _scale_of_distances(apart: FloatArray, distances: FloatArray) -> tuple[float
     return scale, weights, float(np.sqrt(variance / (weights * apart @ apart))) / scale
 
 
-def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
+def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bool = True) -> Gauge:
     """Return the gauge of position priors: a robust similarity, with a turn if they determine one.
 
     From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
@@ -231,6 +231,8 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Args:
         locations: (n, 3) the solver's answer.
         priors: of these cameras.
+        axes_known: whether the locations' axes mean anything. If not, and the priors lie on a line, the model
+            is turned onto that line, and about it by any angle.
 
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
@@ -250,6 +252,8 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
         found, weights, level = fit_to_priors(source, priors, size, rotate=False)
+    if not turns and not axes_known:
+        found, weights, level = fit_to_priors(source, priors, size, rotate=True)
     if found.scale <= 0.0:
         raise InputError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
@@ -257,9 +261,9 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     return Gauge(
         similarity=_keep_axes(found.scale, found.rotation.T @ found.translation),
         scale="prior",
-        axes=found.rotation if turns else None,
-        statement=_prior_statement(priors, found, weights, level, turns=turns),
-        warning=_prior_warning(level, size, turns=turns),
+        axes=found.rotation if turns or not axes_known else None,
+        statement=_prior_statement(priors, found, weights, level, turns=turns or not axes_known),
+        warning=_prior_warning(level, size, turns=turns, axes_known=axes_known),
         datum=priors.datum if turns else None,
     )
 
@@ -332,11 +336,16 @@ def _prior_statement(
     )
 
 
-def _prior_warning(level: float, size: float, *, turns: bool) -> str:
+def _prior_warning(level: float, size: float, *, turns: bool, axes_known: bool) -> str:
     if level > _ROUGH * size:
         return (
             f"the position priors are {level / size:.0%} of their spread off the answer, so scale and axes "
             "taken from them are rough; check them"
+        )
+    if not turns and not axes_known:
+        return (
+            "the position priors lie on a line or are fewer than three, so the model is turned onto that "
+            "line, and about it by any angle"
         )
     if not turns:
         return (

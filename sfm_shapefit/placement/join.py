@@ -214,7 +214,7 @@ def _fit_priors(centers: FloatArray, priors: PositionPriors) -> tuple[Similarity
             f"{FEWEST_WITNESSES + 1} in each"
         )
     try:
-        gauge = prior_gauge(centers, priors)
+        gauge = prior_gauge(centers, priors, axes_known=False)
     except InputError as error:
         raise UnsolvableError(str(error)) from error
     if gauge.warning or gauge.axes is None:

@@ -137,6 +137,18 @@ def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_sta
     assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
 
 
+def test_where_axes_mean_nothing_priors_on_a_line_turn_the_model_onto_it():
+    """As in `map`: a strip of a drone whose averaged rotations look anywhere."""
+    line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
+    turned = 3.0 * line @ np.diag([-1.0, -1.0, 1.0]) + 1.0
+    for rows in (np.arange(8), np.array([1, 6])):
+        gauge = prior_gauge(line, priors_of(turned, rows=rows), axes_known=False)
+        np.testing.assert_allclose(gauge.apply(line), turned, atol=1e-9)
+        assert "about it by any angle" in gauge.warning
+    with pytest.raises(InputError, match="contradict"):
+        prior_gauge(line, priors_of(-line))
+
+
 def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
     rng = np.random.default_rng(104)
     t, sigma = cameras(4, n=60), 0.05

@@ -73,14 +73,15 @@ class GaugeRule(NamedTuple):
         """
         model, rigid, options = self.model, self.rigid, self.options
         centers, fixed = model.centers[cameras], rigid.fixed[cameras]
-        if coincide(model.centers - model.frame_offsets):
+        has_centers = not coincide(model.centers - model.frame_offsets)
+        if not has_centers:
             centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
         if options.known_distance:
             gauge = _gauge_of_distances(model, cameras.tolist(), locations, options.known_distance)
         elif self.priors is not None:
-            gauge = prior_gauge(locations, self.priors.of(cameras))
+            gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
         else:
             gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
         if not rigid.fixed.any():
