@@ -362,3 +362,95 @@ def _warnings(degenerate: bool, close: BoolArray, cap: float) -> tuple[str, ...]
             " the alignment may rest on the wrong ones"
         )
     return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class PositionEvaluation(Displayed):
+    """Errors of a model's camera centers against positions measured otherwise, such as by GPS."""
+
+    names: tuple[str, ...]
+    """The k common cameras, in the reference's order."""
+    missing: tuple[str, ...]
+    """Cameras of the reference that the model does not have."""
+    offsets: FloatArray | None
+    """(k, 3) model minus reference as they stand, in the reference's axes and units; None if these are not
+    the model's."""
+    aligned_errors: FloatArray
+    """(k,) distances after the robust similarity that fits best, in the reference's units."""
+    ref_from_model: Similarity
+    """That similarity."""
+    statement: str
+    """What is compared with what, in words."""
+
+    @property
+    def position(self) -> ErrorSummary | None:
+        """Statistics of the distances as they stand; None if they mean nothing."""
+        return None if self.offsets is None else summarize_errors(np.linalg.norm(self.offsets, axis=1))
+
+    @property
+    def aligned(self) -> ErrorSummary:
+        """Statistics of the distances after the alignment."""
+        return summarize_errors(self.aligned_errors)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the figures as plain Python values with stable keys, as they stand in JSON."""
+        return {
+            "statement": self.statement,
+            "num_reference": len(self.names) + len(self.missing),
+            "num_common": len(self.names),
+            "missing": list(self.missing),
+            "position_error": None if self.position is None else asdict(self.position),
+            "median_offset": None if self.offsets is None else np.median(self.offsets, axis=0).tolist(),
+            "aligned_position_error": asdict(self.aligned),
+            "ref_from_model": {
+                "scale": self.ref_from_model.scale,
+                "rotation": self.ref_from_model.rotation.tolist(),
+                "translation": self.ref_from_model.translation.tolist(),
+            },
+        }
+
+    def _headline(self) -> str:
+        return (
+            f"{len(self.names)} cameras in common, position error {self.aligned.median:.3g} (median, aligned)"
+        )
+
+    def rows(self) -> list[dict[str, str | float]]:
+        """Return one row per common camera, for a table."""
+        offsets = np.full((len(self.names), 3), np.nan) if self.offsets is None else self.offsets
+        errors = np.column_stack([offsets, self.aligned_errors]).tolist()
+        keys = ("name", "offset_x", "offset_y", "offset_z", "aligned_error")
+        return [
+            dict(zip(keys, (name, *row), strict=True)) for name, row in zip(self.names, errors, strict=True)
+        ]
+
+
+def evaluate_positions(
+    model: tuple[Sequence[str], FloatArray],
+    reference: tuple[Sequence[str], FloatArray],
+    statement: str,
+    *,
+    as_they_stand: bool,
+) -> PositionEvaluation:
+    """Compare camera centers (n, 3) with known positions, each by distinct names.
+
+    Args:
+        model, reference: names and positions.
+        statement: what is compared with what.
+        as_they_stand: whether both are in the same axes and units.
+
+    Raises:
+        InputError: if fewer than 3 cameras are common, or those of either side coincide.
+    """
+    in_model, in_ref = _common_cameras(model[0], reference[0])
+    x, y = model[1][in_model], reference[1][in_ref]
+    _refuse_coincident("the model", x)
+    _refuse_coincident("the reference", y)
+    ref_from_model = fit_similarity_l1(x, y, cap=_CAP_OF_SPREAD * median_spread(y))
+    return PositionEvaluation(
+        names=tuple(reference[0][k] for k in in_ref),
+        missing=_only_in(reference[0], model[0]),
+        offsets=frozen(x - y) if as_they_stand else None,
+        aligned_errors=frozen(np.linalg.norm(ref_from_model.apply(x) - y, axis=1)),
+        ref_from_model=ref_from_model,
+        statement=statement,
+    )

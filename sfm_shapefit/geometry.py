@@ -176,18 +176,20 @@ def fit_similarity_l1(
         return best
 
     plain = fit_similarity(source, target, rotate=rotate)
-    sampled = sorted(_fits_of_few_points(source, target, rotate=rotate), key=cost)
+    sampled = sorted(fits_of_few_points(source, target, rotate=rotate), key=cost)
     return min((reweigh(start) for start in [plain, *sampled[:_NUM_REFINED_SAMPLES]]), key=cost)
 
 
-def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool) -> list[Similarity]:
+def fits_of_few_points(
+    source: FloatArray, target: FloatArray, *, rotate: bool, count: int = _NUM_SAMPLES
+) -> list[Similarity]:
     """Return similarities that each fit as few points as determine one, drawn with a fixed seed.
 
     They are what `fit_similarity` returns for each few, all at once.
     """
     size = min(len(source), source.shape[1] if rotate else 2)
     rng = np.random.default_rng(0)
-    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(_NUM_SAMPLES)])
+    few = np.array([rng.choice(len(source), size, replace=False) for _ in range(count)])
     w = np.full(size, 1.0 / size)
     source_means, target_means = w @ source[few], w @ target[few]
     x, y = source[few] - source_means[:, None], target[few] - target_means[:, None]
@@ -195,8 +197,8 @@ def _fits_of_few_points(source: FloatArray, target: FloatArray, *, rotate: bool)
     crosses = np.swapaxes(w[:, None] * y, 1, 2) @ x
     eyes = np.broadcast_to(np.eye(source.shape[1]), crosses.shape)
     rotations = nearest_rotations(crosses) if rotate else eyes
-    alike = np.maximum((rotations * crosses).reshape(_NUM_SAMPLES, -1).sum(axis=1), 0.0)
-    scales = np.divide(alike, spreads, out=np.ones(_NUM_SAMPLES), where=spreads > 0.0)
+    alike = np.maximum((rotations * crosses).reshape(count, -1).sum(axis=1), 0.0)
+    scales = np.divide(alike, spreads, out=np.ones(count), where=spreads > 0.0)
     moved = ((scales[:, None, None] * rotations) @ source_means[:, :, None])[:, :, 0]
     fits = zip(scales.tolist(), rotations, target_means - moved, strict=True)
     return [Similarity(scale=scale, rotation=turn, translation=shift) for scale, turn, shift in fits]

@@ -5,7 +5,7 @@ the options of all its stages, and some that concern the whole.
 """
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
@@ -17,7 +17,9 @@ Rotations = Literal["auto", "measured", "free"]
 Points = Literal["auto", "never", "always"]
 Source = Literal["auto", "matches", "relative-poses", "tracks"]
 Relative = Literal["matches", "stored"]
+KnownDistance = tuple[str, str, float]
 Refined = Literal["auto", "focal", "all", "none"]
+Join = Literal["never", "safe"]
 
 LEAST_MATCHES = 15
 """Pairs with fewer verified matches are never used by `map`; COLMAP's own limit."""
@@ -56,8 +58,10 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         'a table is given, else "input". A model with rigs of several cameras always has their scale, '
         "and one with two or more fixed cameras theirs.",
     )
-    known_distance: tuple[str, str, float] | None = option(
-        None, "Two images by name, and how far apart they are in the output's units."
+    known_distance: tuple[KnownDistance, ...] = option(
+        (),
+        "Two images by name, and how far apart they are in the output's units. May be repeated: of several "
+        "the scale is a robust fit, and each is told with what the model has.",
     )
     fix: str = option(
         "",
@@ -152,17 +156,17 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
     def _check_distance(self) -> None:
         """Refuse a known distance that is none, or that the scale asked for has no use for."""
         known = self.known_distance
-        if self.scale == "distance" and known is None:
+        if self.scale == "distance" and not known:
             raise ValueError("the scale distance needs known_distance: two image names and their distance")
-        if known is None:
+        if not known:
             return
         if self.scale not in ("auto", "distance"):
             raise ValueError(f"known_distance has no effect with the scale {self.scale}; leave out one")
-        is_number = len(known) == 3 and isinstance(known[2], int | float)
-        if not (is_number and isinstance(known[0], str) and isinstance(known[1], str)):
-            raise ValueError(f"known_distance must be two image names and a number, got {known!r}")
-        if not 0.0 < known[2] < float("inf") or known[0] == known[1]:
-            raise ValueError(f"known_distance must be positive, of two different images, got {known!r}")
+        if isinstance(known[0], str):
+            known = (known,)
+        for one in known:
+            _check_one_distance(one)
+        object.__setattr__(self, "known_distance", tuple(map(tuple, known)))
 
     def uses_points(self, num_cameras: int) -> bool:
         """Return whether 3D points join the view graph of so many cameras."""
@@ -183,6 +187,16 @@ class LocateOptions(PlacementOptions, DirectionOptions, StructureOptions):
         if not self.uses_points(num_cameras):
             return f"no: more than {limit} cameras, where they would multiply the time of the solve"
         return f"{num_points} tracks join as nodes: at most {limit} cameras, so they cost little"
+
+
+def _check_one_distance(known: Any) -> None:
+    """Refuse what is not two image names and a distance."""
+    parts = known if isinstance(known, tuple | list) else ()
+    fits = zip(parts, (str, str, int | float), strict=False)
+    if len(parts) != 3 or not all(isinstance(part, kind) for part, kind in fits):
+        raise ValueError(f"known_distance must be two image names and a number, got {known!r}")
+    if not 0.0 < known[2] < float("inf") or known[0] == known[1]:
+        raise ValueError(f"known_distance must be positive, of two different images, got {known!r}")
 
 
 @explained
@@ -223,6 +237,11 @@ class MapOptions(LocateOptions):
         'look like a video too; "names" believes the names; "none" takes all pairs alike.',
     )
     min_model_size: int = option(3, "Components with fewer images make no model.")
+    join: Join = option(
+        "safe",
+        'Models that stand apart: "safe" joins those that position priors or points seen by both tie '
+        'together beyond doubt, with a standard deviation, into a further folder; "never" joins none.',
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,7 +21,7 @@ LAYERS = [
     {"laplacian"},
     {"rigidity"},
     {"solver"},
-    {"measured"},
+    {"measured", "known_positions"},
     {"directions"},
     {"baselines"},
     {"rotations"},

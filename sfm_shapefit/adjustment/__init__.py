@@ -37,7 +37,6 @@ from sfm_shapefit.adjustment.covariance import FrameCovariances, estimate_covari
 from sfm_shapefit.adjustment.options import AdjustmentOptions, AdjustmentStep, OnIteration
 from sfm_shapefit.adjustment.problem import (
     AdjustmentProblem,
-    CenterPrior,
     Lens,
     LensPrior,
     Rig,
@@ -58,7 +57,6 @@ __all__ = [
     "AdjustmentOptions",
     "AdjustmentProblem",
     "AdjustmentStep",
-    "CenterPrior",
     "Ending",
     "FrameCovariances",
     "Lens",

@@ -48,12 +48,10 @@ def free_similarities(problem: AdjustmentProblem, options: AdjustmentOptions) ->
         may_scale = not np.any(problem.rig.translations)
     basis = np.eye(_DIMENSION)[:, np.repeat([True, may_turn, may_scale], [3, 3, 1])]
     basis = basis @ _null_space((moves[problem.is_fixed()] @ basis).reshape(-1, basis.shape[1]))
-    for prior, slots in ((problem.rotation_prior, slice(3, 6)), (problem.center_prior, slice(0, 3))):
-        if prior is None:
-            continue
-        size = np.einsum("naa->n", prior.information)
-        information = prior.information / np.where(size > 0.0, size, 1.0)[:, None, None]
-        felt = moves[:, slots] @ basis
+    for frames, given, slots in problem.priors_of_poses():
+        size = np.einsum("naa->n", given)
+        information = given / np.where(size > 0.0, size, 1.0)[:, None, None]
+        felt = moves[frames, slots] @ basis
         basis = basis @ _null_space(np.einsum("nai,nab,nbj->ij", felt, information, felt))
     basis[np.abs(basis) < _NONE] = 0.0
     return scale[:, None] * basis

@@ -33,10 +33,11 @@ def sum_priors(problem: AdjustmentProblem, values: Values, noise_px: float) -> f
     """Return the cost of all priors in px^2; those of fixed frames are constants and left out."""
     moves = ~problem.is_fixed()
     total = 0.0
-    for prior, off in ((problem.rotation_prior, _turns), (problem.center_prior, _shifts)):
-        if prior is not None:
-            d = off(problem, values)
-            total += float(np.einsum("n,na,nab,nb->", moves, d, prior.information, d))
+    if problem.rotation_prior is not None:
+        d = _turns(problem, values)
+        total += float(np.einsum("n,na,nab,nb->", moves, d, problem.rotation_prior.information, d))
+    if problem.center_prior is not None:
+        total += float(moves[problem.center_prior.indices] @ problem.center_prior.chi2(values.centers))
     if problem.lens_prior is not None:
         d = values.lenses - problem.lens_prior.values
         total += float(np.sum(_lens_information(problem) * d**2))
@@ -60,11 +61,12 @@ def add_center_prior(
     problem: AdjustmentProblem, values: Values, noise_px: float, blocks: FloatArray, gradients: FloatArray
 ) -> None:
     """Add the center prior to the blocks (n, 3, 3) and gradients (n, 3) of the centers of all frames."""
-    if problem.center_prior is None:
+    prior = problem.center_prior
+    if prior is None:
         return
-    information = noise_px**2 * problem.center_prior.information
-    blocks += information
-    gradients += np.einsum("nab,nb->na", information, _shifts(problem, values))
+    information = noise_px**2 * prior.information
+    blocks[prior.indices] += information
+    gradients[prior.indices] += np.einsum("kab,kb->ka", information, prior.off(values.centers))
 
 
 def add_lens_prior(
@@ -92,12 +94,6 @@ def _turns(problem: AdjustmentProblem, values: Values) -> FloatArray:
     """Return the rotation vectors from the prior's rotations, (n, 3)."""
     assert problem.rotation_prior is not None
     return rotation_vectors(values.rotations @ problem.rotation_prior.rotations.transpose(0, 2, 1))
-
-
-def _shifts(problem: AdjustmentProblem, values: Values) -> FloatArray:
-    """Return the shifts from the prior's centers, (n, 3)."""
-    assert problem.center_prior is not None
-    return values.centers - problem.center_prior.centers
 
 
 def _inverse_left_jacobians(d: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ the distortion once, and pass focal length times ray as the pixel of a PINHOLE l
 principal point 0. Its residuals are then those of an ideal camera, not exactly pixels of the image.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
@@ -25,6 +25,7 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.errors import InputError
+from sfm_shapefit.known_positions import KnownPositions
 
 _FX, _FY, _CX, _CY, _K1, _K2, _P1, _P2 = range(8)
 NUM_VALUES = 8
@@ -120,16 +121,6 @@ class RotationPrior:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class CenterPrior:
-    """Centers measured otherwise: cost 1/2 noise_px^2 d^T Omega d with d = C_f - C_prior."""
-
-    centers: FloatArray
-    """(n, 3)"""
-    information: FloatArray
-    """(n, 3, 3) inverse covariances in world axes; 0 where there is no prior."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LensPrior:
     """Intrinsics known otherwise: cost 1/2 noise_px^2 sum_p Omega_p d_p^2 with d = p - p_prior.
 
@@ -178,8 +169,8 @@ class AdjustmentProblem:
     """(n,) frames whose pose stays what it is, to the last bit; none if empty."""
     rotation_prior: RotationPrior | None = None
     """Weighs rotations that are not held."""
-    center_prior: CenterPrior | None = None
-    """Weighs centers."""
+    center_prior: KnownPositions | None = None
+    """Centers of some frames, measured otherwise: cost 1/2 noise_px^2 chi2."""
     lens_prior: LensPrior | None = None
     """Weighs focal lengths and distortion that are not held."""
 
@@ -229,6 +220,13 @@ class AdjustmentProblem:
         """Return the frame of each observation, (m,)."""
         cameras = self.cameras_seeing
         return cameras if self.rig is None else self.rig.frame_of_camera[cameras]
+
+    def priors_of_poses(self) -> Iterator[tuple[IntArray, FloatArray, slice]]:
+        """Yield frames, information of their centers or rotations, and its slots among their unknowns."""
+        if self.center_prior is not None:
+            yield self.center_prior.indices, self.center_prior.information, slice(0, 3)
+        if self.rotation_prior is not None:
+            yield np.arange(self.num_frames), self.rotation_prior.information, slice(3, 6)
 
     def with_values(
         self, rotations: FloatArray, centers: FloatArray, points: FloatArray, lenses: Sequence[Lens]
@@ -280,10 +278,12 @@ class AdjustmentProblem:
             _check_rotations(self.rotation_prior.rotations, "rotation of the prior")
             _check_information(self.rotation_prior.information, n, "rotation")
         if self.center_prior is not None:
-            centers = self.center_prior.centers
-            if centers.shape != (n, 3) or not np.isfinite(centers).all():
-                raise InputError(f"the center prior must have {n} finite centers")
-            _check_information(self.center_prior.information, n, "center")
+            frames, centers, information = self.center_prior
+            k = len(frames)
+            _check_range(frames, n, "frame of the center prior's")
+            if len(np.unique(frames)) < k or centers.shape != (k, 3) or not np.isfinite(centers).all():
+                raise InputError(f"the center prior must have {k} finite centers, each of its own frame")
+            _check_information(information, k, "center")
         if self.lens_prior is not None:
             shape = (len(self.lenses), NUM_VALUES)
             values, information = self.lens_prior.values, self.lens_prior.information

@@ -151,15 +151,15 @@ def _add_errors_of_priors(
     """Add the pulls of priors that are in error as they say they are, in units of K / kappa."""
     rng = np.random.default_rng(1)
     layout = system.layout
-    moves = layout.node_of_frame >= 0
-    nodes = layout.node_of_frame[moves]
-    for prior, slots in ((problem.center_prior, slice(0, 3)), (problem.rotation_prior, slice(3, 6))):
-        if prior is None or (slots.start == 3 and options.hold_rotations):
+    for frames, information, slots in problem.priors_of_poses():
+        if slots.start == 3 and options.hold_rotations:
             continue
-        values, axes = np.linalg.eigh(prior.information)
+        nodes = layout.node_of_frame[frames]
+        moves = nodes >= 0
+        values, axes = np.linalg.eigh(information)
         roots = axes * np.sqrt(np.maximum(values, 0.0))[:, None, :]
-        draws = rng.standard_normal((problem.num_frames, 3, by_sample.shape[2]))
-        by_sample[nodes, slots] += options.noise_px**2 / kappa * (roots @ draws)[moves]
+        draws = rng.standard_normal((len(frames), 3, by_sample.shape[2]))
+        by_sample[nodes[moves], slots] += options.noise_px**2 / kappa * (roots @ draws)[moves]
 
 
 class _Pulls:

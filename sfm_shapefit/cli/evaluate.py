@@ -12,12 +12,13 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.wording import rounded
 
 if TYPE_CHECKING:
-    from sfm_shapefit.evaluation import Evaluation, Recall
+    from sfm_shapefit.evaluation import Evaluation, PositionEvaluation, Recall
     from sfm_shapefit.pose_errors import ErrorSummary
 
 _ROUNDING = 1e-9
 """Errors in degrees, and in the extent, that are no more than rounding."""
 _WORST_SHOWN = 3
+_TABLES = {".csv", ".txt"}
 
 
 @app.command(
@@ -29,7 +30,11 @@ _WORST_SHOWN = 3
 def evaluate_command(
     model: ModelArgument = None,
     reference: Annotated[
-        Path | None, typer.Argument(metavar="REF", help="COLMAP model with the true poses.")
+        Path | None,
+        typer.Argument(
+            metavar="REF",
+            help="COLMAP model with the true poses, or a table (.csv, .txt) of known positions such as GPS.",
+        ),
     ] = None,
     *,
     input_path: InputPath = None,
@@ -56,10 +61,16 @@ def evaluate_command(
     source = one_path(model, input_path, "MODEL")
     truth = one_path(reference, None, "REF")
     with report_errors():
-        from sfm_shapefit.commands.evaluate import evaluate
+        from sfm_shapefit.commands.evaluate import evaluate, evaluate_against_table
         from sfm_shapefit.results.tables import write_records
 
-        errors = evaluate(source, truth, thresholds=threshold or (), trajectory=trajectory)
+        errors: Evaluation | PositionEvaluation
+        if truth.is_file() and truth.suffix.lower() in _TABLES:
+            if threshold or trajectory:
+                raise InputError("a table of positions has no thresholds and no trajectory; leave these out")
+            errors = evaluate_against_table(source, truth)
+        else:
+            errors = evaluate(source, truth, thresholds=threshold or (), trajectory=trajectory)
         if csv is not None:
             if csv.exists() and csv.suffix.lower() != ".csv":
                 raise InputError(f"{csv} exists and is no .csv file; choose another name")
@@ -67,7 +78,28 @@ def evaluate_command(
         if as_json:
             print_json(errors.summary())
         else:
-            print_table(f"{source} against {truth}", _evaluation_table(errors))
+            title = f"{source} against {truth}"
+            print_table(title, _rows_of(errors))
+
+
+def _rows_of(errors: "Evaluation | PositionEvaluation") -> Rows:
+    """Return the errors against a model or known positions."""
+    from sfm_shapefit.evaluation import Evaluation
+
+    return _evaluation_table(errors) if isinstance(errors, Evaluation) else _position_table(errors)
+
+
+def _position_table(errors: "PositionEvaluation") -> Rows:
+    """Return the errors against known positions."""
+    rows = [
+        ("cameras", f"{len(errors.names)} in common of {len(errors.names) + len(errors.missing)}"),
+        ("compared", errors.statement),
+    ]
+    if errors.position is not None:
+        offset = ", ".join(rounded(value) for value in errors.summary()["median_offset"])
+        rows += [("position error", _describe(errors.position)), ("median offset", offset)]
+    scale = errors.ref_from_model.scale
+    return [*rows, ("after alignment", f"{_describe(errors.aligned)}; scale {scale:.6g}")]
 
 
 def _evaluation_table(errors: "Evaluation") -> Rows:

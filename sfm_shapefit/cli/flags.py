@@ -37,8 +37,9 @@ PriorsFile = Annotated[
     Path | None,
     typer.Option(
         "--priors",
-        metavar="FILE",
-        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header.",
+        metavar="FILE|FOLDER",
+        help="Position priors, name x y z [sigma] per line, or name,lat,lon,alt with that header; or the "
+        "folder of the images, for the GPS positions of their EXIF data.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
@@ -67,6 +68,12 @@ _METAVARS: dict[Any, str] = {
     float | None: "NUMBER",
 }
 """What stands for a flag's value in the help, by the field's name or else by its type."""
+
+_REPEATED = {"known_distance": (str, str, float)}
+"""Flags of several values that may be repeated, of which typer knows none, and the types of their values."""
+
+# No argument of a program can hold this.
+_JOINT = "\0"
 
 _EARLIER_NAMES: dict[str, str] = {}
 """Flags that are taken beside their present names, without standing in any help."""
@@ -111,14 +118,14 @@ class GroupedCommand(TyperCommand):
                     formatter.write_dl(records)
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse flags by their present names, where an earlier one is given."""
+        """Parse flags by their present names, where an earlier one is given, and several values as one."""
         known = {name for parameter in self.get_params(ctx) for name in parameter.opts}
         renamed = []
         for arg in args:
             flag, equals, value = arg.partition("=")
             present = _EARLIER_NAMES.get(flag, flag)
             renamed.append(present + equals + value if flag not in known and present in known else arg)
-        return super().parse_args(ctx, renamed)
+        return super().parse_args(ctx, _gather_values(renamed))
 
 
 def takes(*settings: type[Settings], only: Sequence[str] = ()) -> Callable[[Command], Command]:
@@ -152,14 +159,15 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
             names = [f"{flag}/--no{flag[1:]}" if has_opposite else flag]
             names += [_SHORT[item.name]] if item.name in _SHORT else []
             shown = {"True": "yes", "False": "no"}.get(str(item.default), str(item.default))
-            default = "" if item.default in (None, "") or is_switch else f" [default: {shown}]"
+            default = "" if item.default in (None, "", ()) or is_switch else f" [default: {shown}]"
             flagged = typer.Option(
                 *names,
                 help=item.metadata["help"] + default,
                 rich_help_panel=group.title,
                 metavar=_METAVARS.get(item.name, _METAVARS.get(kinds[item.name])),
             )
-            annotation: Any = Annotated[kinds[item.name] | None, flagged]
+            repeated = item.name in _REPEATED
+            annotation: Any = Annotated[(list[str] if repeated else kinds[item.name]) | None, flagged]
             kind = inspect.Parameter.KEYWORD_ONLY
             parameters.append(inspect.Parameter(item.name, kind, default=None, annotation=annotation))
     return parameters
@@ -167,6 +175,28 @@ def _flags(settings: type[Settings]) -> list[inspect.Parameter]:
 
 def _flag_of(name: str) -> str:
     return f"--{name.replace('_', '-')}"
+
+
+def _gather_values(args: Sequence[str]) -> list[str]:
+    """Return arguments in which the values of a repeated flag are one."""
+    counts = {_flag_of(name): len(kinds) for name, kinds in _REPEATED.items()}
+    gathered, waiting = [], list(args)
+    while waiting:
+        flag = waiting.pop(0)
+        gathered.append(flag)
+        count = counts.get(flag, 0)
+        if count:
+            gathered.append(_JOINT.join(waiting[:count]))
+            waiting = waiting[count:]
+    return gathered
+
+
+def _values_of(name: str, text: str) -> tuple[Any, ...]:
+    """Return the values of a repeated flag that `_gather_values` made one."""
+    try:
+        return tuple(kind(part) for kind, part in zip(_REPEATED[name], text.split(_JOINT), strict=True))
+    except ValueError as error:
+        raise typer.BadParameter(f"{_flag_of(name)} takes {_METAVARS[name]}") from error
 
 
 def read_options(settings: type[Options], given: dict[str, Any], config: Path | None = None) -> Options:
@@ -182,6 +212,8 @@ def read_options(settings: type[Options], given: dict[str, Any], config: Path | 
     known = {item.name for item in fields(settings)}
     values = _read_toml(config, known, earlier) if config else {}
     values |= {name: value for name, value in given.items() if value is not None and name in known}
+    for name in _REPEATED.keys() & {name for name in known if given.get(name) is not None}:
+        values[name] = tuple(_values_of(name, text) for text in given[name])
     try:
         return settings(**values)
     except (TypeError, ValueError) as error:

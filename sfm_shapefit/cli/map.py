@@ -89,10 +89,12 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *([("bundle adjustment", describe_adjustment(located.adjusted))] if located.adjusted else []),
             ("certificate", located.departure.statement),
         ]
+    folders = [*map(str, range(len(found.models))), *(one.folder for one in found.joined)]
     left_out = [f"{name}: {reason}" for name, reason in found.left_out.items()]
     return Told(
         figures=[
             *figures,
+            *[("joined" if join.join else "not joined", join.statement) for join in found.joins],
             *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
             *[("warning", warning) for warning in found.warnings],
         ],
@@ -100,6 +102,5 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         verdict=found.models[0].located.verdict,
         steps=next_steps(dict(found.models[0].located.summary()), out / "0", flags),
         timings_s=found.timings_s,
-        written=f"{out}: {'models' if several else 'a model'} in "
-        f"{', '.join(str(k) for k in range(len(found.models)))}, map.json",
+        written=f"{out}: {'models' if several else 'a model'} in {', '.join(folders)}, map.json",
     )

@@ -10,40 +10,20 @@ is at most 1.3 times that of the image, even for rays at right angles to the cam
 import itertools
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import pycolmap
 
-from sfm_shapefit.adjustment import AdjustmentProblem, CenterPrior, Lens, Rig
+from sfm_shapefit.adjustment import AdjustmentProblem, Lens, Rig
 from sfm_shapefit.adjustment.tracks import CameraPoses, MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import TriangulatedPoints
 from sfm_shapefit.arrays import BoolArray, FloatArray, IntArray
 from sfm_shapefit.colmap.model import camera_rays, observed_points, points2d_xy
 from sfm_shapefit.colmap.structure import TrackSource
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.known_positions import KnownPositions
 
 _ADJUSTED_MODELS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
-
-
-class KnownCenters(NamedTuple):
-    """Where frames are by another measurement, such as GPS, in the world of the reconstruction."""
-
-    frame_ids: IntArray
-    """(k,)"""
-    positions: FloatArray
-    """(k, 3)"""
-    information: FloatArray
-    """(k, 3, 3) inverse covariances."""
-
-    def prior(self, frame_ids: Sequence[int]) -> CenterPrior:
-        """Return the prior of frames, of which some may be unknown."""
-        place = {frame: k for k, frame in enumerate(frame_ids)}
-        known = np.array([frame in place for frame in self.frame_ids.tolist()], dtype=np.bool_)
-        rows = [place[frame] for frame in self.frame_ids[known].tolist()]
-        centers, information = np.zeros((len(place), 3)), np.zeros((len(place), 3, 3))
-        centers[rows], information[rows] = self.positions[known], self.information[known]
-        return CenterPrior(centers=centers, information=information)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -73,7 +53,7 @@ class PosedFrames:
     """(c,)"""
     colmap_camera_of_lens: tuple[int, ...]
     """The id of the camera in the reconstruction."""
-    center_prior: CenterPrior | None = None
+    center_prior: KnownPositions | None = None
     """Of the frames."""
 
     def poses(self) -> CameraPoses:
@@ -126,14 +106,14 @@ class PosedFrames:
 def read_frames(
     reconstruction: pycolmap.Reconstruction,
     fixed_frames: Collection[int] = (),
-    known: KnownCenters | None = None,
+    known: KnownPositions | None = None,
 ) -> PosedFrames:
     """Return the posed frames of a reconstruction as arrays.
 
     Args:
         reconstruction: whose frames with a pose are read.
         fixed_frames: ids of those that stay; others are ignored.
-        known: centers measured otherwise; of other frames they are ignored.
+        known: centers measured otherwise, by the ids of frames; of other frames they are ignored.
     """
     image_ids = sorted(reconstruction.reg_image_ids())
     images = [reconstruction.image(i) for i in image_ids]
@@ -166,7 +146,7 @@ def read_frames(
         lenses=lenses,
         lens_of_camera=np.array([camera_ids.index(image.camera_id) for image in images])[of_image],
         colmap_camera_of_lens=tuple(camera_ids),
-        center_prior=None if known is None else known.prior(frame_ids),
+        center_prior=None if known is None else known.among(np.array(frame_ids)),
     )
 
 

@@ -44,7 +44,6 @@ from sfm_shapefit.adjustment.tracks import MatchedKeypoints, ObservedTracks
 from sfm_shapefit.adjustment.triangulation import PointLimits, TriangulatedPoints, triangulate_tracks
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.adjustment import (
-    KnownCenters,
     add_points,
     collect_tracks,
     read_frames,
@@ -57,6 +56,7 @@ from sfm_shapefit.colmap.seed import copy_without_points
 from sfm_shapefit.colmap.structure import TrackSource, filter_points, triangulate
 from sfm_shapefit.colmap.structure_options import Adjuster, StructureOptions
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.known_positions import KnownPositions
 
 # Of the two solves of all tracks: scales of the Cauchy loss in pixel thresholds, and the relative falls to
 # end at.
@@ -162,8 +162,8 @@ class GivenPoses(NamedTuple):
     """Of the model's rotations."""
     model: pycolmap.Reconstruction | None = None
     """Whose rotations were given; None: those of the seed."""
-    centers: KnownCenters | None = None
-    """Measured otherwise, which pull at the frames."""
+    centers: KnownPositions | None = None
+    """Measured otherwise, by the ids of frames, which they pull at."""
     lenses: FreeLenses = ALL_HELD
     """Those that may change; all others stay what they are, to the bit."""
 

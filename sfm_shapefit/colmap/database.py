@@ -288,7 +288,23 @@ class MatchDatabase:
             enough &= (rank >= part[0]) & (rank < part[1])
         if among is not None:
             enough &= np.isin(self._pairs.pairs, among).all(axis=1)
-        chosen = np.flatnonzero(enough)
+        yield from self._batches_of(np.flatnonzero(enough), min_matches, max_matches_per_batch)
+
+    def iter_matches_between(
+        self, groups: IntArray, max_matches_per_batch: int = 2_000_000
+    ) -> Iterator[MatchBatch]:
+        """Yield the matches of all pairs whose images are in different groups (n,), as `iter_matches` does.
+
+        Images of a negative group are in none.
+        """
+        ends = groups[self._pairs.pairs]
+        chosen = self._pairs.has_matches & (ends >= 0).all(axis=1) & (ends[:, 0] != ends[:, 1])
+        yield from self._batches_of(np.flatnonzero(chosen), 1, max_matches_per_batch)
+
+    def _batches_of(
+        self, chosen: IntArray, min_matches: int, max_matches_per_batch: int
+    ) -> Iterator[MatchBatch]:
+        """Read the matches of chosen pairs."""
         for first, last in batch_ranges(self._pairs.num_inliers[chosen], max_matches_per_batch):
             batch = self._match_batch(chosen[first:last], max(min_matches, 1))
             if len(batch.pairs):

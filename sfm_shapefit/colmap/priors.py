@@ -1,4 +1,4 @@
-"""Position priors of cameras: the pose priors of a COLMAP database, or a table of names and positions.
+"""Position priors of cameras: pose priors of a COLMAP database, a table of names and positions, or EXIF data.
 
 Positions on the WGS84 ellipsoid (latitude, longitude in degrees, altitude in meters) become meters east,
 north and up of their median. Their covariances are taken as meters squared in those axes.
@@ -19,6 +19,7 @@ from sfm_shapefit.colmap.database import readonly_rows
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.formats.lines import is_number, text_of
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import Datum, PositionPriors
 
 _WGS84, _CARTESIAN = 0, 1
@@ -36,7 +37,8 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
     Raises:
         InputError: if the database has no prior of these images, mixes coordinate systems, or is damaged.
     """
-    found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    systems: set[int] = set()
     index_of_name = {name: index for index, name in enumerate(model.names)}
     selected = "SELECT images.name, position, {}, coordinate_system FROM pose_priors JOIN images ON {}"
     by_image, covariances = "images.image_id = pose_priors.image_id", "position_covariance"
@@ -52,10 +54,10 @@ def database_priors(path: Path, model: PosedModel) -> PositionPriors:
         xyz = _numbers(path, name, position, 3)
         if index is None or system not in (_WGS84, _CARTESIAN) or not (np.abs(xyz) <= _LARGEST).all():
             continue
-        found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3), system
+        found[index] = xyz, _numbers(path, name, covariance, 9).reshape(3, 3)
+        systems.add(system)
     if not found:
         raise InputError(f"{path} has no position prior of the model's images; give a table with --priors")
-    systems = {system for _, _, system in found.values()}
     if len(systems) > 1:
         raise InputError(f"{path} mixes WGS84 and Cartesian priors; give a table of one kind with --priors")
     return _priors(found, f"pose priors of {path}", geodetic=systems == {_WGS84})
@@ -72,27 +74,73 @@ def table_priors(path: Path, model: PosedModel) -> PositionPriors:
         InputError: if the file cannot be read, a line is malformed (it is named by its number), or no name
             is one of the model's.
     """
+    rows, geodetic = read_position_table(path)
     index_of_name = {name: index for index, name in enumerate(model.names)}
-    found: dict[int, tuple[FloatArray, FloatArray, int]] = {}
-    system, seen, first = _CARTESIAN, set(), True
+    found = {index_of_name[name]: row for name, row in rows.items() if name in index_of_name}
+    if not found:
+        raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
+    return _priors(found, f"{len(found)} positions of {path}", geodetic=geodetic)
+
+
+def exif_priors(folder: Path, model: PosedModel) -> PositionPriors:
+    """Read the GPS positions that the EXIF data of the model's images have, by pycolmap's own reader.
+
+    A position without altitude has that of the median.
+
+    Raises:
+        InputError: if no image of the model in the folder has a position.
+    """
+    found: dict[int, tuple[FloatArray, FloatArray]] = {}
+    for index, name in enumerate(model.names):
+        bitmap = pycolmap.Bitmap.read(folder / name, True) if (folder / name).is_file() else None
+        if bitmap is not None:
+            read = bitmap.exif_latitude(), bitmap.exif_longitude(), bitmap.exif_altitude()
+            position = np.array([np.nan if value is None else value for value in read])
+            if np.isfinite(position[:2]).all():
+                found[index] = position, np.full((3, 3), np.nan)
+    if not found:
+        raise InputError(f"{folder} has no image of the model with a GPS position in its EXIF data")
+    altitudes = np.array([position[2] for position, _ in found.values()])
+    level = float(np.median(altitudes[np.isfinite(altitudes)])) if np.isfinite(altitudes).any() else 0.0
+    for position, _ in found.values():
+        position[2] = level if np.isnan(position[2]) else position[2]
+    return _priors(found, f"EXIF data of {len(found)} images of {folder}", geodetic=True)
+
+
+def read_position_table(path: Path) -> tuple[dict[str, tuple[FloatArray, FloatArray]], bool]:
+    """Read position (3,) and covariance (3, 3) of each name of a table, and whether it has latitudes.
+
+    Raises:
+        InputError: if the file cannot be read or a line is malformed.
+    """
+    found: dict[str, tuple[FloatArray, FloatArray]] = {}
+    geodetic, first = False, True
     for number, line in enumerate(text_of(path).splitlines(), start=1):
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         cells = next(csv.reader([line])) if "," in line else line.split()
         cells = [cell.strip() for cell in cells]
         if first and len(cells) > 1 and not is_number(cells[1]):
-            system = _WGS84 if cells[1].lower() in _GEODETIC_NAMES else _CARTESIAN
+            geodetic = cells[1].lower() in _GEODETIC_NAMES
         else:
-            position, covariance = _parse(path, number, cells)
-            if cells[0] in seen:
+            row = _parse(path, number, cells)
+            if cells[0] in found:
                 raise InputError(f"{path}, line {number}: {cells[0]} stands twice; keep one of its priors")
-            seen.add(cells[0])
-            if cells[0] in index_of_name:
-                found[index_of_name[cells[0]]] = position, covariance, system
+            found[cells[0]] = row
         first = False
-    if not found:
-        raise InputError(f"{path} has no prior of the model's images, such as {model.names[0]}")
-    return _priors(found, f"{len(found)} positions of {path}", geodetic=system == _WGS84)
+    return found, geodetic
+
+
+def enu_of(geodetic: FloatArray, datum: Datum) -> FloatArray:
+    """Return positions (k, 3), latitude, longitude in degrees and altitude, in meters east, north and up.
+
+    Raises:
+        ValueError: if a latitude or longitude is out of range.
+    """
+    if (np.abs(geodetic[:, 0]) > 90.0).any() or (np.abs(geodetic[:, 1]) > 360.0).any():
+        raise ValueError("a latitude or longitude is out of range; give degrees")
+    transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
+    return np.asarray(transform.ellipsoid_to_enu(geodetic, *datum))
 
 
 def _numbers(path: Path, name: str, blob: object, count: int) -> FloatArray:
@@ -123,26 +171,24 @@ def _parse(path: Path, number: int, cells: list[str]) -> tuple[FloatArray, Float
 
 
 def _priors(
-    found: dict[int, tuple[FloatArray, FloatArray, int]], source: str, *, geodetic: bool
+    found: dict[int, tuple[FloatArray, FloatArray]], source: str, *, geodetic: bool
 ) -> PositionPriors:
     """Return priors in Cartesian axes."""
     cameras = sorted(found)
     positions, covariances = (np.array([found[k][part] for k in cameras]) for part in (0, 1))
     statement, datum = source, None
     if geodetic:
-        if (np.abs(positions[:, 0]) > 90.0).any() or (np.abs(positions[:, 1]) > 360.0).any():
-            raise InputError(f"{source}: a latitude or longitude is out of range; give degrees")
         datum = Datum(*np.median(positions, axis=0).tolist())
-        transform = pycolmap.GPSTransform(pycolmap.GPSTransformEllipsoid.WGS84)
-        positions = np.asarray(transform.ellipsoid_to_enu(positions, *datum))
+        try:
+            positions = enu_of(positions, datum)
+        except ValueError as error:
+            raise InputError(f"{source}: {error}") from error
         latitude, longitude, altitude = datum
         statement += (
             f", in meters east, north and up of {latitude:.6f}, {longitude:.6f} deg, {altitude:.2f} m"
         )
     return PositionPriors(
-        cameras=np.array(cameras, dtype=np.int64),
-        positions=positions,
-        covariances=covariances,
+        known=KnownPositions.measured(np.array(cameras, dtype=np.int64), positions, covariances),
         statement=statement,
         datum=datum,
     )

@@ -15,7 +15,7 @@ import sfm_shapefit.commands.notebook_page  # noqa: F401  so that results show t
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.colmap.bundle_adjustment import GivenPoses, Uncertainty
-from sfm_shapefit.colmap.model import read_model
+from sfm_shapefit.colmap.model import PosedModel, read_model
 from sfm_shapefit.commands.stages.adjustment import (
     adjust_placed,
     pull_cameras,
@@ -41,15 +41,17 @@ from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.errors import UnsolvableError
 from sfm_shapefit.geometry import median_spread
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.placement.gauge import PositionPriors, tell_scale
+from sfm_shapefit.placement.gauge import Gauge, PositionPriors, tell_scale
 from sfm_shapefit.placement.move import bring_to_scale, move_cameras
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles, compare_with_priors
 from sfm_shapefit.results.intrinsics import NO_DOUBTS, Intrinsics, intrinsics_warnings
 from sfm_shapefit.results.result import Inputs, LocateResult
 from sfm_shapefit.results.warnings import (
     ambiguity_warnings,
     focal_warnings,
     match_warnings,
+    prior_warnings,
     quality_warnings,
     trust_warnings,
 )
@@ -84,7 +86,8 @@ def locate(
         options: settings, see `help(LocateOptions)`; defaults if None.
         **overrides: single options by name: `locate(model, min_trust=0.0)`.
         progress: called as stages advance, with the stage, the work done and the work in all.
-        priors: a table of position priors, see `colmap.priors.table_priors`; the database's own pose priors
+        priors: a table of position priors, see `colmap.priors.table_priors`, or the folder of the images,
+            whose EXIF data have them; the database's own pose priors
             serve if the scale is "prior" and there is no table.
         executor: shares out the pairs of a database among its workers, which must see its file, or a model's
             own tracks, with the same answer to the bit. None: all is done here.
@@ -181,10 +184,12 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
     focal_doubts = tuple(doubt for doubt in focal_doubts if doubt.camera not in intrinsics.refined.sigmas)
     gauge = tell_scale(seeded.gauge, placement.scale_sigma)
     located = located._replace(placement=placement, gauge=gauge)
+    prior_angles = _ask_priors(source.model, directions, known.priors, gauge, seeded.reconstruction)
     warnings = (
         *focal_warnings(source.model, focal_doubts, intrinsics.refined.undetermined),
         *intrinsics_warnings(intrinsics, intrinsics.rows(seeded.reconstruction)),
         *_collect_warnings(source, directions, located, seeded.reconstruction.num_points3D()),
+        *prior_warnings(prior_angles, directions.pairs, source.model.names),
     )
     return LocateResult(
         reconstruction=seeded.reconstruction,
@@ -204,9 +209,27 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         warnings=warnings,
         further=further,
         fixed=rigid.fixed,
+        prior_angles=prior_angles,
         focal_doubts=focal_doubts,
         intrinsics=intrinsics,
     )
+
+
+def _ask_priors(
+    model: PosedModel,
+    directions: PairDirections,
+    priors: PositionPriors | None,
+    gauge: Gauge,
+    output: "pycolmap.Reconstruction",
+) -> PriorAngles | None:
+    """Return how far directions are off the baselines of priors that set the axes, if any do."""
+    if priors is None or gauge.scale != "prior" or gauge.axes is None:
+        return None
+    centers = np.full((model.num_images, 3), np.nan)
+    for image, image_id in enumerate(model.image_ids.tolist()):
+        if output.image(image_id).has_pose:
+            centers[image] = output.image(image_id).projection_center()
+    return compare_with_priors(directions.pairs, directions.directions, priors, gauge, centers)
 
 
 def _choose(placement: Placement, rule: GaugeRule) -> Located:

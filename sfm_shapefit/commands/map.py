@@ -29,13 +29,14 @@ from sfm_shapefit.commands.stages.first_placement import adjust_first_placement
 from sfm_shapefit.commands.stages.gauge_choice import GaugeRule, read_priors
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source, read_left_out
 from sfm_shapefit.commands.stages.intrinsics import settle_intrinsics
+from sfm_shapefit.commands.stages.joins import JoinedModels, join_models
 from sfm_shapefit.commands.stages.rigs import find_rigid_parts
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.formats.pair_list import PairNames
 from sfm_shapefit.locate_options import LEAST_MATCHES, LocateOptions, MapOptions
 from sfm_shapefit.placement.gauge import FEWEST_PRIORS, PositionPriors
 from sfm_shapefit.results.intrinsics import Intrinsics
-from sfm_shapefit.results.map_result import MappedModel, MapResult
+from sfm_shapefit.results.map_result import MappedModel, MapResult, tell_joins
 from sfm_shapefit.results.result import Inputs, LocateResult, Loop
 from sfm_shapefit.rotations.averaged import AveragedRotations
 from sfm_shapefit.rotations.frames import relative_rotations_of_frames
@@ -117,27 +118,33 @@ def map_database(
     models, reasons = [], dict.fromkeys(range(int(frame_of_image.max()) + 1), _UNMATCHED)
     for frames, members, averaging in run.average_images(relative, reasons):
         try:
-            found = run.locate_component(members, averaging)
+            located = run.locate_component(members, averaging)
         except UnsolvableError as error:
             reasons |= dict.fromkeys(frames.tolist(), f"its component cannot be placed: {error}")
             continue
         names = tuple(unposed.names[k] for k in members.tolist())
-        found = replace(found, loops=tuple(_loops_of(visits, unposed.names, set(names))))
-        models.append(MappedModel(located=found, averaging=averaging, names=names))
+        located = replace(located, loops=tuple(_loops_of(visits, unposed.names, set(names))))
+        models.append(MappedModel(located=located, averaging=averaging, names=names))
         for k in frames.tolist():
             del reasons[k]
     if not models:
         raise UnsolvableError(_explain_failure(path, relative, reasons))
     models.sort(key=lambda model: -int(model.located.kept.sum()))
+    found = JoinedModels((), ())
+    if options.join == "safe":
+        with clock("join"):
+            found = join_models(models, unposed, path, positions, run.without)
     left_out = {
         name: reasons[frame]
         for name, frame in zip(unposed.names, frame_of_image.tolist(), strict=True)
         if frame in reasons
     }
-    return MapResult(
+    result = MapResult(
         database=path,
         options=options,
         models=tuple(models),
+        joins=found.joins,
+        joined=found.joined,
         num_images=unposed.num_images,
         num_pairs=len(relative.pairs),
         num_frames=videos.num_frames,
@@ -145,6 +152,7 @@ def map_database(
         timings_s=clock.seconds,
         warnings=tuple(_warnings(images, models, left_out)),
     )
+    return tell_joins(result)
 
 
 def database_in(path: Path) -> Path:
@@ -303,7 +311,7 @@ class _Run(NamedTuple):
         """Place one component: adjust a first placement, and locate from the rotations of that."""
         image_ids = self.unposed.image_ids[members].tolist()
         priors = None if self.priors is None else self.priors.of(members)
-        if priors is not None and len(priors.cameras) < FEWEST_PRIORS:
+        if priors is not None and len(priors) < FEWEST_PRIORS:
             priors = None
         options = self._options_of(members, has_priors=priors is not None)
         model = self._pose(image_ids, averaging.rotations)
@@ -338,20 +346,16 @@ class _Run(NamedTuple):
     def _options_of(self, members: IntArray, *, has_priors: bool) -> LocateOptions:
         """Return the options of one component, whose scale is what is known of its own images."""
         settings = {item.name: getattr(self.options, item.name) for item in fields(LocateOptions)}
-        known = self.options.known_distance
-        if known is not None and not {*known[:2]} <= {self.unposed.names[k] for k in members.tolist()}:
-            # The known distance belongs to another component.
-            known, settings["known_distance"] = None, None
-            settings["scale"] = "auto"
+        names = {self.unposed.names[k] for k in members.tolist()}
+        # Other known distances belong to other components.
+        known = tuple(one for one in self.options.known_distance if {*one[:2]} <= names)
+        if len(known) < len(self.options.known_distance):
+            settings["known_distance"] = known
+            settings["scale"] = settings["scale"] if known else "auto"
         if not has_priors:
             settings["refine_with_priors"] = False
         has_rigs = any(i in self.images.rigs.place_of_image for i in self.unposed.image_ids[members].tolist())
-        if (
-            known is None
-            and not has_priors
-            and not has_rigs
-            and settings["scale"] in ("auto", "input", "prior")
-        ):
+        if not known and not has_priors and not has_rigs and settings["scale"] in ("auto", "input", "prior"):
             # There is no input whose scale could be taken.
             settings["scale"] = "unit"
         return LocateOptions(**settings)

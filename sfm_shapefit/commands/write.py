@@ -1,7 +1,8 @@
 """OUT on disk: the seeded model, `locate.json`, `cameras.csv`, `pairs.csv`, `report.html`, scenes if wanted.
 
 Further parallel-rigid pieces stand in `pieces/1`, `pieces/2`, ...: a seeded model and a `cameras.csv` each. A
-bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `map.json` beside them.
+bare graph has no model. `map` has such a folder per model, `0`, `1`, ..., and `map.json` beside them; models
+that were joined stand in `joined_0` in one world too.
 """
 
 from collections.abc import Mapping
@@ -62,6 +63,9 @@ def write_result(
             for number, model in enumerate(found.models):
                 (folder / str(number)).mkdir()
                 _write_files(model.located, folder / str(number), options)
+            for joined in found.joined:
+                (folder / joined.folder).mkdir()
+                write_model(joined.reconstruction, folder / joined.folder)
             write_json(found.summary(), folder / MAP_MARKER)
         else:
             _write_files(found, folder, options)

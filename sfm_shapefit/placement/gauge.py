@@ -5,6 +5,7 @@ the input's. A gauge is a scale and a shift of the centers and, with position pr
 whole model onto their axes.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple
 
@@ -15,12 +16,14 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import (
     MEDIAN_NORMAL_LENGTH,
     METRIC_SIGMA,
+    SIGMA_PER_MEDIAN,
     Similarity,
     fit_similarity,
     fit_similarity_l1,
     median_spread,
     rotation_angles_deg,
 )
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.refinement.options import Scale
 
 # An input center that is farther off, of the spread of all, is lost and must not set the scale.
@@ -76,12 +79,8 @@ class Gauge:
 class PositionPriors:
     """Measured positions of some cameras, such as GPS, in axes and units of their own."""
 
-    cameras: IntArray
-    """(k,) whose they are, ascending indices without repetition."""
-    positions: FloatArray
-    """(k, 3)"""
-    covariances: FloatArray
-    """(k, 3, 3), in the positions' units squared; NaN where unknown."""
+    known: KnownPositions
+    """By camera."""
     statement: str
     """Where they come from, and what their axes are."""
     datum: Datum | None = None
@@ -89,10 +88,11 @@ class PositionPriors:
 
     def of(self, cameras: IntArray) -> "PositionPriors":
         """Return the priors of some cameras (n,), ascending, numbered by their place among these."""
-        _, rows, places = np.intersect1d(self.cameras, cameras, assume_unique=True, return_indices=True)
-        return replace(
-            self, cameras=places, positions=self.positions[rows], covariances=self.covariances[rows]
-        )
+        return replace(self, known=self.known.among(cameras))
+
+    def __len__(self) -> int:
+        """Return how many cameras have one."""
+        return len(self.known.indices)
 
 
 def input_gauge(locations: FloatArray, input_centers: FloatArray) -> Gauge:
@@ -166,28 +166,62 @@ def unit_gauge(locations: FloatArray, because: str = "") -> Gauge:
     return Gauge(similarity=_keep_axes(scale, -scale * centroid), scale="unit", statement=statement)
 
 
-def distance_gauge(locations: FloatArray, first: int, second: int, distance: float, names: str) -> Gauge:
-    """Return the gauge in which two cameras are so far apart; origin: the centroid.
+def distance_gauge(
+    locations: FloatArray, pairs: IntArray, distances: FloatArray, names: Sequence[str]
+) -> Gauge:
+    """Return the gauge in which cameras are so far apart; origin: the centroid.
+
+    One distance becomes true. Of several the scale is the robust least-squares fit to all, weights
+    1 / (1 + (residual / 3 levels)^4), from the median of what each says alone.
 
     Args:
         locations: (n, 3) the solver's answer.
-        first, second: two of the cameras.
-        distance: their distance in the output's units, positive.
-        names: the two cameras, for the statement.
+        pairs: (k, 2) cameras, k >= 1.
+        distances: (k,) of each pair in the output's units, positive.
+        names: (k,) the cameras of each pair, for the statement.
 
     Raises:
-        InputError: if the two cameras coincide in the answer.
+        InputError: if the cameras of a pair coincide in the answer.
     """
-    apart = float(np.linalg.norm(locations[first] - locations[second]))
-    if apart <= _COINCIDENT * median_spread(locations):
-        raise InputError(f"the cameras {names} coincide, so their distance sets no scale; choose two others")
-    scale = distance / apart
+    apart = np.linalg.norm(locations[pairs[:, 0]] - locations[pairs[:, 1]], axis=1)
+    near = apart <= _COINCIDENT * median_spread(locations)
+    if near.any():
+        name = names[int(np.argmax(near))]
+        raise InputError(f"the cameras {name} coincide, so their distance sets no scale; choose two others")
+    scale, weights, sigma = _scale_of_distances(apart, distances)
+    residuals = scale * apart - distances
+    said = f"{names[0]} are {distances[0]:g} apart"
+    if len(distances) > 1:
+        worst = int(np.argmax(np.abs(residuals)))
+        said = (
+            f"{int(np.sum(weights >= 0.5))} of {len(distances)} known distances agree, on a scale known to "
+            f"{100.0 * sigma:.2g} %; {names[worst]} miss theirs most, by {residuals[worst]:.3g}"
+        )
     similarity = _keep_axes(scale, -scale * locations.mean(axis=0))
-    statement = f"distance: {names} are {distance:g} apart; origin: the cameras' centroid, axes: the input's"
-    return Gauge(similarity=similarity, scale="distance", statement=statement)
+    statement = f"distance: {said}; origin: the cameras' centroid, axes: the input's"
+    return Gauge(
+        similarity=similarity,
+        scale="distance",
+        statement=statement,
+        scale_sigma=sigma if len(distances) > 1 else None,
+        warning=f"the known distances contradict one another: {said}" if sigma > METRIC_SIGMA else "",
+    )
 
 
-def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
+def _scale_of_distances(apart: FloatArray, distances: FloatArray) -> tuple[float, FloatArray, float]:
+    """Return the scale, the weight of each distance in [0, 1], and the relative standard deviation."""
+    scale, weights = float(np.median(distances / apart)), np.ones(len(apart))
+    level = SIGMA_PER_MEDIAN * float(np.median(np.abs(scale * apart - distances)))
+    spread = max(level, 1e-12 * float(distances.max()))
+    for _ in range(_REWEIGHTINGS):
+        weights = 1.0 / (1.0 + ((scale * apart - distances) / (_KERNEL_WIDTH * spread)) ** 4)
+        scale = float(weights * apart @ distances / (weights * apart @ apart))
+    left = max(float(weights.sum()) - 1.0, 1e-3)
+    variance = float(weights @ (scale * apart - distances) ** 2) / left
+    return scale, weights, float(np.sqrt(variance / (weights * apart @ apart))) / scale
+
+
+def prior_gauge(locations: FloatArray, priors: PositionPriors, *, axes_known: bool = True) -> Gauge:
     """Return the gauge of position priors: a robust similarity, with a turn if they determine one.
 
     From the L1 fit, reweighted least squares with the priors' standard deviations (or one level for all,
@@ -197,25 +231,29 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     Args:
         locations: (n, 3) the solver's answer.
         priors: of these cameras.
+        axes_known: whether the locations' axes mean anything. If not, and the priors lie on a line, the model
+            is turned onto that line, and about it by any angle.
 
     Raises:
         InputError: if fewer than two cameras have one, or the priors coincide or contradict the answer.
     """
-    if len(priors.cameras) < FEWEST_PRIORS:
+    if len(priors) < FEWEST_PRIORS:
         raise InputError(
-            f"{len(priors.cameras)} of the placed cameras have a position prior, and a scale needs two; "
+            f"{len(priors)} of the placed cameras have a position prior, and a scale needs two; "
             "give priors of more cameras, or choose another scale"
         )
-    source, target = locations[priors.cameras], priors.positions
+    source, target = locations[priors.known.indices], priors.known.positions
     size = median_spread(target)
     if size <= _COINCIDENT * max(1.0, float(np.abs(target).max())):
         raise InputError("the position priors coincide, so they set no scale; choose another scale")
     turns = len(source) >= _PRIORS_FOR_AXES
-    found, weights, level = _fit_to_priors(source, priors, size, rotate=turns)
+    found, weights, level = fit_to_priors(source, priors, size, rotate=turns)
     across = np.sqrt(np.linalg.svd(_center(target, weights), compute_uv=False)[1] ** 2 / weights.sum())
     if turns and across <= max(_FLAT * level, _COINCIDENT * size):  # exact priors have no level
         turns = False
-        found, weights, level = _fit_to_priors(source, priors, size, rotate=False)
+        found, weights, level = fit_to_priors(source, priors, size, rotate=False)
+    if not turns and not axes_known:
+        found, weights, level = fit_to_priors(source, priors, size, rotate=True)
     if found.scale <= 0.0:
         raise InputError(
             "the position priors contradict the cameras that were found; check that names and axes are right"
@@ -223,9 +261,9 @@ def prior_gauge(locations: FloatArray, priors: PositionPriors) -> Gauge:
     return Gauge(
         similarity=_keep_axes(found.scale, found.rotation.T @ found.translation),
         scale="prior",
-        axes=found.rotation if turns else None,
-        statement=_prior_statement(priors, found, weights, level, turns=turns),
-        warning=_prior_warning(level, size, turns=turns),
+        axes=found.rotation if turns or not axes_known else None,
+        statement=_prior_statement(priors, found, weights, level, turns=turns or not axes_known),
+        warning=_prior_warning(level, size, turns=turns, axes_known=axes_known),
         datum=priors.datum if turns else None,
     )
 
@@ -254,14 +292,20 @@ def _keep_axes(scale: float, shift: FloatArray) -> Similarity:
     return Similarity(scale=scale, rotation=np.eye(3), translation=shift)
 
 
-def _fit_to_priors(
+def fit_to_priors(
     source: FloatArray, priors: PositionPriors, size: float, *, rotate: bool
 ) -> tuple[Similarity, FloatArray, float]:
-    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals."""
-    target = priors.positions
+    """Return the similarity, the weight of each prior in [0, 1], and the level of their residuals.
+
+    Args:
+        source: (k, 3) the locations of the cameras that have a prior.
+        priors: theirs.
+        size: the spread of the priors.
+        rotate: whether the axes are to be found too.
+    """
+    target = priors.known.positions
     found = fit_similarity_l1(source, target, rotate=rotate, cap=_CAP_OF_SIZE * size)
-    sigmas = np.sqrt(np.trace(priors.covariances, axis1=1, axis2=2) / 3.0)
-    sigmas = np.where(np.isfinite(sigmas), sigmas, 0.0)
+    sigmas = np.nan_to_num(priors.known.sigmas(), nan=0.0)
     weights = np.ones(len(source))
     level = 0.0
     for _ in range(_REWEIGHTINGS):
@@ -292,11 +336,16 @@ def _prior_statement(
     )
 
 
-def _prior_warning(level: float, size: float, *, turns: bool) -> str:
+def _prior_warning(level: float, size: float, *, turns: bool, axes_known: bool) -> str:
     if level > _ROUGH * size:
         return (
             f"the position priors are {level / size:.0%} of their spread off the answer, so scale and axes "
             "taken from them are rough; check them"
+        )
+    if not turns and not axes_known:
+        return (
+            "the position priors lie on a line or are fewer than three, so the model is turned onto that "
+            "line, and about it by any angle"
         )
     if not turns:
         return (

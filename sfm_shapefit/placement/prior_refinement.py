@@ -7,9 +7,10 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.geometry import MEDIAN_NORMAL_LENGTH
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import Gauge, PositionPriors
 from sfm_shapefit.placement.place import Placement, replace_locations
-from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
+from sfm_shapefit.refinement.anchored import refine_anchored, weighted_anchors
 from sfm_shapefit.refinement.angular import KERNEL_WIDTH, Metric
 from sfm_shapefit.refinement.options import PlacementOptions
 
@@ -24,7 +25,7 @@ class Pulled(NamedTuple):
     """Refined on directions and priors together, and judged anew."""
     gauge: Gauge
     """That of before; its statement says by how much the priors moved cameras."""
-    anchors: Anchors
+    anchors: KnownPositions
     """The priors by the placement's cameras, in its gauge but for the axes, which are the input's; each has
     the weight that it ended with: a wrong one has none."""
 
@@ -47,7 +48,7 @@ def pull_to_priors(
         UnsolvableError: if the factor would take more memory than the options allow.
     """
     part, refined = placement.measured_part(), placement.refined
-    own = priors.of(placement.nodes)
+    own = priors.of(placement.nodes).known
     start = gauge.similarity.apply(refined.locations)
     anchors = _anchor(start, own, np.eye(3) if gauge.axes is None else gauge.axes)
     levels = np.radians(np.array(refined.levels_deg))
@@ -56,7 +57,7 @@ def pull_to_priors(
         part.graph, start, metric, levels, anchors, max_bytes=options.factor_memory_mb * 1_000_000
     )
     by = float(np.median(np.linalg.norm((moved - start)[: len(placement.cameras)], axis=1)))
-    held = anchors.nodes[anchors.chi2(moved) <= KERNEL_WIDTH**2]
+    held = anchors.indices[anchors.chi2(moved) <= KERNEL_WIDTH**2]
     kept = replace(
         refined,
         locations=(moved - gauge.similarity.translation) / gauge.similarity.scale,
@@ -65,16 +66,14 @@ def pull_to_priors(
     return Pulled(
         replace_locations(placement, kept, options),
         replace(gauge, statement=f"{gauge.statement}{PULLED}{by:.3g} (median)"),
-        anchors.weighted(moved),
+        weighted_anchors(anchors, moved),
     )
 
 
-def _anchor(start: FloatArray, priors: PositionPriors, axes: FloatArray) -> Anchors:
+def _anchor(start: FloatArray, known: KnownPositions, axes: FloatArray) -> KnownPositions:
     """Return the priors in the input's axes; those of unknown covariance get that of their residuals."""
-    positions = priors.positions @ axes
-    residuals = np.linalg.norm(start[priors.cameras] - positions, axis=1)
-    level = float(np.median(residuals)) / MEDIAN_NORMAL_LENGTH
-    covariances = priors.covariances.copy()
-    covariances[~np.isfinite(covariances).all(axis=(1, 2))] = level**2 * np.eye(3)
-    information = np.linalg.inv(axes.T @ covariances @ axes)
-    return Anchors(priors.cameras, positions, np.asarray(information, dtype=np.float64))
+    turned = known._replace(positions=known.positions @ axes)
+    level = float(np.median(np.linalg.norm(turned.off(start), axis=1))) / MEDIAN_NORMAL_LENGTH
+    information = known.information.copy()
+    information[~np.isfinite(information).all(axis=(1, 2))] = level**-2 * np.eye(3)
+    return turned._replace(information=axes.T @ information @ axes)

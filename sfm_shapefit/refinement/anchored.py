@@ -9,12 +9,11 @@ which stands at the origin: the normal matrix is a block Laplacian still, and wh
 everything, is settled by that node. Units are those of the anchors; directions do not mind.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.errors import UnsolvableError
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.laplacian.symbolic import DEFAULT_FACTOR_BYTES
 from sfm_shapefit.refinement.angular import (
     DAMPING,
@@ -35,29 +34,10 @@ _MAX_STEPS = 40
 _CONVERGED = 1e-9
 
 
-class Anchors(NamedTuple):
-    """Measured positions."""
-
-    nodes: IntArray
-    """(k,) whose they are."""
-    positions: FloatArray
-    """(k, d)"""
-    information: FloatArray
-    """(k, d, d) inverse covariances."""
-
-    def off(self, t: FloatArray) -> FloatArray:
-        """Return how far locations (n, d) are off, (k, d)."""
-        return np.asarray(t[self.nodes] - self.positions)
-
-    def chi2(self, t: FloatArray) -> FloatArray:
-        """Return the same in standard deviations, squared, (k,)."""
-        off = self.off(t)
-        return np.asarray(np.einsum("ka,kab,kb->k", off, self.information, off))
-
-    def weighted(self, t: FloatArray) -> "Anchors":
-        """Return the anchors of plain squares whose pull at locations (n, d) is that of these."""
-        weights = 1.0 / (1.0 + (self.chi2(t) / KERNEL_WIDTH**2) ** 2)
-        return self._replace(information=weights[:, None, None] * self.information)
+def weighted_anchors(anchors: KnownPositions, t: FloatArray) -> KnownPositions:
+    """Return the anchors of plain squares whose pull at locations (n, d) is that of these."""
+    weights = 1.0 / (1.0 + (anchors.chi2(t) / KERNEL_WIDTH**2) ** 2)
+    return anchors._replace(information=weights[:, None, None] * anchors.information)
 
 
 def refine_anchored(
@@ -65,7 +45,7 @@ def refine_anchored(
     start: FloatArray,
     metric: Metric,
     levels: FloatArray,
-    anchors: Anchors,
+    anchors: KnownPositions,
     *,
     max_bytes: int = DEFAULT_FACTOR_BYTES,
 ) -> FloatArray:
@@ -96,17 +76,17 @@ def refine_anchored(
     return t
 
 
-def _join(graph: ViewGraph, anchors: Anchors) -> GraphShape:
+def _join(graph: ViewGraph, anchors: KnownPositions) -> GraphShape:
     """Return the pairs of the graph, and those of the anchors' nodes with the origin, the last node."""
     n = graph.num_nodes
-    links = np.stack([anchors.nodes, np.full(len(anchors.nodes), n)], axis=1)
+    links = np.stack([anchors.indices, np.full(len(anchors.indices), n)], axis=1)
     return GraphShape(n + 1, np.concatenate([graph.edges, links]), graph.dimension)
 
 
 class _AnchoredTerms(AngularTerms):
     """The joint cost and its normal equations, over the pairs of `_join`."""
 
-    def __init__(self, graph: ViewGraph, information: FloatArray, anchors: Anchors) -> None:
+    def __init__(self, graph: ViewGraph, information: FloatArray, anchors: KnownPositions) -> None:
         super().__init__(graph, information)
         self._anchors, self._joined = anchors, _join(graph, anchors)
 
@@ -118,7 +98,7 @@ class _AnchoredTerms(AngularTerms):
     def normal_equations(self, t: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return blocks (m + k, d, d), damping (m + k,) and the right-hand side (n + 1, d)."""
         blocks, damped, gradient = self.linearize(t)
-        own = self._anchors.weighted(t).information
+        own = weighted_anchors(self._anchors, t).information
         pull = np.einsum("kab,kb->ka", own, self._anchors.off(t))
         right = -adjoint(np.concatenate([gradient, pull]), self._joined.edges, self._joined.num_nodes)
         return np.concatenate([blocks, own]), np.append(damped, np.zeros(len(own))), right

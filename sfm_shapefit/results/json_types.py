@@ -240,6 +240,41 @@ class LoopOfVideo(TypedDict):
     tolerance_deg: Annotated[float, "Up to where they agree with it."]
 
 
+class KnownDistance(TypedDict):
+    """A distance that was told."""
+
+    first: Annotated[str, "Name of an image."]
+    second: Annotated[str, "Name of another."]
+    known: Annotated[float, "How far apart they are, as told."]
+    found: Annotated[float | None, "In the output; null if one of them is not in it."]
+
+
+class Alignment(TypedDict):
+    """A similarity of the world: scale * rotation @ center + translation."""
+
+    scale: Annotated[float, "Units of the one world in one of the other."]
+    rotation: Annotated[list[list[float]], "3 rows."]
+    translation: Annotated[list[float], "In units of the world that is mapped to."]
+
+
+class Join(TypedDict):
+    """A model of `map` beside the largest, and what came of joining it to a larger one."""
+
+    model: Annotated[str, "Its folder."]
+    to: Annotated[str, "The folder of the model that it was to be joined to."]
+    joined: Annotated[bool, "Whether it was."]
+    folder: Annotated[str | None, "Where both stand in one world; null if they are not joined."]
+    statement: Annotated[str, "How and how surely, or why not, in words."]
+    scale_sigma: Annotated[float | None, "Relative standard deviation of the scale between them."]
+    turn_sigma_deg: Annotated[float | None, "Standard deviation of the turn between them."]
+    center_sigma: Annotated[
+        float | None,
+        "Standard deviation of where its cameras come to lie, median, in units of the model that it is "
+        "joined to.",
+    ]
+    similarity: Annotated[Alignment | None, "From its world to that of the model that it is joined to."]
+
+
 class LocateSummary(PlacementSummary):
     """locate.json, and what `sfm-shapefit locate --json` prints."""
 
@@ -260,6 +295,7 @@ class LocateSummary(PlacementSummary):
     scale_sigma: Annotated[
         float | None, "Relative standard deviation of a scale that rigs or priors tell; else null."
     ]
+    known_distances: Annotated[list[KnownDistance], "What was told of distances, and what the model has."]
     datum: Annotated[EarthDatum | None, "Where the output's origin is on Earth; null if that is not known."]
     rigid_groups: Annotated[RigidGroups | None, "Null where every camera moves by itself."]
     intrinsics: Annotated[
@@ -277,6 +313,7 @@ class LocateSummary(PlacementSummary):
     adjustment: Annotated[PlacementAdjustment | None, "Null if the placement stayed as it was found."]
     rotation_refinement: Annotated[RotationRefinement | None, "Null if the placement was not adjusted."]
     bundle_adjustment: Annotated[BundleAdjustment | None, "Null if it was not asked for."]
+    join: Annotated[Join | None, "Of a model of `map` beside the largest; else null."]
 
 
 class GraphInputs(TypedDict):
@@ -336,9 +373,27 @@ class MapSummary(TypedDict):
     num_frames: Annotated[int, "Images that are frames of a video."]
     num_pairs: Annotated[int, "Pairs with a relative rotation."]
     models: Annotated[list[Model], "One per connected component, most cameras first."]
+    joins: Annotated[list[Join], "What came of joining the models; one for each but the largest."]
     left_out: Annotated[dict[str, str], "Images in no model, and why."]
     timings_s: Timings
     warnings: Warnings
+
+
+class PositionsSummary(TypedDict):
+    """What `sfm-shapefit evaluate --json` prints against a table of known positions."""
+
+    statement: Annotated[str, "What is compared with what, in words."]
+    num_reference: Annotated[int, "Cameras of the table."]
+    num_common: Annotated[int, "Cameras of both, by name."]
+    missing: Annotated[list[str], "Names of the cameras that the model lacks."]
+    position_error: Annotated[
+        ErrorSummary | None, "As they stand, in the table's units; null if the model has no datum."
+    ]
+    median_offset: Annotated[
+        list[float] | None, "Model minus table as they stand, the median of each axis; else null."
+    ]
+    aligned_position_error: Annotated[ErrorSummary, "After the robust similarity that fits best."]
+    ref_from_model: Annotated[Alignment, "From the model's world to the table's."]
 
 
 class Expected(TypedDict):
@@ -359,14 +414,6 @@ class InspectSummary(TypedDict):
     theory: Annotated[dict[str, Any] | None, "Constants of the recovery theorems, if asked for."]
     expected: Annotated[Expected | None, "What locate will take; null for a bare graph."]
     rigs: Annotated[str, "How many frames hang together, if the model has rigs."]
-
-
-class Alignment(TypedDict):
-    """The robust similarity of the centers: scale * rotation @ center + translation."""
-
-    scale: Annotated[float, "The reference's units in one of the model."]
-    rotation: Annotated[list[list[float]], "3 rows."]
-    translation: Annotated[list[float], "In the reference's units."]
 
 
 class WorstCamera(TypedDict):

@@ -1,16 +1,18 @@
 """What `map` returns, and its files: COLMAP's layout of several models, each with the files of `locate`.
 
 OUT/0, OUT/1, ...   models, largest first: each a folder as `locate` writes it
+OUT/joined_0        models that were joined, in the world of the first, where that was safe
 OUT/map.json        the averaging behind each, and the images in no model with the reason
 """
 
 import html
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
 from sfm_shapefit.display import Displayed
 from sfm_shapefit.locate_options import MapOptions
+from sfm_shapefit.results.joins import Joined, JoinedModel
 from sfm_shapefit.results.json_types import Averaging, LocateSummary, MapSummary
 from sfm_shapefit.results.result import LocateResult
 from sfm_shapefit.results.tables import SCHEMA_VERSION
@@ -44,6 +46,10 @@ class MapResult(Displayed):
     left_out: dict[str, str]
     """Name and reason of each image in no model."""
     timings_s: dict[str, float]
+    joins: tuple[Joined, ...] = ()
+    """What came of joining each model but the largest to a larger one."""
+    joined: tuple[JoinedModel, ...] = ()
+    """Models that were joined, in one world; each stands in `models` by itself too."""
     warnings: tuple[str, ...]
     """What the user should know beyond the warnings of each model."""
 
@@ -72,11 +78,16 @@ class MapResult(Displayed):
                 }
                 for number, model in enumerate(self.models)
             ],
+            "joins": [join.summary(self.folder_of_join(join)) for join in self.joins],
             "left_out": self.left_out,
             "timings_s": self.timings_s,
             "warnings": list(self.warnings),
         }
         return dict(facts)
+
+    def folder_of_join(self, join: Joined) -> str | None:
+        """Return where the models of a join stand in one world; None if they were not joined."""
+        return next((one.folder for one in self.joined if join.join and join.model in one.models), None)
 
     def _repr_html_(self) -> str:
         """Return what matters of all models, and what the largest shows of itself."""
@@ -85,3 +96,14 @@ class MapResult(Displayed):
     def _headline(self) -> str:
         models = counted(len(self.models), "model")
         return f"{self.num_placed} of {self.num_images} images placed in {models}"
+
+
+def tell_joins(result: MapResult) -> MapResult:
+    """Return the result whose models know what came of joining them."""
+    models = list(result.models)
+    for join in result.joins:
+        facts = join.summary(result.folder_of_join(join))
+        models[join.model] = replace(
+            models[join.model], located=replace(models[join.model].located, join=facts)
+        )
+    return replace(result, models=tuple(models))

@@ -21,12 +21,13 @@ from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.locate_options import LocateOptions, Source
 from sfm_shapefit.placement.gauge import Gauge
 from sfm_shapefit.placement.place import Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
 from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
 from sfm_shapefit.results.intrinsics import Intrinsics
-from sfm_shapefit.results.json_types import GraphSummary, LocateSummary
+from sfm_shapefit.results.json_types import GraphSummary, Join, LocateSummary
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
@@ -121,6 +122,9 @@ class LocateResult(Displayed):
     """(m,) see `rotations.missing_matches`; None as above, and NaN of all where there are too many pairs."""
     loops: tuple[Loop, ...] = ()
     """Of the videos among the images, where `map` looked for some."""
+    prior_angles: PriorAngles | None = None
+    """Of each of the `directions`, how far it is off the baseline of position priors; None without priors
+    that set the axes."""
     poor: dict[int, int] = field(default_factory=dict)
     """By the id of each image that was left out because it sees too few points, their number."""
     agreeing_observations: float = math.nan
@@ -131,6 +135,8 @@ class LocateResult(Displayed):
 
     intrinsics: Intrinsics = field(default_factory=Intrinsics)
     """Cameras whose intrinsics were in doubt, and what became of them."""
+    join: Join | None = None
+    """What came of joining it to a larger model of `map`."""
 
     def summary(self) -> dict[str, Any]:
         """Return what stands in locate.json."""
@@ -251,14 +257,17 @@ class LocateResult(Displayed):
                 strict=True,
             )
         ]
-        if self.triplet_scores is None or self.matched_shares is None:
-            return rows
-        scores = score_pairs(self.triplet_scores, self.matched_shares)
-        columns = (self.triplet_scores.tolist(), self.matched_shares.tolist(), scores.tolist())
-        return [
-            replace(row, triplet_score=triplet, matched_share=share, pair_score=score)
-            for row, triplet, share, score in zip(rows, *columns, strict=True)
-        ]
+        if self.triplet_scores is not None and self.matched_shares is not None:
+            scores = score_pairs(self.triplet_scores, self.matched_shares)
+            columns = (self.triplet_scores.tolist(), self.matched_shares.tolist(), scores.tolist())
+            rows = [
+                replace(row, triplet_score=triplet, matched_share=share, pair_score=score)
+                for row, triplet, share, score in zip(rows, *columns, strict=True)
+            ]
+        if self.prior_angles is not None:
+            angles = self.prior_angles.angles_deg.tolist()
+            rows = [replace(row, prior_angle_deg=angle) for row, angle in zip(rows, angles, strict=True)]
+        return rows
 
     @cached_property
     def line_sigma(self) -> float | None:

@@ -15,6 +15,7 @@ from sfm_shapefit.results.json_types import (
     InspectSummary,
     LocateSummary,
     MapSummary,
+    PositionsSummary,
 )
 
 PATH = Path(__file__).parents[1] / "schemas" / "output.schema.json"
@@ -24,6 +25,7 @@ _COMMANDS = {
     "solve_graph": GraphSummary,
     "inspect": InspectSummary,
     "evaluate": EvaluateSummary,
+    "evaluate_table": PositionsSummary,
     "map": MapSummary,
 }
 _SIMPLE = {int: "integer", float: "number", str: "string", bool: "boolean", type(None): "null"}
@@ -39,7 +41,7 @@ def output_schema() -> dict[str, Any]:
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "Output of sfm-shapefit",
         "description": "Each command prints one object with --json. $defs has the schema of each: locate, "
-        "solve_graph (the command place), inspect, evaluate, map.",
+        "solve_graph (the command place), inspect, evaluate (against a table: evaluate_table), map.",
         "anyOf": [{"$ref": f"#/$defs/{name}"} for name in _COMMANDS],
         "$defs": definitions,
     }

@@ -15,6 +15,7 @@ from sfm_shapefit.results.json_types import (
     BundleAdjustment,
     EarthDatum,
     GraphSummary,
+    KnownDistance,
     LocateSummary,
     LoopOfVideo,
     Lud,
@@ -70,6 +71,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "num_points_as_nodes": int(np.sum(placement.nodes >= placement.num_cameras)),
         "scale": found.gauge.statement,
         "scale_sigma": found.gauge.scale_sigma,
+        "known_distances": _known_distances(found),
         "datum": None if found.gauge.datum is None else cast("EarthDatum", found.gauge.datum._asdict()),
         "rigid_groups": _summarize_groups(found),
         "intrinsics": found.intrinsics.rows(model),
@@ -79,7 +81,27 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "adjustment": _summarize_adjustment(found),
         "rotation_refinement": _summarize_rotations(found.turned_deg),
         "bundle_adjustment": _pick(BundleAdjustment, found.adjusted),
+        "join": found.join,
     }
+
+
+def _known_distances(found: "LocateResult") -> list[KnownDistance]:
+    """Return the distances that were told, each with what the output has."""
+    known = found.options.known_distance
+    named = {name for one in known for name in one[:2]}
+    images = found.reconstruction.images.values() if named else ()
+    centers = {i.name: i.projection_center() for i in images if i.name in named and i.has_pose}
+    return [
+        {
+            "first": first,
+            "second": second,
+            "known": float(distance),
+            "found": float(np.linalg.norm(centers[first] - centers[second]))
+            if first in centers and second in centers
+            else None,
+        }
+        for first, second, distance in known
+    ]
 
 
 def summarize_graph(found: "GraphResult") -> GraphSummary:

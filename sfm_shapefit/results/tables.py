@@ -78,6 +78,8 @@ class PairRow:
     pair_score: float = math.nan
     """`triplet_score` (0.5 where there is none) times `matched_share`: the lowest of a scene are the
     likeliest to be repeated structure."""
+    prior_angle_deg: float = math.nan
+    """Angle between the direction and the baseline of the position priors, where both cameras have one."""
 
 
 Row = TypeVar("Row", CameraRow, PairRow)
@@ -91,7 +93,7 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
-_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score"}
+_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score", "prior_angle_deg"}
 """What earlier outputs lack."""
 
 

@@ -1,6 +1,6 @@
 """What the user should know beyond the tables, a sentence each."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from sfm_shapefit.judgement.turns import Doubt
 from sfm_shapefit.judgement.uncertainty import standard_deviations
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import SMALLEST_PIECE, Placement
+from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.solver.options import Status
+from sfm_shapefit.wording import counted
 
 # A larger share of pairs that contradict the solution, or the given rotations, is warned of.
 _ALARMING_SHARE = 0.5
@@ -175,3 +177,18 @@ def _least_trusted(placement: Placement, rows: IntArray) -> str:
     """Return the name of the least trusted of some of the placed cameras, and why it is."""
     worst = int(rows[np.argmin(placement.assessment.trust[rows])])
     return f"{placement.graph.name_of(int(placement.cameras[worst]))} ({placement.assessment.reasons[worst]})"
+
+
+def prior_warnings(found: PriorAngles | None, pairs: IntArray, names: Sequence[str]) -> Iterator[str]:
+    """Warn of pairs whose directions contradict the baselines of position priors."""
+    if found is None or not found.contradicting.any():
+        return
+    rows = np.flatnonzero(found.contradicting)
+    worst = int(rows[np.argmax(found.angles_deg[rows])])
+    first, second = (names[k] for k in pairs[worst].tolist())
+    compared = int(np.isfinite(found.angles_deg).sum())
+    yield (
+        f"the directions of {len(rows)} of {counted(compared, 'pair')} contradict the baselines of their "
+        f"position priors, that of {first} and {second} most, by {found.angles_deg[worst]:.0f} deg; see "
+        "prior_angle_deg in pairs.csv"
+    )

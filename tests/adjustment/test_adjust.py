@@ -11,7 +11,6 @@ import pytest
 from sfm_shapefit.adjustment import (
     AdjustmentOptions,
     AdjustmentProblem,
-    CenterPrior,
     Ending,
     Lens,
     LensPrior,
@@ -27,6 +26,7 @@ from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.solve import values_of
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.known_positions import KnownPositions
 from tests.adjustment.made import disturb, look_at, ring_problem
 
 TIGHT = AdjustmentOptions(cost_tolerance=0.0, gradient_tolerance=1e-12, loss_scale_px=2.0)
@@ -117,13 +117,12 @@ def test_a_tiny_sigma_equals_held_rotations_and_a_huge_one_free_ones():
 
 def test_a_center_prior_of_tiny_sigma_holds_and_sets_scale_and_origin():
     truth, start = make_start()
-    sigmas = np.full(start.num_frames, np.inf)
-    sigmas[[0, 4, 8]] = 1e-6
+    known = np.array([0, 4, 8])
     aims = 3.0 * truth.centers + 5.0
-    prior = CenterPrior(centers=aims, information=isotropic_information(sigmas))
+    prior = KnownPositions(known, aims[known], isotropic_information(np.full(3, 1e-6)))
     begin = replace(start, centers=3.0 * start.centers + 5.0, points=3.0 * start.points + 5.0)
     found = adjust(replace(begin, center_prior=prior), TIGHT).problem
-    np.testing.assert_allclose(found.centers[[0, 4, 8]], aims[[0, 4, 8]], atol=1e-5)
+    np.testing.assert_allclose(found.centers[known], aims[known], atol=1e-5)
     assert error(found, truth) < 0.01
 
 
@@ -398,7 +397,7 @@ def test_wrong_priors_lenses_and_options_are_refused():
     n = start.num_frames
     with pytest.raises(InputError, match="positive semidefinite"):
         replace(
-            start, center_prior=CenterPrior(centers=start.centers, information=np.tile(-np.eye(3), (n, 1, 1)))
+            start, center_prior=KnownPositions(np.arange(n), start.centers, np.tile(-np.eye(3), (n, 1, 1)))
         )
     with pytest.raises(InputError, match="rotation prior must have 12"):
         replace(

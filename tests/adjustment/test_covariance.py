@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import (
     AdjustmentOptions,
-    CenterPrior,
     RotationPrior,
     adjust,
     estimate_covariances,
@@ -17,6 +16,7 @@ from sfm_shapefit.adjustment import (
 from sfm_shapefit.adjustment.gauge import small_similarities
 from sfm_shapefit.adjustment.layout import lay_out
 from sfm_shapefit.adjustment.solve import linearize_all, values_of
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.laplacian.operators import Workers
 from tests.adjustment.made import ring_problem
 from tests.adjustment.test_derivatives import whole_matrix
@@ -60,7 +60,7 @@ def test_covariances_are_blocks_of_the_inverse_of_the_whole_matrix(case, solver)
         prior = RotationPrior(rotations=problem.rotations, information=information)
         problem, num_free = replace(problem, rotation_prior=prior), 4
     if case == "anchored":
-        prior = CenterPrior(centers=problem.centers, information=information)
+        prior = KnownPositions(np.arange(n), problem.centers, information)
         problem, num_free = replace(problem, center_prior=prior), 0
     found = estimate_covariances(problem, options)
     assert found.free_similarities == num_free

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import (
     AdjustmentOptions,
-    CenterPrior,
     LensPrior,
     RotationPrior,
     isotropic_information,
@@ -17,6 +16,7 @@ from sfm_shapefit.adjustment.layout import SLOTS, lay_out
 from sfm_shapefit.adjustment.priors import sum_priors
 from sfm_shapefit.adjustment.residuals import linearize, reprojection_residuals, sum_losses
 from sfm_shapefit.adjustment.solve import linearize_all, move, values_of
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.laplacian.operators import Workers
 from tests.adjustment.made import LENSES, disturb, ring_problem
 
@@ -39,8 +39,8 @@ def with_priors(problem, rng):
     return replace(
         problem,
         rotation_prior=RotationPrior(rotations=turns @ problem.rotations, information=information[0]),
-        center_prior=CenterPrior(
-            centers=problem.centers + 0.1 * rng.standard_normal((n, 3)), information=information[1]
+        center_prior=KnownPositions(
+            np.arange(n), problem.centers + 0.1 * rng.standard_normal((n, 3)), information[1]
         ),
         lens_prior=LensPrior(
             values=np.array([1.1 * lens.values() for lens in problem.lenses]),

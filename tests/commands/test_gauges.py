@@ -7,6 +7,7 @@ import pytest
 import sfm_shapefit
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.geometry import mean_rotation_l1
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, input_gauge, prior_gauge
 from sfm_shapefit.synthetic import SceneOptions, WorkspaceOptions, make_rig_drive
 from sfm_shapefit.synthetic.workspace import write_workspace
@@ -107,10 +108,9 @@ def test_priors_fit_best_as_they_are(ring, adjusted, tmp_path, pulled):
         # What is pulled fits better than any similarity of what was placed.
         assert np.median(np.linalg.norm(centers - positions, axis=1)) < 1.538 * 0.02
         return
-    covariances = np.tile(0.02**2 * np.eye(3), (len(positions), 1, 1))
-    priors = PositionPriors(
-        cameras=np.arange(len(positions)), positions=positions, covariances=covariances, statement=""
-    )
+    information = np.tile(0.02**-2 * np.eye(3), (len(positions), 1, 1))
+    known = KnownPositions(np.arange(len(positions)), positions, information)
+    priors = PositionPriors(known=known, statement="")
     again = prior_gauge(centers, priors)
     assert again.similarity.scale == pytest.approx(1.0, abs=EXACT)
     np.testing.assert_allclose(again.axes, np.eye(3), atol=EXACT)

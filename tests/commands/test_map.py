@@ -12,6 +12,7 @@ import sfm_shapefit
 from abuse import determinism
 from abuse.verdicts import read_cameras
 from sfm_shapefit.colmap.database_images import read_images
+from sfm_shapefit.colmap.merge import merge_models
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.relative_rotations import measure_rotations
 from sfm_shapefit.commands.stages.averaging import average_consistently
@@ -484,3 +485,70 @@ def test_a_camera_whose_pairs_disagree_shows_in_its_agreement_and_unsound_pairs_
     assert answers[1].num_pairs == 61
     assert answers[1].share > 0.99
     assert worst_error_deg(answers[1], truth) < 0.5
+
+
+def keep_few_matches(wrong):
+    """Of the pairs between the first images and the others, leave few matches of six and none of the rest."""
+
+    def edit(connection):
+        rng = np.random.default_rng(0)
+        rows = connection.execute("SELECT pair_id, rows, data FROM two_view_geometries WHERE rows > 0")
+        between = [row for row in rows if (row[0] // PAIR <= 4) != (row[0] % PAIR <= 4)]
+        for rank, (pair, count, data) in enumerate(sorted(between, key=lambda row: -row[1])):
+            matches = np.frombuffer(data, np.uint32).reshape(-1, 2)
+            matches = matches[rng.permutation(count)[: 12 * (rank < 6)]].copy()
+            if wrong:
+                matches[:, 1] = rng.permutation(matches[:, 1])
+            values = len(matches), matches.tobytes(), pair
+            connection.execute("UPDATE two_view_geometries SET rows = ?, data = ? WHERE pair_id = ?", values)
+
+    return edit
+
+
+@pytest.mark.parametrize("wrong", [False, True])
+def test_models_are_joined_by_matches_too_few_for_pairs_and_not_by_wrong_ones(tmp_path, wrong):
+    database = changed(RING, tmp_path, keep_few_matches(wrong))
+    found = sfm_shapefit.map_database(database, sfm_shapefit.MapOptions(**FAST))
+    (told,) = found.joins
+    assert [len(model.names) for model in found.models] == [4, 4]
+    sfm_shapefit.write_map_result(found, tmp_path / "out")
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    facts = json.loads((tmp_path / "out" / "1" / "locate.json").read_text())
+    assert facts["join"]["statement"] == told.statement
+    assert facts["join"] == json.loads((tmp_path / "out" / "map.json").read_text())["joins"][0]
+    assert json.loads((tmp_path / "out" / "0" / "locate.json").read_text())["join"] is None
+    assert ("joined_0" in names) == (told.join is not None) == (not wrong)
+    if wrong:
+        assert "model 1 is not joined to model 0: " in told.statement
+        return
+    whole = read_model(tmp_path / "out" / "joined_0")
+    errors = sfm_shapefit.evaluate(whole.reconstruction, RING / "sparse" / "0")
+    assert len(errors.names) == 8
+    assert errors.position.max < 1e-5 * errors.extent  # the keypoints are exact
+    assert errors.rotation_deg.max < 1e-3
+    models = [model.located.reconstruction for model in found.models]
+    assert whole.reconstruction.num_points3D() == sum(model.num_points3D() for model in models)
+    same = [(min(models[0].point3D_ids()), min(models[1].point3D_ids()))]
+    merged, renamed, new = merge_models(*models, told.join.first_from_second, same)
+    assert merged.num_points3D() == whole.reconstruction.num_points3D() - 1
+    assert renamed[same[0][0]] == new[same[0][1]]
+
+
+def test_models_are_joined_by_position_priors_unless_that_is_not_wanted(tmp_path):
+    truth = read_model(RING / "sparse" / "0")
+    across = f"(pair_id / {PAIR} <= 4) != (pair_id % {PAIR} <= 4)"
+    database = changed(RING, tmp_path, f"DELETE FROM two_view_geometries WHERE {across}")
+    table = tmp_path / "priors.txt"
+    rows = zip(truth.names, truth.centers.tolist(), strict=True)
+    table.write_text("\n".join(" ".join(map(str, (name, *center))) for name, center in rows))
+    out = tmp_path / "out"
+    arguments = ("map", database, out, "--points", "never", "--no-report")
+    run(*arguments, "--priors", table)
+    (told,) = json.loads((out / "map.json").read_text())["joins"]
+    assert "model 1 is joined to model 0 by position priors of 4 and 4 cameras" in told["statement"]
+    errors = sfm_shapefit.evaluate(out / "joined_0", RING / "sparse" / "0")
+    assert errors.position.max < 1e-3 * errors.extent
+    assert "not joined" in run(*arguments, "--overwrite").output
+    facts = json.loads(run(*arguments, "--overwrite", "--join", "never", "--json", "--priors", table).stdout)
+    assert facts["joins"] == []
+    assert not (out / "joined_0").exists()

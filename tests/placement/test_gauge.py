@@ -1,7 +1,9 @@
 """Scale, origin and axes: of the input's centers, of a known distance, of position priors."""
 
+import csv
 import json
 import sqlite3
+import struct
 
 import numpy as np
 import pycolmap
@@ -10,11 +12,14 @@ from scipy.spatial.transform import Rotation
 
 from sfm_shapefit import InputError, locate
 from sfm_shapefit.colmap.model import read_model
-from sfm_shapefit.colmap.priors import database_priors, table_priors
+from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.placement.gauge import PositionPriors, distance_gauge, input_gauge, prior_gauge
-from sfm_shapefit.refinement.anchored import Anchors, refine_anchored
+from sfm_shapefit.placement.prior_pairs import compare_with_priors
+from sfm_shapefit.refinement.anchored import refine_anchored
 from sfm_shapefit.refinement.angular import Metric, plan_refinement, refine_angles
+from sfm_shapefit.results.warnings import prior_warnings
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.program import run, run_refused
 from tests.scenes import RING
@@ -30,9 +35,9 @@ def cameras(seed, n=12):
 def priors_of(positions, sigma=np.nan, rows=None):
     rows = np.arange(len(positions)) if rows is None else np.asarray(rows)
     return PositionPriors(
-        cameras=rows,
-        positions=positions[rows],
-        covariances=np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3)),
+        known=KnownPositions.measured(
+            rows, positions[rows], np.broadcast_to(sigma**2 * np.eye(3), (len(rows), 3, 3))
+        ),
         statement="a test",
     )
 
@@ -64,12 +69,12 @@ def test_without_input_centers_or_with_contradicting_ones_the_scale_is_unit(cent
 
 def test_a_known_distance_becomes_true():
     t = cameras(1)
-    placed = distance_gauge(t, 3, 7, 12.5, "a and b").apply(t)
+    placed = distance_gauge(t, np.array([[3, 7]]), np.array([12.5]), ["a and b"]).apply(t)
     assert np.linalg.norm(placed[3] - placed[7]) == pytest.approx(12.5, rel=1e-14)
     np.testing.assert_allclose(placed.mean(axis=0), 0.0, atol=1e-13)
     t[4] = t[5]  # cameras at one place
     with pytest.raises(InputError, match="a and b coincide"):
-        distance_gauge(t, 4, 5, 1.0, "a and b")
+        distance_gauge(t, np.array([[4, 5]]), np.ones(1), ["a and b"])
 
 
 def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_image(tmp_path):
@@ -83,6 +88,42 @@ def test_locate_makes_a_known_distance_true_and_says_so_and_names_an_unknown_ima
     assert "no posed image x.jpg" in run_refused("locate", RING_MODEL, tmp_path / "none", *unknown)
 
 
+def test_several_known_distances_are_fitted_robustly_and_say_how_well():
+    rng = np.random.default_rng(2)
+    ratios = []
+    for seed in range(20):
+        t = cameras(seed)
+        pairs = rng.permuted(np.tile(np.arange(12), (8, 1)), axis=1)[:, :2]
+        distances = 4.0 * np.linalg.norm(t[pairs[:, 0]] - t[pairs[:, 1]], axis=1)
+        distances = distances + 0.02 * rng.standard_normal(8)
+        distances[5] *= 3.0  # read in feet
+        gauge = distance_gauge(t, pairs, distances, [str(k) for k in range(8)])
+        assert "5 miss theirs most" in gauge.statement
+        ratios.append((gauge.similarity.scale / 4.0 - 1.0) / gauge.scale_sigma)
+    assert 0.3 < np.median(np.abs(ratios)) < 1.5  # 0.67 where the deviation is known exactly
+    both = np.array([[0, 1], [2, 3]])
+    apart = np.linalg.norm(t[both[:, 0]] - t[both[:, 1]], axis=1)
+    assert "contradict" in distance_gauge(t, both, apart * [1.0, 2.0], ["a", "b"]).warning
+
+
+def test_locate_takes_several_known_distances_and_tells_each(ring, tmp_path):
+    told = [(1, 4, 1.0), (2, 7, 1.0), (3, 6, 1.0), (0, 5, 2.0)]
+    flags, known = [], []
+    for i, j, factor in told:
+        known.append(factor * 3.0 * np.linalg.norm(ring.centers[i] - ring.centers[j]))
+        flags += ["--known-distance", ring.names[i], ring.names[j], known[-1]]
+    facts = json.loads(run("locate", RING_MODEL, tmp_path / "out", "--json", "--no-report", *flags).stdout)
+    assert "3 of 4 known distances agree" in facts["scale"]
+    found = [row["found"] for row in facts["known_distances"]]
+    np.testing.assert_allclose(found[:3], known[:3], rtol=1e-4)
+    np.testing.assert_allclose(found[3], known[3] / 2.0, rtol=1e-4)
+    options = tmp_path / "options.toml"
+    rows = [[ring.names[i], ring.names[j], k] for (i, j, _), k in zip(told, known, strict=True)]
+    options.write_text(f"known_distance = {json.dumps(rows)}")
+    again = json.loads(run("locate", RING_MODEL, tmp_path / "two", "--json", "--config", options).stdout)
+    assert again["known_distances"] == facts["known_distances"]
+
+
 def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_stay():
     t = cameras(3)
     truth = 5.0 * t @ TURN.T + [100.0, -20.0, 3.0]
@@ -94,6 +135,18 @@ def test_exact_priors_give_back_scale_axes_and_origin_and_on_a_line_the_axes_sta
     assert gauge.axes is None
     assert "lie on a line" in gauge.warning
     assert gauge.similarity.scale == pytest.approx(3.0, rel=1e-9)
+
+
+def test_where_axes_mean_nothing_priors_on_a_line_turn_the_model_onto_it():
+    """As in `map`: a strip of a drone whose averaged rotations look anywhere."""
+    line = np.outer(np.arange(8.0), [1.0, 2.0, -1.0])
+    turned = 3.0 * line @ np.diag([-1.0, -1.0, 1.0]) + 1.0
+    for rows in (np.arange(8), np.array([1, 6])):
+        gauge = prior_gauge(line, priors_of(turned, rows=rows), axes_known=False)
+        np.testing.assert_allclose(gauge.apply(line), turned, atol=1e-9)
+        assert "about it by any angle" in gauge.warning
+    with pytest.raises(InputError, match="contradict"):
+        prior_gauge(line, priors_of(-line))
 
 
 def test_a_fifth_of_the_priors_off_by_100_sigma_does_no_harm():
@@ -146,11 +199,11 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
     path = tmp_path / "priors.txt"
     for sep in (" ", ","):
         write_table(path, ring, ring.centers, ["# comment", "elsewhere.jpg 1 2 3"], sep)
-        found = table_priors(path, ring)
+        found = table_priors(path, ring).known
         np.testing.assert_array_equal(found.positions, ring.centers)
-        assert np.isnan(found.covariances).all()
+        assert np.isnan(found.information).all()
     path.write_text(f"name,x,y,z,sx,sy,sz\n{ring.names[0]},1,2,3,0.5,0.25,2\n")
-    np.testing.assert_array_equal(table_priors(path, ring).covariances, [np.diag([0.25, 0.0625, 4.0])])
+    np.testing.assert_array_equal(table_priors(path, ring).known.information, [np.diag([4.0, 16.0, 0.25])])
 
     names = ring.names[:3]
     path.write_text(
@@ -158,7 +211,7 @@ def test_a_table_is_read_by_name_with_either_separator_deviations_and_latitudes(
     )
     priors = table_priors(path, ring)
     assert priors.datum == (48.0, 11.0, 500.0)  # medians of the three
-    found = priors.positions
+    found = priors.known.positions
     # WGS84 at 48 N: a degree of longitude is 74628 m, of latitude 111200 m.
     np.testing.assert_allclose(found[1] - found[0], [74.628, 0.0, 0.0], atol=2e-2)
     np.testing.assert_allclose(found[2] - found[0], [0.0, 111.20, 10.0], atol=2e-2)
@@ -232,15 +285,17 @@ def test_priors_of_a_database_of_any_version_are_read(ring, tmp_path, schema):
     rows = [
         (9, "0003.jpg", [1, 2, 3], np.diag([1.0, 4.0, 9.0]).ravel(), 1),
         (4, "0001.jpg", [4, 5, 6], None, 1),
+        (3, "0002.jpg", [4, 5, 7], np.zeros(9), 1),  # what is not positive definite is not known
     ]
-    rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0002.jpg", [np.nan, 0, 0], None, 1)]
-    found = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring)
+    rows += [(5, "else.jpg", [7, 8, 9], None, 1), (6, "0004.jpg", [np.nan, 0, 0], None, 1)]
+    known = database_priors(database_with_priors(tmp_path / "d.db", schema, rows), ring).known
     by_name = {
-        ring.names[k]: p.tolist() for k, p in zip(found.cameras.tolist(), found.positions, strict=True)
+        ring.names[k]: p.tolist() for k, p in zip(known.indices.tolist(), known.positions, strict=True)
     }
-    assert by_name == {"0003.jpg": [1, 2, 3], "0001.jpg": [4, 5, 6]}
-    third = [ring.names[k] for k in found.cameras.tolist()].index("0003.jpg")
-    np.testing.assert_array_equal(found.covariances[third], np.diag([1.0, 4.0, 9.0]))
+    assert by_name == {"0003.jpg": [1, 2, 3], "0001.jpg": [4, 5, 6], "0002.jpg": [4, 5, 7]}
+    assert np.isfinite(known.information).all(axis=(1, 2)).sum() == 1
+    third = [ring.names[k] for k in known.indices.tolist()].index("0003.jpg")
+    np.testing.assert_array_equal(known.information[third], np.diag([1.0, 1.0 / 4.0, 1.0 / 9.0]))
 
 
 def test_a_database_without_usable_priors_is_refused(ring, tmp_path):
@@ -306,8 +361,39 @@ def drive(sigma):
     start = gauge.similarity.apply(found.locations)
     if gauge.axes is not None:
         positions, truth = positions @ gauge.axes, truth @ gauge.axes
-    anchors = Anchors(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
+    anchors = KnownPositions(np.arange(n), positions, np.broadcast_to(np.eye(3) / sigma**2, (n, 3, 3)))
     return (graph, start, metric, found.levels_rad), start, truth, anchors
+
+
+def test_a_model_with_a_datum_is_compared_with_latitudes_where_they_stand(ring, tmp_path):
+    """A degree of latitude is 111.20 m at 48 N, one of longitude 74.628 m a thousandth."""
+    degrees = ring.centers / [74628.0, 111200.0, 1.0]
+    table = tmp_path / "gps.csv"
+    rows = [
+        f"{n},{48.0 + y},{11.0 + x},{500.0 + z}" for n, (x, y, z) in zip(ring.names, degrees, strict=True)
+    ]
+    table.write_text("\n".join(["name,lat,lon,alt", *rows]))
+    run("locate", RING_MODEL, tmp_path / "out", "--priors", table, "--no-report")
+    facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
+    assert facts["num_common"] == len(ring.names)
+    assert facts["position_error"]["max"] < 0.01
+    with (tmp_path / "out" / "pairs.csv").open() as lines:
+        assert all(float(row["prior_angle_deg"]) < 0.1 for row in csv.DictReader(lines))
+    higher = [f"{row.rsplit(',', 1)[0]},{float(row.rsplit(',', 1)[1]) - 2.0}" for row in rows]
+    table.write_text("\n".join(["name,lat,lon,alt", *higher]))
+    facts = json.loads(run("evaluate", tmp_path / "out", table, "--json").stdout)
+    np.testing.assert_allclose(facts["median_offset"], [0.0, 0.0, 2.0], atol=0.01)
+    assert facts["aligned_position_error"]["max"] < 0.01
+    without = json.loads(run("evaluate", RING_MODEL, table, "--json").stdout)
+    assert without["position_error"] is None
+    assert without["aligned_position_error"]["max"] < 0.01
+    shown = run("evaluate", RING_MODEL, table, "--csv", tmp_path / "errors.csv").output
+    assert "no datum" in shown
+    assert len((tmp_path / "errors.csv").read_text().splitlines()) == 1 + len(ring.names)
+    assert "leave these out" in run("evaluate", RING_MODEL, table, "--trajectory", code=3).output
+    write_table(tmp_path / "xyz.txt", ring, ring.centers + 1.0)
+    plain = json.loads(run("evaluate", RING_MODEL, tmp_path / "xyz.txt", "--json").stdout)
+    np.testing.assert_allclose(plain["median_offset"], [-1.0, -1.0, -1.0], atol=1e-9)
 
 
 def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
@@ -326,3 +412,65 @@ def test_locate_lets_priors_pull_and_says_by_how_much(ring, tmp_path):
         centers = {image.name: image.projection_center() for image in model.images.values()}
         off.append([np.linalg.norm(centers[name] - p) for name, p in zip(ring.names, noisy, strict=True)])
     assert np.sum(np.square(off[1])) < np.sum(np.square(off[0]))  # nearer to the priors than before
+
+
+def test_pairs_that_contradict_the_baselines_of_priors_are_named():
+    rng = np.random.default_rng(4)
+    t = cameras(4)
+    truth = 5.0 * t @ TURN.T
+    priors = priors_of(truth + 0.02 * rng.standard_normal(truth.shape), 0.02, rows=np.arange(10))
+    gauge = prior_gauge(t, priors)
+    pairs = np.array([(i, j) for i in range(12) for j in range(i)])
+    directions = normalized(t[pairs[:, 0]] - t[pairs[:, 1]])
+    directions[7] = normalized(np.cross(directions[7], directions[8]))
+    directions[9] = np.nan
+    found = compare_with_priors(pairs, directions, priors, gauge, gauge.apply(t))
+    without = (pairs >= 10).any(axis=1)
+    without[9] = True
+    np.testing.assert_array_equal(np.isnan(found.angles_deg), without)
+    assert np.flatnonzero(found.contradicting).tolist() == [7]
+    assert found.angles_deg[7] == pytest.approx(90.0, abs=2.0)
+    (sentence,) = prior_warnings(found, pairs, [f"{k}.jpg" for k in range(12)])
+    i, j = pairs[7]
+    assert f"1 of {int((~without).sum())} pairs contradict" in sentence
+    assert f"that of {i}.jpg and {j}.jpg most, by 90 deg" in sentence
+
+
+def exif_segment(latitude, longitude, altitude):
+    """The APP1 segment of a JPEG file with a position, big-endian TIFF: IFD 0, the GPS IFD, rationals."""
+    numbers = []
+    for angle in (latitude, longitude):
+        minutes, degrees = 60.0 * (angle % 1.0), int(angle)
+        numbers += [degrees, 1, int(minutes), 1, round(60e6 * (minutes % 1.0)), 1_000_000]
+    numbers += [round(1000.0 * altitude), 1000]
+    start = 8 + 2 + 12 + 4 + 2 + 12 * 6 + 4
+    entries = [
+        struct.pack(">HHI4s", 1, 2, 2, b"N\0\0\0"),
+        struct.pack(">HHII", 2, 5, 3, start),
+        struct.pack(">HHI4s", 3, 2, 2, b"E\0\0\0"),
+        struct.pack(">HHII", 4, 5, 3, start + 24),
+        struct.pack(">HHI4s", 5, 1, 1, b"\0\0\0\0"),
+        struct.pack(">HHII", 6, 5, 1, start + 48),
+    ]
+    tiff = struct.pack(">2sHI", b"MM", 42, 8) + struct.pack(">HHHIII", 1, 0x8825, 4, 1, 26, 0)
+    tiff += struct.pack(">H", 6) + b"".join(entries) + struct.pack(">I", 0) + struct.pack(">14I", *numbers)
+    return b"\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff
+
+
+def test_positions_of_exif_data_are_priors(ring, tmp_path):
+    assert "no image of the model with a GPS position" in run_refused(
+        "locate", RING_MODEL, tmp_path / "none", "--priors", tmp_path
+    )
+    pycolmap.Bitmap.from_array(np.zeros((8, 8, 3), np.uint8)).write(tmp_path / "black.jpg")
+    plain = (tmp_path / "black.jpg").read_bytes()
+    for name, (x, y, z) in zip(ring.names[:6], ring.centers, strict=False):
+        place = exif_segment(48.0 + (y + 10.0) / 111200.0, 11.0 + (x + 10.0) / 74628.0, 500.0 + z)
+        (tmp_path / name).write_bytes(plain[:2] + place + plain[2:])
+    (tmp_path / ring.names[6]).write_bytes(plain)
+    found = exif_priors(tmp_path, ring)
+    assert found.known.indices.tolist() == list(range(6))
+    positions, truth = found.known.positions, ring.centers[:6]
+    np.testing.assert_allclose(positions - positions[0], truth - truth[0], atol=0.01)
+    facts = json.loads(run("locate", RING_MODEL, tmp_path / "out", "--priors", tmp_path, "--json").stdout)
+    assert "EXIF data of 6 images" in facts["scale"]
+    assert facts["datum"]["latitude_deg"] == pytest.approx(48.0, abs=1e-3)

@@ -7,6 +7,7 @@ import pytest
 
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import normalized
+from sfm_shapefit.known_positions import KnownPositions
 from sfm_shapefit.measured import MeasuredGraph
 from sfm_shapefit.placement.gauge import PositionPriors, prior_gauge
 from sfm_shapefit.placement.place import Placement, place
@@ -139,9 +140,7 @@ def test_rejected_pairs_that_agree_on_another_placement_are_warned_of(usual):
 def priors_for(rows, positions):
     """Exact positions of some cameras, of a standard deviation of 0.01."""
     return PositionPriors(
-        cameras=np.asarray(rows),
-        positions=positions[rows],
-        covariances=np.tile(1e-4 * np.eye(3), (len(rows), 1, 1)),
+        known=KnownPositions(np.asarray(rows), positions[rows], np.tile(1e4 * np.eye(3), (len(rows), 1, 1))),
         statement="made",
     )
 

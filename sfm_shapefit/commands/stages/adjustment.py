@@ -12,7 +12,6 @@ import numpy as np
 
 from sfm_shapefit.adjustment.given_rotations import RotationWeight
 from sfm_shapefit.arrays import FloatArray
-from sfm_shapefit.colmap.adjustment import KnownCenters
 from sfm_shapefit.colmap.bundle_adjustment import (
     AdjustedPlacement,
     Uncertainty,
@@ -50,9 +49,8 @@ def pull_cameras(
         UnsolvableError: if the factor would take more memory than the options allow.
     """
     pulled = pull_to_priors(located.placement, located.gauge, priors, options)
-    nodes, positions, information = pulled.anchors
-    frame_ids = model.frame_ids[pulled.placement.nodes[nodes]]
-    given = located.given._replace(centers=KnownCenters(frame_ids, positions, information))
+    frame_ids = model.frame_ids[pulled.placement.nodes[pulled.anchors.indices]]
+    given = located.given._replace(centers=pulled.anchors._replace(indices=frame_ids))
     return located._replace(placement=pulled.placement, gauge=pulled.gauge, given=given)
 
 

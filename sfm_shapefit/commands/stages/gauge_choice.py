@@ -1,5 +1,6 @@
 """Which scale, origin and axes the output gets: as asked, or by what is known."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,11 +8,11 @@ import numpy as np
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.colmap.model import PosedModel
-from sfm_shapefit.colmap.priors import database_priors, table_priors
+from sfm_shapefit.colmap.priors import database_priors, exif_priors, table_priors
 from sfm_shapefit.commands.stages.rigs import Rigid
 from sfm_shapefit.errors import InputError, UnsolvableError
 from sfm_shapefit.geometry import mean_rotation_l1
-from sfm_shapefit.locate_options import LocateOptions
+from sfm_shapefit.locate_options import KnownDistance, LocateOptions
 from sfm_shapefit.placement.gauge import (
     Gauge,
     PositionPriors,
@@ -37,7 +38,7 @@ def read_priors(
     if options.scale not in ("auto", "prior") and table is not None:
         raise InputError(f"priors have no effect with the scale {options.scale}; leave out one of the two")
     if table is not None:
-        return table_priors(Path(table), model)
+        return exif_priors(Path(table), model) if Path(table).is_dir() else table_priors(Path(table), model)
     if options.scale != "prior":
         if options.refine_with_priors:
             raise InputError("refine_with_priors needs priors; give a table, or the scale prior")
@@ -72,14 +73,15 @@ class GaugeRule(NamedTuple):
         """
         model, rigid, options = self.model, self.rigid, self.options
         centers, fixed = model.centers[cameras], rigid.fixed[cameras]
-        if coincide(model.centers - model.frame_offsets):
+        has_centers = not coincide(model.centers - model.frame_offsets)
+        if not has_centers:
             centers = np.zeros_like(centers)  # where sensors are in their rig says nothing of positions
         if unit is not None:
             return metric_gauge(locations, unit, centers, fixed, has_rigs=model.has_rigs)
         if options.known_distance:
-            gauge = _gauge_of_distance(model, cameras.tolist(), locations, options.known_distance)
+            gauge = _gauge_of_distances(model, cameras.tolist(), locations, options.known_distance)
         elif self.priors is not None:
-            gauge = prior_gauge(locations, self.priors.of(cameras))
+            gauge = prior_gauge(locations, self.priors.of(cameras), axes_known=has_centers)
         else:
             gauge = unit_gauge(locations) if options.scale == "unit" else input_gauge(locations, centers)
         if not rigid.fixed.any():
@@ -103,17 +105,18 @@ def restore_axes(model: PosedModel, cameras: IntArray, rotations: FloatArray) ->
     return mean_rotation_l1(model.rotations[cameras].transpose(0, 2, 1) @ rotations)
 
 
-def _gauge_of_distance(
-    model: PosedModel, cameras: list[int], locations: FloatArray, known: tuple[str, str, float]
+def _gauge_of_distances(
+    model: PosedModel, cameras: list[int], locations: FloatArray, known: Sequence[KnownDistance]
 ) -> Gauge:
-    """Return the gauge of the known distance of two cameras, by their names."""
+    """Return the gauge of known distances of cameras, by their names."""
     places = []
-    for name in known[:2]:
+    for name in (name for one in known for name in one[:2]):
         if name not in model.names:
             raise InputError(f"known_distance: the model has no posed image {name}")
         index = model.names.index(name)
         if index not in cameras:
             raise InputError(f"known_distance: the image {name} could not be placed; choose another")
         places.append(cameras.index(index))
-    names = f"{known[0]} and {known[1]}"
-    return distance_gauge(locations, places[0], places[1], float(known[2]), names)
+    names = [f"{first} and {second}" for first, second, _ in known]
+    distances = np.array([float(distance) for *_, distance in known])
+    return distance_gauge(locations, np.array(places).reshape(-1, 2), distances, names)

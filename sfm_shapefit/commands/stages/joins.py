@@ -1,0 +1,293 @@
+"""The models of one database joined where that is safe: by position priors, or by matches between them."""
+
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, suppress
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from sfm_shapefit.arrays import FloatArray, IntArray
+from sfm_shapefit.colmap.database import MatchDatabase, open_database
+from sfm_shapefit.colmap.intrinsics import with_parameters
+from sfm_shapefit.colmap.merge import merge_models
+from sfm_shapefit.colmap.model import PosedModel, observed_points
+from sfm_shapefit.colmap.priors import database_priors
+from sfm_shapefit.colmap.relative_rotations import estimate_relative_rotations
+from sfm_shapefit.directions.matches import MatchBatch
+from sfm_shapefit.errors import InputError, UnsolvableError
+from sfm_shapefit.formats.pair_list import PairNames
+from sfm_shapefit.geometry import Similarity
+from sfm_shapefit.placement.gauge import PositionPriors
+from sfm_shapefit.placement.join import (
+    ModelJoin,
+    Ties,
+    compose,
+    join_by_matches,
+    join_by_priors,
+)
+from sfm_shapefit.results.joins import Joined, JoinedModel
+from sfm_shapefit.results.map_result import MappedModel
+
+if TYPE_CHECKING:
+    import pycolmap
+
+# A camera may miss a point of the other model by so many thresholds of reprojection errors: models drift.
+_WIDENING = 2.0
+_NOTHING_IN_COMMON = "no pair of images and no position priors tie them together"
+
+
+class JoinedModels(NamedTuple):
+    """What came of joining models."""
+
+    joins: tuple[Joined, ...]
+    """One for each model but the largest."""
+    joined: tuple[JoinedModel, ...]
+    """Models in one world, larger ones first; none where nothing was joined."""
+
+
+def join_models(
+    models: Sequence[MappedModel],
+    unposed: PosedModel,
+    database: Path,
+    priors: PositionPriors | None,
+    left_out: PairNames = frozenset(),
+) -> JoinedModels:
+    """Join each model to the first larger one that it can be joined to safely.
+
+    Args:
+        models: largest first.
+        unposed: all images of the database, by index.
+        database: with the matches between the models.
+        priors: of the images; None: those of the database, if it has any.
+        left_out: pairs of images whose matches say nothing.
+    """
+    if len(models) < 2:
+        return JoinedModels((), ())
+    if priors is None:
+        with suppress(InputError):
+            priors = database_priors(database, unposed)
+    evidence = _Evidence(models, unposed, priors, partial(open_database, database, left_out=left_out))
+    joins = [evidence.join(number) for number in range(1, len(models))]
+    return JoinedModels(tuple(joins), tuple(_merge(models, joins, evidence)))
+
+
+class _Between(NamedTuple):
+    """Matches between images of two models."""
+
+    images: IntArray
+    """(k, 2) of each match, that of the larger model first."""
+    points: IntArray
+    """(k, 2) ids of the points that its keypoints observe; -1 for none."""
+    rays: FloatArray
+    """(k, 2, 3) in the worlds of the models."""
+    turns: FloatArray
+    """(p, 3, 3) rotations first_from_second, one of each pair of images."""
+
+    @classmethod
+    def concatenated(cls, parts: "Sequence[_Between]") -> "_Between":
+        """Return all parts as one."""
+        return cls(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+class _Evidence:
+    """What ties models together."""
+
+    def __init__(
+        self,
+        models: Sequence[MappedModel],
+        unposed: PosedModel,
+        priors: PositionPriors | None,
+        open_matches: Callable[..., AbstractContextManager[MatchDatabase]],
+    ) -> None:
+        parameters = {
+            camera_id: camera.params.tolist()
+            for model in reversed(models)
+            for camera_id, camera in model.located.reconstruction.cameras.items()
+        }
+        self.models, self.unposed, self.priors = models, with_parameters(unposed, parameters), priors
+        index = {image_id: k for k, image_id in enumerate(unposed.image_ids.tolist())}
+        self.model_of_image = np.full(unposed.num_images, -1, dtype=np.int64)
+        for number, model in enumerate(models):
+            for image_id in model.located.reconstruction.reg_image_ids():
+                self.model_of_image[index[image_id]] = number
+        self.centers = np.full((unposed.num_images, 3), np.nan)
+        self.rotations = np.full((unposed.num_images, 3, 3), np.nan)
+        self.ids: list[IntArray] = []
+        """Of each image, the id of the point that each keypoint observes; -1 for none."""
+        for image, number in enumerate(self.model_of_image.tolist()):
+            self.ids.append(self._observed(image, number) if number >= 0 else np.zeros(0, dtype=np.int64))
+        with open_matches(model=self.unposed) as source:
+            self.matches = self._read_matches(source)
+
+    def _observed(self, image: int, number: int) -> IntArray:
+        """Return what the keypoints of an image of a model observe, and note its pose."""
+        posed = self.models[number].located.reconstruction.image(int(self.unposed.image_ids[image]))
+        self.centers[image] = posed.projection_center()
+        self.rotations[image] = posed.cam_from_world().rotation.matrix()
+        keypoints, points = observed_points(posed)
+        found = np.full(posed.num_points2D(), -1, dtype=np.int64)
+        found[keypoints] = points.astype(np.int64)
+        return found
+
+    def _read_matches(self, source: MatchDatabase) -> dict[tuple[int, int], "_Between"]:
+        """Return the matches between models, by the two models, and what turns they suggest."""
+        parts: dict[tuple[int, int], list[_Between]] = {}
+        for batch in source.iter_matches_between(self.model_of_image):
+            relative = estimate_relative_rotations(batch)
+            turns = dict(zip(map(tuple, relative.pairs.tolist()), relative.rotations, strict=True))
+            for k, (i, j) in enumerate(batch.pairs.tolist()):
+                part = self._between(batch, k, turns.get((i, j)))
+                key = sorted((int(self.model_of_image[i]), int(self.model_of_image[j])))
+                parts.setdefault((key[0], key[1]), []).append(part)
+        return {key: _Between.concatenated(found) for key, found in parts.items()}
+
+    def _between(self, batch: MatchBatch, k: int, turn: FloatArray | None) -> "_Between":
+        """Return the matches of one pair of images, that of the larger model first."""
+        rows = slice(batch.offsets[k], batch.offsets[k + 1])
+        (i, j), ends = batch.pairs[k].tolist(), batch.keypoints[rows]
+        rays = [batch.rays_i[rows], batch.rays_j[rows]]
+        if self.model_of_image[i] > self.model_of_image[j]:
+            i, j, ends, rays = j, i, ends[:, ::-1], rays[::-1]
+            turn = None if turn is None else turn.T
+        points = [_take(self.ids[i], ends[:, 0]), _take(self.ids[j], ends[:, 1])]
+        return _Between(
+            images=np.tile([i, j], (len(ends), 1)),
+            points=np.stack(points, axis=1),
+            rays=np.stack([rays[0] @ self.rotations[i], rays[1] @ self.rotations[j]], axis=1),
+            turns=np.zeros((0, 3, 3))
+            if turn is None
+            else (self.rotations[i].T @ turn.T @ self.rotations[j])[None],
+        )
+
+    def join(self, number: int) -> Joined:
+        """Return what comes of joining a model to one of the larger ones, the largest first."""
+        refused = []
+        for larger in range(number):
+            try:
+                return Joined(model=number, to=larger, join=self._join(larger, number))
+            except UnsolvableError as error:
+                refused.append(Joined(model=number, to=larger, join=None, reason=str(error)))
+        telling = [one for one in refused if one.reason != _NOTHING_IN_COMMON]
+        return (telling or refused)[0]
+
+    def _join(self, first: int, second: int) -> ModelJoin:
+        """Return the join by priors, or else by points.
+
+        Raises:
+            UnsolvableError: if neither is safe.
+        """
+        if any(self.models[k].located.model.has_rigs for k in (first, second)):
+            raise UnsolvableError("models with rigs of several cameras are not joined")
+        known = [self._priors_of(k) for k in (first, second)]
+        reasons = []
+        if known[0] is not None and known[1] is not None:
+            try:
+                return join_by_priors(known[0], known[1])
+            except UnsolvableError as error:
+                reasons.append(str(error))
+        between = self.matches.get((first, second))
+        if between is not None:
+            try:
+                ties = self._tie(between, first, second)
+                return join_by_matches(ties, between.turns, self._centers_of(second))
+            except UnsolvableError as error:
+                reasons.append(str(error))
+        raise UnsolvableError("; ".join(reasons) or _NOTHING_IN_COMMON)
+
+    def _priors_of(self, number: int) -> tuple[FloatArray, PositionPriors] | None:
+        """Return the centers of a model's cameras, and their priors, if there are any."""
+        own = np.flatnonzero(self.model_of_image == number)
+        priors = None if self.priors is None else self.priors.of(own)
+        return None if priors is None or not len(priors) else (self.centers[own], priors)
+
+    def _centers_of(self, number: int) -> FloatArray:
+        return np.asarray(self.centers[self.model_of_image == number])
+
+    def _tie(self, between: "_Between", first: int, second: int) -> Ties:
+        """Return the matches between two models with centers and points in the worlds of these."""
+        options = self.models[first].located.options
+        points = []
+        for k, number in enumerate((first, second)):
+            structure, ids = self.models[number].located.reconstruction, between.points[:, k]
+            points.append(np.full((len(ids), 3), np.nan))
+            there = ids >= 0
+            points[k][there] = np.reshape([structure.point3D(i).xyz for i in ids[there].tolist()], (-1, 3))
+        focal_px = self.unposed.focal_lengths_px[between.images].min(axis=1)
+        return Ties(
+            eyes_first=self.centers[between.images[:, 0]],
+            eyes_second=self.centers[between.images[:, 1]],
+            rays_first=between.rays[:, 0],
+            rays_second=between.rays[:, 1],
+            points_first=points[0],
+            points_second=points[1],
+            pairs=between.images[:, 0] * self.unposed.num_images + between.images[:, 1],
+            tolerances=_WIDENING * options.max_reprojection_error_px / focal_px,
+        )
+
+    def same_points(self, done: Joined) -> list[tuple[int, int]]:
+        """Return the points of both models that are one, by a join that rests on matches; each once."""
+        if done.join is None or done.join.agreeing is None:
+            return []
+        rows = self.matches[done.to, done.model].points[done.join.agreeing]
+        rows = rows[(rows >= 0).all(axis=1)]
+        seen: tuple[set[int], set[int]] = (set(), set())
+        found = []
+        for one, other in rows.tolist():
+            if one not in seen[0] and other not in seen[1]:
+                found.append((one, other))
+                seen[0].add(one)
+                seen[1].add(other)
+        return found
+
+
+def _merge(models: Sequence[MappedModel], joins: Sequence[Joined], evidence: _Evidence) -> list[JoinedModel]:
+    """Return the models that were joined, each group in the world of its largest."""
+    groups = [_Group.of(number, model) for number, model in enumerate(models)]
+    root = list(range(len(models)))
+    for done in joins:
+        if done.join is not None:
+            root[done.model] = root[done.to]
+            groups[root[done.to]].add(done, models[done.model], evidence.same_points(done))
+    return [
+        JoinedModel(reconstruction=group.reconstruction, models=tuple(group.world_from))
+        for group in groups
+        if len(group.world_from) > 1
+    ]
+
+
+class _Group:
+    """Models in the world of the largest of them; more come in."""
+
+    def __init__(self, reconstruction: "pycolmap.Reconstruction", number: int) -> None:
+        self.reconstruction = reconstruction
+        self.world_from = {number: Similarity(scale=1.0, rotation=np.eye(3), translation=np.zeros(3))}
+        # Of each model, the ids of its points here, by those in the model where they are others.
+        self.ids: dict[int, dict[int, int]] = {number: {}}
+
+    @classmethod
+    def of(cls, number: int, model: MappedModel) -> "_Group":
+        """Return a model by itself."""
+        return cls(model.located.reconstruction, number)
+
+    def add(self, done: Joined, model: MappedModel, same_points: list[tuple[int, int]]) -> None:
+        """Take in a model that was joined to one of the group."""
+        assert done.join is not None
+        own = self.ids[done.to]
+        same_points = [(own.get(one, one), other) for one, other in same_points]
+        world_from = compose(self.world_from[done.to], done.join.first_from_second)
+        second = model.located.reconstruction
+        self.reconstruction, renamed, new = merge_models(self.reconstruction, second, world_from, same_points)
+        self.world_from[done.model] = world_from
+        for ids in self.ids.values():
+            ids |= {point: renamed[now] for point, now in ids.items() if now in renamed}
+        for one, now in renamed.items():
+            self.ids[next(iter(self.ids))].setdefault(one, now)
+        self.ids[done.model] = new
+
+
+def _take(ids: IntArray, keypoints: IntArray) -> IntArray:
+    """Return the points of keypoints; -1 where the image has no such keypoint."""
+    extended = np.append(ids, -1)
+    return np.asarray(extended[np.minimum(keypoints, len(ids))])
