@@ -6,12 +6,17 @@ compiled: that takes a quarter of the time. It rests on parts of numba that are 
 not as expected, numba loads the kernel its own way.
 """
 
+import io
 import pickle
+import sys
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import llvmlite.binding as llvm
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompileResult
+from numba.core.environment import Environment
 from numba.core.runtime import rtsys
 from numba.core.serialize import dumps
 
@@ -46,6 +51,31 @@ class LoadedLibrary(JITCodeLibrary):  # type: ignore[misc]
         return self._shared_module
 
 
+class _Reader(pickle.Unpickler):
+    """Reads what `pack` writes, and leaves the modules alone that functions of numba come from.
+
+    Compiled code does not look into them, and importing them takes as long as loading all kernels of a run.
+    """
+
+    def find_class(self, module_name: str, name: str) -> Any:
+        """Return an object of a module."""
+        found = super().find_class(module_name, name)
+        is_environment = (module_name, name) == ("numba.core.environment", "_rebuild_env")
+        return partial(_environment, found) if is_environment else found
+
+
+def _environment(rebuild: Callable[..., Any], module_name: str, constants: list[Any], name: str) -> Any:
+    """Return the constants that a compiled function needs, as numba's `rebuild` does."""
+    known = getattr(Environment, "_memo", None)
+    if known is None or name in known or module_name in sys.modules:
+        return rebuild(module_name, constants, name)
+    environment = Environment({"__name__": module_name})
+    environment.consts[:] = constants
+    environment.env_name = name
+    known[name] = environment
+    return environment
+
+
 def pack(compiled: Any) -> bytes:
     """Return what `unpack` takes, without the text that numba keeps for those who inspect types."""
     return bytes(dumps(compiled._replace(type_annotation="")._reduce()))
@@ -57,7 +87,7 @@ def unpack(content: bytes, target_context: Any) -> Any:
     Raises:
         Exception: of any type, if the content is damaged or of another version.
     """
-    reduced = pickle.loads(content)
+    reduced = _Reader(io.BytesIO(content)).load()
     try:
         return _load(target_context, reduced)
     except Exception:  # whatever another version of numba does

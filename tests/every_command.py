@@ -19,7 +19,7 @@ COMMANDS = """
     solve data_synthetic/graph40.txt {out}/solved -q
     solve data_synthetic/graph40.txt {out}/split --method admm -q
     map data_synthetic/ring8/database.db {out}/mapped -q
-    map data_synthetic/courtyard/database.db {out}/adjusted --bundle-adjust -q
+    map data_synthetic/courtyard/database.db {out}/mapped_and_adjusted --bundle-adjust -q
     map data_synthetic/ring8/database.db {out}/averaged --averaging pycolmap -q
     locate data_synthetic/ring8/sparse/0 {out}/fixed --fix solved -q
     report {out}/located --scene

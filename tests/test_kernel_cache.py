@@ -1,12 +1,15 @@
 """Where compiled kernels are kept: found again wherever they are copied, never stale, never damaged."""
 
 import sys
+from weakref import WeakValueDictionary
 
 import llvmlite.binding as llvm
 import numba
+import numpy as np
 import pytest
 from numba.core import config
 from numba.core.codegen import JITCodeLibrary
+from numba.core.environment import Environment
 
 from sfm_shapefit import kernel_cache
 from sfm_shapefit.jit import kernel
@@ -17,6 +20,10 @@ from tests.program import run_python
 
 def double(x):
     return 2 * x
+
+
+def allocate(n):
+    return np.empty(n).size
 
 
 @pytest.fixture
@@ -66,6 +73,18 @@ def test_a_kernel_is_loaded_without_its_llvm_code_and_taken_into_another_with_it
     assert library._shared_module is None
     assert numba.njit(lambda x: loaded(x) + 1)(21) == 43
     assert library._shared_module is not None
+
+
+def test_a_kernel_is_loaded_without_the_modules_of_the_functions_that_it_calls(folder, monkeypatch):
+    kernel(allocate)(3)
+    monkeypatch.setattr(Environment, "_memo", WeakValueDictionary())  # as in another process
+    monkeypatch.delitem(sys.modules, "numba.np.arrayobj")
+    with on_miss(lambda: pytest.fail("missed")):
+        loaded = kernel(allocate)
+        assert loaded(3) == 3
+    with pytest.raises(ValueError, match="negative"):
+        loaded(-1)
+    assert "numba.np.arrayobj" not in sys.modules
 
 
 def test_where_numba_is_not_as_expected_it_loads_kernels_its_own_way(folder, monkeypatch):

@@ -18,6 +18,7 @@ from sfm_shapefit.adjustment.problem import AdjustmentProblem
 from sfm_shapefit.adjustment.residuals import Values
 from sfm_shapefit.arrays import FloatArray
 from sfm_shapefit.geometry import fit_similarity
+from sfm_shapefit.laplacian.dense import one_blas_thread
 
 _DIMENSION = 7
 _NONE = 1e-10  # share of the largest: what holds less holds nothing
@@ -66,6 +67,7 @@ def _null_space(matrix: FloatArray) -> FloatArray:
     return np.asarray(rows[values <= _NONE * values[0]].T)
 
 
+@one_blas_thread()  # matrices this small keep other threads waiting for hundreds of times as long
 def restore_gauge(problem: AdjustmentProblem, values: Values, free: FloatArray) -> Values:
     """Return the values moved by the free similarity that brings their centers closest to the problem's.
 

@@ -7,6 +7,7 @@ command that misses a kernel lets the examples that commands need run first, if 
 with what they compiled.
 """
 
+import gc
 import os
 import re
 import signal
@@ -164,7 +165,7 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
     try:
         for _ in range(num_processes):
             ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs,), daemon=True)
+            process = context.Process(target=_work, args=(theirs, gc.get_threshold()), daemon=True)
             process.start()
             theirs.close()
             workers[ours] = process
@@ -190,8 +191,12 @@ def _run(examples: Iterable[str], num_processes: int) -> Iterator[str | WarmUpEr
             process.join()
 
 
-def _work(connection: Connection) -> None:
-    """Run the examples that the connection names, and tell of every kernel."""
+def _work(connection: Connection, objects_between_searches: tuple[int, int, int]) -> None:
+    """Run the examples that the connection names, and tell of every kernel.
+
+    Unused objects are looked for as often as in the parent: compiling makes very many of them.
+    """
+    gc.set_threshold(*objects_between_searches)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent gets it too, and ends this process
     # A parent that died needs no answer.
     with hear_of_kernels(connection.send), suppress(BrokenPipeError, EOFError):

@@ -20,8 +20,8 @@ The division is what costs: one pair that is moved out of its ball by 1 % lowers
   one to rounding comes last. From a dual of the splitting the bound is then 100 to 1000 times closer than
   from one repair with S = P.
 
-The systems are solved by conjugate gradients with that Laplacian, factored in float32 or, where it would
-fill in, approximately, as preconditioner. A dual that satisfies the equality already, as that of a Newton
+The systems are solved by conjugate gradients with that Laplacian, factored or, where it would fill in,
+factored approximately, as preconditioner. A dual that satisfies the equality already, as that of a Newton
 method does, is taken as it is.
 
 Uniqueness. An optimal T' has w_e ||r'_e|| = <y_e, r'_e> for every pair and every optimal dual: r'_e = 0
@@ -351,7 +351,7 @@ def _preconditioner(graph: ViewGraph, stiffness: npt.NDArray[Any], resources: Re
     factor = laplacian_factor(graph, resources)
     try:
         factor.refactor(stiffness)
-    except UnsolvableError:  # connected, but too long for float32
+    except UnsolvableError:  # connected, but too long for the precision of the factor
         neighbors = adjacency(graph.num_nodes, np.ascontiguousarray(graph.edges))
         return approximate_cholesky(neighbors, stiffness, _SEED)
     return factor.preconditioner if isinstance(factor, IterativeSolver) else factor

@@ -114,6 +114,17 @@ def test_the_shell_can_complete_commands_and_python_can_run_them():
     assert run_python("-m", "sfm_shapefit", "--version").stdout == run("--version").stdout
 
 
+def test_the_program_ends_without_a_last_search_for_garbage():
+    script = (
+        "import atexit, gc, sys\n"
+        "atexit.register(lambda: print(gc.get_freeze_count() > 0))\n"
+        "from sfm_shapefit.cli import main\n"
+        "sys.argv[1:] = ['--version']\n"
+        "main()"
+    )
+    assert run_python("-c", script).stdout.endswith("\nTrue\n")
+
+
 def test_earlier_names_of_flags_and_of_place_are_taken_and_stand_in_no_help(tmp_path):
     flags = ("--method", "conic", "--factor-memory=500", "--json", "--no-report")
     done = run("solve", BUNDLED / "graph40.txt", tmp_path / "out", *flags)

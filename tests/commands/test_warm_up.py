@@ -3,6 +3,7 @@
 import inspect as python_inspect
 import os
 import re
+from multiprocessing import Pipe
 
 import pytest
 
@@ -40,6 +41,16 @@ def test_processes_that_die_are_told_of(monkeypatch):
     monkeypatch.setattr(module, "_work", os.abort)  # which takes no argument, so that they end at once
     done = warm_up(["find_pieces", "place_graph"])
     assert done == WarmUp(0, ("find_pieces, place_graph: no process is left to run it",))
+
+
+def test_processes_look_for_garbage_as_often_as_the_one_that_began_them(monkeypatch):
+    thresholds = []
+    monkeypatch.setattr(module.gc, "set_threshold", lambda *given: thresholds.append(given))
+    monkeypatch.setattr(module.signal, "signal", lambda *_: None)
+    ours, theirs = Pipe()
+    ours.send("")
+    module._work(theirs, (50_000, 20, 100))
+    assert thresholds == [(50_000, 20, 100)]
 
 
 def test_where_no_process_can_be_started_a_command_compiles_alone(monkeypatch):

@@ -106,6 +106,7 @@ def solve_by_splitting(_folder: Path) -> None:
     for graph in (_random_graph(), _long_graph(60)):
         solve(graph, solver="admm", threads=2)
         solve(graph, solver="admm", threads=1, factor_memory_mb=0, max_iterations=20)
+    solve(_long_graph(500), solver="admm", threads=1, max_iterations=20)  # its factor is of float32
 
 
 def solve_iteratively(_folder: Path) -> None:

@@ -1,8 +1,9 @@
-"""The linear solve inside ADMM: a float32 Cholesky factor where it fits, conjugate gradients elsewhere.
+"""The linear solve inside ADMM: a Cholesky factor where it fits, conjugate gradients elsewhere.
 
 Each ADMM step solves L delta = rhs with the weighted graph Laplacian L and moves the locations by delta. An
 error of delta is relative to the *step* and enters the next right-hand side: a float32 factor loses nothing,
-and conjugate gradients that reduce their residual tenfold count as solved.
+and halves the time and memory of many cameras; conjugate gradients that reduce their residual tenfold count
+as solved.
 """
 
 from typing import NamedTuple, Protocol
@@ -36,6 +37,9 @@ _JACOBI_STEPS = 8
 _HUGE = 400_000
 # The factor of an expander of so many cameras takes longer than it saves.
 _LARGE = 5_000
+# The factor of fewer cameras is small in any type. It is of float64, as those of other solves are, so that
+# the kernels for float32, 2 s of compiling, are no part of a first run.
+_FEW = 500
 _SEED = 1
 
 
@@ -133,7 +137,7 @@ def predict_factor(graph: ViewGraph) -> Prediction:
 def laplacian_factor(
     graph: ViewGraph, resources: Resources = ONE_THREAD, prediction: Prediction | None = None
 ) -> LaplacianFactor:
-    """Return the factor of the resources; if None, a float32 Cholesky factor of the graph's Laplacian.
+    """Return the factor of the resources; if None, a Cholesky factor of the graph's Laplacian.
 
     Or an iterative solver where that factor would not fit, or would take longer than it saves.
 
@@ -149,9 +153,10 @@ def laplacian_factor(
     neighbors = adjacency(graph.num_nodes, edges)
     if tree is None or tree.flops > _FLOPS_PER_EDGE * graph.num_edges:
         return IterativeSolver(neighbors, resources.threads)
-    if tree.num_nonzeros * np.dtype(np.float32).itemsize > resources.memory_bytes:
+    dtype = np.float64 if graph.num_nodes < _FEW else np.float32
+    if tree.num_nonzeros * np.dtype(dtype).itemsize > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
     plan = plan_factorization(neighbors, edges, tree)
-    if plan.num_bytes(1, np.float32) > resources.memory_bytes:
+    if plan.num_bytes(1, dtype) > resources.memory_bytes:
         return IterativeSolver(neighbors, resources.threads)
-    return allocate_factor(plan, 1, np.float32, threads=resources.threads)
+    return allocate_factor(plan, 1, dtype, threads=resources.threads)
