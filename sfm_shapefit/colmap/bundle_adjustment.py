@@ -65,8 +65,8 @@ _LAST_SCALES, _LAST_FALL = (0.0625, 0.125, 0.25), 1e-4
 _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 # Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
 _FINE = 0.9
-# Of the solves after a placement: the scale at which the rotations are judged, and where they end.
-_GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
+# Where the solve after a placement ends.
+_GIVEN_FALL = 1e-5
 # So often lenses are held that turn out to be left open, and all is solved for again.
 _MOST_REPETITIONS = 2
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
@@ -296,12 +296,14 @@ def adjust_placement(
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
     problem = run.frames.problem(joined, found)
+    scale = run.choose_scale(problem)
     if weight is None:
-        loss_scale_px = _GIVEN_SCALE * structure_options.max_reprojection_error_px
+        # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
+        loss_scale_px = scale * structure_options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    adjusted = run.solve(problem, scale, _GIVEN_FALL)
     if run.lenses.doubts:
         run.judge_lenses(adjusted)
     else:
@@ -448,7 +450,7 @@ class _Run:
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
         try:
-            found = estimate_center_errors(problem, options, self.weight.open_rad)
+            found = estimate_center_errors(problem, options, self.weight.open_rad())
         except UnsolvableError:
             return Uncertainty()
         of_camera = found.covariances[self.frames.frame_of_camera]
