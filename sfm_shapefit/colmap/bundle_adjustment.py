@@ -126,6 +126,8 @@ class AdjustedPlacement:
     """The adjusted poses, without points."""
     weight: RotationWeight
     """How the given rotations were treated."""
+    frame_ids: tuple[int, ...]
+    """The frames, in the order of its standard deviations."""
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
     uncertainty: Uncertainty
@@ -156,12 +158,22 @@ class GivenPoses(NamedTuple):
 
     weight: RotationWeight = _FREE
     """Of the model's rotations."""
+    weight_frames: Sequence[int] = ()
+    """Ids of the frames that its standard deviations are of, if each has one."""
     model: pycolmap.Reconstruction | None = None
     """Whose rotations were given; None: those of the seed."""
     centers: KnownCenters | None = None
     """Measured otherwise, which pull at the frames."""
     lenses: FreeLenses = ALL_HELD
     """Those that may change; all others stay what they are, to the bit."""
+
+    def weight_of(self, frame_ids: Sequence[int]) -> RotationWeight:
+        """Return the weight with the standard deviations of the given frames; new ones have the usual one."""
+        sigmas, usual = self.weight.frame_sigmas_rad, self.weight.sigma_rad or 0.0
+        if sigmas is None:
+            return self.weight
+        known = dict(zip(self.weight_frames, sigmas.tolist(), strict=True))
+        return self.weight._replace(frame_sigmas_rad=np.array([known.get(i, usual) for i in frame_ids]))
 
 
 def bundle_adjust(
@@ -204,7 +216,7 @@ def bundle_adjust(
         refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
     else:
         run = _Run(seed, tracks, structure_options, fixed_frames, given)
-        run.weight = given.weight
+        run.weight = given.weight_of(run.frames.frame_ids)
         if given.model is not None:
             run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
@@ -261,6 +273,7 @@ def adjust_thinly(
     return AdjustedPlacement(
         reconstruction=poses,
         weight=_FREE,
+        frame_ids=run.frames.frame_ids,
         errors=None,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
@@ -312,6 +325,7 @@ def adjust_placement(
     return AdjustedPlacement(
         reconstruction=poses,
         weight=weight,
+        frame_ids=run.frames.frame_ids,
         errors=errors,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
