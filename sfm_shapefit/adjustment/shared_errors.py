@@ -24,8 +24,8 @@ calibration  e is a smooth field for each image: ten polynomials in the plane fo
              What all images of a lens share moves them together, and adds up. Its size is estimated from the
              part that is seen: where an error of the coefficient k of a field shows, the residuals tell it as
              a_k with the variance v_k of the noise, and the variance t of the coefficients that makes these
-             likeliest (empirical Bayes) holds for the part that hides, too. On photographs t^1/2 is 0.01 to
-             0.05 px, and up to 0.23 px where lenses were calibrated otherwise; on made scenes none.
+             likeliest (empirical Bayes) holds for the part that hides, too, if the test finds any at all. On
+             photographs t^1/2 is 0.01 to 0.05 px, and up to 0.23 px where others had calibrated the lenses.
 
 The gauge is that of the adjustment: relative to the centers' mean, and to their scale and axes as far as
 nothing holds these (`covariance`).
@@ -114,8 +114,7 @@ def estimate_center_errors(
     pulls = _Pulls(problem, options, system)
     freely = replace(problem, rotation_prior=None), replace(options, hold_rotations=False)
     evidence, lens_errors_px = _Pulls(*freely, ground_system(*freely)).test_lenses(noise2)
-    doubt = float(np.interp(evidence, [_DOUBT, _CERTAIN], [0.0, 1.0]))
-    calibration_px = _CALIBRATION_OF_ERROR * float(np.median(errors) * np.sqrt(doubt))
+    calibration_px = _CALIBRATION_OF_ERROR * float(np.median(errors) * np.sqrt(_doubt(evidence)))
     turn_sigmas = np.broadcast_to(np.asarray(turn_sigma_rad, dtype=np.float64), (problem.num_frames,))
     by_group, by_sample = pulls.draw(calibration_px, lens_errors_px, turn_sigmas)
     _add_errors_of_priors(by_sample, problem, options, system, kappa)
@@ -251,7 +250,8 @@ class _Pulls:
             return _LensTest(0.0, 0.0)
         amplitudes, variances = (modes.T @ wanted)[seen] / shares[seen], noise2 / shares[seen]
         excess = float(np.sum(amplitudes**2 / variances) - seen.sum())
-        return _LensTest(excess / np.sqrt(2.0 * seen.sum()), likeliest_variance(amplitudes, variances))
+        evidence = excess / np.sqrt(2.0 * seen.sum())
+        return _LensTest(evidence, _doubt(evidence) * likeliest_variance(amplitudes, variances))
 
 
 class _LensTest(NamedTuple):
@@ -261,6 +261,11 @@ class _LensTest(NamedTuple):
     """By how many standard deviations what the fields explain exceeds noise."""
     variance: float
     """Of each coefficient of the fields, px^2."""
+
+
+def _doubt(evidence: float) -> float:
+    """Return how far lenses are to be doubted, in [0, 1]."""
+    return float(np.interp(evidence, [_DOUBT, _CERTAIN], [0.0, 1.0]))
 
 
 def likeliest_variance(values: FloatArray, variances: FloatArray) -> float:
