@@ -13,9 +13,9 @@ Noise that neighboring keypoints share is in both, other than in a covariance fr
 agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
 away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it.
 
-What holding them leaves open is the median agreement. A frame whose own agreement is larger than these, and
-exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are right the
-agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance.
+What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
+one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
+right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance.
 
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
@@ -46,6 +46,8 @@ _MEDIAN_LENGTH = 1.1774
 _MEDIAN_SQUARE = 0.7887
 # An agreement of so many times its chance is three standard deviations beyond 0.
 _CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
+# Of a normal error in space, the mean square is once in 300 times larger than so many variances per axis.
+_RARE = 4.6
 
 
 class RotationWeight(NamedTuple):
@@ -131,7 +133,7 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
     open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
     variances = np.full(problem.num_frames, open_variance)
-    clear = agreement > np.maximum(_CLEAR * np.maximum(chance, np.median(chance)), open_variance)
+    clear = agreement > np.maximum(_CLEAR * np.maximum(chance, np.median(chance)), _RARE * open_variance)
     variances[known] = np.where(clear, agreement, variances[known])
     return RotationErrors(
         sigma_rad=float(np.sqrt(variance)),
