@@ -13,6 +13,10 @@ Noise that neighboring keypoints share is in both, other than in a covariance fr
 agreement does not exceed the median chance, freeing the rotations brings more noise than it takes errors
 away: they are held. Otherwise sigma^2 is the mean agreement, and the adjustment weighs rotations by it.
 
+What holding them leaves open is the median agreement. A frame whose own agreement is larger than either lets
+one expect, and exceeds chance by three standard deviations, has that for its sigma^2: with rotations that are
+right the agreement of a frame has a standard deviation of 2 / 3^(1/2) times the chance.
+
 What calibration errors do to the frames is the same in both halves and cannot be told from errors of the
 rotations. Who measured rotations better than the matches know them has to say so.
 """
@@ -40,6 +44,10 @@ _LEAST_REDUNDANCY = 0.1
 _MEDIAN_LENGTH = 1.1774
 # Of a normal error in space, the median square over the mean.
 _MEDIAN_SQUARE = 0.7887
+# An agreement of so many times its chance is three standard deviations beyond 0.
+_CLEAR = 3.0 * 2.0 / np.sqrt(3.0)
+# Of a normal error in space, the mean square is once in 300 times larger than so many variances per axis.
+_RARE = 4.6
 
 
 class RotationWeight(NamedTuple):
@@ -51,15 +59,23 @@ class RotationWeight(NamedTuple):
     """Standard deviation per axis by which they pull; None: they do not."""
     noise_px: float = 0.5
     """Standard deviation of an observation per axis, which the pull is weighed against."""
-    open_rad: float = 0.0
-    """Standard deviation per axis of the errors that rotations may have although they are held."""
+    frame_sigmas_rad: FloatArray | None = None
+    """(n,) the same for each frame: by these they pull, or may be wrong although they are held. None: as
+    above for all, and held ones are right."""
 
     def apply(self, problem: AdjustmentProblem, given: FloatArray) -> AdjustmentProblem:
         """Return the problem with the pull of the given rotations (n, 3, 3)."""
         if self.hold or self.sigma_rad is None:
             return problem
-        information = isotropic_information(np.full(problem.num_frames, self.sigma_rad))
-        return replace(problem, rotation_prior=RotationPrior(rotations=given, information=information))
+        sigmas = self.frame_sigmas_rad
+        if sigmas is None:
+            sigmas = np.full(problem.num_frames, self.sigma_rad)
+        prior = RotationPrior(rotations=given, information=isotropic_information(sigmas))
+        return replace(problem, rotation_prior=prior)
+
+    def open_rad(self) -> float | FloatArray:
+        """Return the standard deviation per axis of the errors of held rotations, or one per frame."""
+        return self.frame_sigmas_rad if self.hold and self.frame_sigmas_rad is not None else 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,8 +86,9 @@ class RotationErrors:
     """Of the given rotations' errors; 0 where chance explains all that the matches would change."""
     chance_rad: float
     """Median over the frames of what chance turns them by, all points together."""
-    open_rad: float
-    """The same from the median agreement, where chance explains it too: what holding them leaves open."""
+    frame_sigmas_rad: FloatArray
+    """(n,) of the errors of each frame's rotation: the same, the median where chance explains it, or what the
+    halves clearly say of the frame."""
     noise_px: float
     """Of an observation, from the median of all errors with free rotations."""
     num_frames: int
@@ -80,7 +97,7 @@ class RotationErrors:
     def weight(self) -> RotationWeight:
         """Return how to treat the rotations: held, if freeing them would bring more noise than it takes."""
         hold = self.sigma_rad == 0.0
-        return RotationWeight(hold, self.sigma_rad or None, self.noise_px, self.open_rad if hold else 0.0)
+        return RotationWeight(hold, self.sigma_rad or None, self.noise_px, self.frame_sigmas_rad)
 
 
 def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOptions) -> RotationErrors:
@@ -104,15 +121,24 @@ def estimate_rotation_errors(problem: AdjustmentProblem, options: AdjustmentOpti
     noise_px = float(np.median(errors_px[np.isfinite(errors_px)])) / _MEDIAN_LENGTH / np.sqrt(redundancy)
     if len(first) < _FEWEST_FRAMES:
         return RotationErrors(
-            sigma_rad=0.0, chance_rad=0.0, open_rad=0.0, noise_px=noise_px, num_frames=len(first)
+            sigma_rad=0.0,
+            chance_rad=0.0,
+            frame_sigmas_rad=np.zeros(problem.num_frames),
+            noise_px=noise_px,
+            num_frames=len(first),
         )
     agreement = np.einsum("fa,fa->f", first, second) / 3.0
     chance = np.einsum("fa,fa->f", first - second, first - second) / 12.0
     is_chance = np.median(agreement) <= np.median(chance)
+    variance = 0.0 if is_chance else float(max(agreement.mean(), np.median(agreement)))
+    open_variance = max(float(np.median(agreement)) / _MEDIAN_SQUARE, 0.0) if is_chance else variance
+    variances = np.full(problem.num_frames, open_variance)
+    clear = agreement > np.maximum(_CLEAR * np.maximum(chance, np.median(chance)), _RARE * open_variance)
+    variances[known] = np.where(clear, agreement, variances[known])
     return RotationErrors(
-        sigma_rad=0.0 if is_chance else float(np.sqrt(max(agreement.mean(), np.median(agreement)))),
+        sigma_rad=float(np.sqrt(variance)),
         chance_rad=float(np.sqrt(np.median(chance))),
-        open_rad=float(np.sqrt(max(np.median(agreement) / _MEDIAN_SQUARE, 0.0))),
+        frame_sigmas_rad=np.sqrt(variances),
         noise_px=noise_px,
         num_frames=len(first),
     )

@@ -69,8 +69,8 @@ _THIN_LIMIT, _THIN_SCALE, _THIN_FALL = 4.0, 0.25, 1e-4
 _FINE_TIMES = 3
 # Poses at which the threshold finds less of the observations that `_THIN_LIMIT` finds are coarse.
 _FINE = 0.9
-# Of the solves after a placement: the scale at which the rotations are judged, and where they end.
-_GIVEN_SCALE, _GIVEN_FALL = 0.125, 1e-5
+# Where the solve after a placement ends.
+_GIVEN_FALL = 1e-5
 # So often lenses are held that turn out to be left open, and all is solved for again.
 _MOST_REPETITIONS = 2
 _FEWEST_IMAGES_OF_A_CHECKED_POINT = 3
@@ -130,6 +130,8 @@ class AdjustedPlacement:
     """The adjusted poses, without points."""
     weight: RotationWeight
     """How the given rotations were treated."""
+    frame_ids: tuple[int, ...]
+    """The frames, in the order of its standard deviations."""
     errors: RotationErrors | None
     """What the matches said of them, if they were asked."""
     uncertainty: Uncertainty
@@ -160,12 +162,22 @@ class GivenPoses(NamedTuple):
 
     weight: RotationWeight = _FREE
     """Of the model's rotations."""
+    weight_frames: Sequence[int] = ()
+    """Ids of the frames that its standard deviations are of, if each has one."""
     model: pycolmap.Reconstruction | None = None
     """Whose rotations were given; None: those of the seed."""
     centers: KnownPositions | None = None
     """Measured otherwise, by the ids of frames, which they pull at."""
     lenses: FreeLenses = ALL_HELD
     """Those that may change; all others stay what they are, to the bit."""
+
+    def weight_of(self, frame_ids: Sequence[int]) -> RotationWeight:
+        """Return the weight with the standard deviations of the given frames; new ones have the usual one."""
+        sigmas, usual = self.weight.frame_sigmas_rad, self.weight.sigma_rad or 0.0
+        if sigmas is None:
+            return self.weight
+        known = dict(zip(self.weight_frames, sigmas.tolist(), strict=True))
+        return self.weight._replace(frame_sigmas_rad=np.array([known.get(i, usual) for i in frame_ids]))
 
 
 def bundle_adjust(
@@ -208,7 +220,7 @@ def bundle_adjust(
         refined = RefinedLenses(dict.fromkeys(given.lenses.doubts, math.nan), ())
     else:
         run = _Run(seed, tracks, structure_options, fixed_frames, given)
-        run.weight = given.weight
+        run.weight = given.weight_of(run.frames.frame_ids)
         if given.model is not None:
             run.given = rotations_of_frames(given.model, run.frames.frame_ids)
         unfiltered, initial_error_px, last = run.adjust_all(seed, tracks)
@@ -265,6 +277,7 @@ def adjust_thinly(
     return AdjustedPlacement(
         reconstruction=poses,
         weight=_FREE,
+        frame_ids=run.frames.frame_ids,
         errors=None,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
@@ -300,12 +313,14 @@ def adjust_placement(
     joined, found = run.triangulate(1.0)
     refuse_without_points(len(found.points))
     problem = run.frames.problem(joined, found)
+    scale = run.choose_scale(problem)
     if weight is None:
-        loss_scale_px = _GIVEN_SCALE * structure_options.max_reprojection_error_px
+        # The loss of the adjustment itself: a wider one lets wrong matches hide what the right ones say.
+        loss_scale_px = scale * structure_options.max_reprojection_error_px
         errors = estimate_rotation_errors(problem, AdjustmentOptions(loss_scale_px=loss_scale_px))
         weight = errors.weight()
     run.weight = weight
-    adjusted = run.solve(problem, run.choose_scale(problem), _GIVEN_FALL)
+    adjusted = run.solve(problem, scale, _GIVEN_FALL)
     if run.lenses.doubts:
         run.judge_lenses(adjusted)
     else:
@@ -314,6 +329,7 @@ def adjust_placement(
     return AdjustedPlacement(
         reconstruction=poses,
         weight=weight,
+        frame_ids=run.frames.frame_ids,
         errors=errors,
         uncertainty=run.uncertainty(adjusted),
         lenses=run.refined,
@@ -459,7 +475,7 @@ class _Run:
             loss_scale_px=self.loss_scale_px, hold_rotations=self.weight.hold, noise_px=self.weight.noise_px
         )
         try:
-            found = estimate_center_errors(problem, options, self.weight.open_rad)
+            found = estimate_center_errors(problem, options, self.weight.open_rad())
         except UnsolvableError:
             return Uncertainty()
         of_camera = found.covariances[self.frames.frame_of_camera]

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.stages.clock import Clock, Progress
+from sfm_shapefit.commands.stages.doubts import confirm_rotations
 from sfm_shapefit.commands.stages.inputs import choose_inputs, open_source
 from sfm_shapefit.commands.stages.measure import (
     build_graph,
@@ -127,7 +128,7 @@ def inspect(
                 num_images=len(model.reconstruction.images),
                 statuses={status.value: count for status, count in directions.counts().items()},
                 points=options.points_statement(model.num_images, measured.num_points),
-                diagnosis=diagnose(measured, options),
+                diagnosis=diagnose(measured, options, confirm_rotations(matches, directions, options)),
                 theory=theory_of(pairs, model.centers, options.num_threads()) if theory else None,
                 expected=forecast(work, matches.economy),
                 rigs=rigs_statement(model, grouped),

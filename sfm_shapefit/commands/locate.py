@@ -166,7 +166,10 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
             source, directions, placement, adjustment = after
             intrinsics = intrinsics.after(adjustment.lenses)
             given = located.given._replace(
-                weight=adjustment.weight, model=model.reconstruction, lenses=intrinsics.free
+                weight=adjustment.weight,
+                weight_frames=adjustment.frame_ids,
+                model=model.reconstruction,
+                lenses=intrinsics.free,
             )
             located = located._replace(given=given)
     with clock("trust"):
@@ -200,7 +203,8 @@ def locate_source(opened: MatchSource, known: Locating, options: LocateOptions, 
         placement=placement,
         kept=located.kept & ~np.isin(model.image_ids[placement.cameras], list(seeded.poor)),
         poor=seeded.poor,
-        agreeing_observations=seeded.agreeing_observations,
+        agreeing_observations=seeded.observations.agreeing,
+        contradicting_observations=seeded.observations.contradicting,
         gauge=gauge,
         adjusted=seeded.adjusted,
         adjustment=adjustment,

@@ -16,7 +16,8 @@ corruption     In a triangle without errors each direction lies on the arc betwe
                circle, it is too low.
 
 A camera most of whose matches contradict the given rotations is named as well. Where the scene repeats itself
-right cameras are among those; only the solution tells them from wrong ones (`judgement.trust`).
+right cameras are among those. The pairs' own relative rotations tell these from wrong ones
+(`judgement.turns`); who has them says which rotations they confirm.
 """
 
 from dataclasses import dataclass
@@ -124,12 +125,18 @@ class Theory:
     statement: str
 
 
-def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | None = None) -> Diagnosis:
+def diagnose(
+    measured: MeasuredGraph | ViewGraph,
+    options: PlacementOptions | None = None,
+    confirmed: BoolArray | None = None,
+) -> Diagnosis:
     """Diagnose a view graph without solving.
 
     Args:
         measured: any view graph, best with what is known of its pairs.
         options: how it would be placed; defaults if None.
+        confirmed: (n,) cameras whose rotation is known to be right, though pairs of theirs are wrong; none if
+            None.
     """
     if isinstance(measured, ViewGraph):
         measured = MeasuredGraph(measured)
@@ -145,6 +152,7 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
     contradicted: BoolArray = np.zeros(graph.num_edges, dtype=np.bool_)
     if scores is not None:
         contradicted[measured.pairs] = scores > WRONG_SCORE_RAD
+    confirmed = np.zeros(n, dtype=np.bool_) if confirmed is None else confirmed
     against = np.zeros((0, 2), dtype=np.int64)
     if measured.evidence is not None:
         against = measured.evidence.contradicting
@@ -163,7 +171,7 @@ def diagnose(measured: MeasuredGraph | ViewGraph, options: PlacementOptions | No
             for piece in pieces[: count_large(pieces, n)]
         ),
         left_out={graph.name_of(camera): reason for camera, reason in outside.items() if camera < n},
-        weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against),
+        weak=() if obstacle else _find_weak_cameras(measured, pieces[0], contradicted, against, confirmed),
         corruption=_corruption(pairs, scores),
         plan=None if obstacle else _plan_placement(graph.restricted_to(pieces[0].edges)[0], options),
         obstacle=obstacle,
@@ -193,12 +201,16 @@ def theory_of(graph: ViewGraph, centers: FloatArray, threads: int = 1) -> Theory
 
 
 def _find_weak_cameras(
-    measured: MeasuredGraph, piece: RigidPiece, contradicted: BoolArray, against: IntArray
+    measured: MeasuredGraph,
+    piece: RigidPiece,
+    contradicted: BoolArray,
+    against: IntArray,
+    confirmed: BoolArray,
 ) -> tuple[WeakCamera, ...]:
     """Return the cameras of the largest piece that little holds, or that most triangles contradict.
 
     Pairs (m,) that their triangles contradict hold nothing; the matches of those `against` (q, 2) contradict
-    the given rotations.
+    the given rotations. Neither is held against cameras (n,) whose rotation is `confirmed`.
     """
     graph, n = measured.graph, measured.graph.num_nodes
     ends, is_pair = graph.edges[piece.edges], measured.is_pair[piece.edges]
@@ -213,12 +225,12 @@ def _find_weak_cameras(
         reasons = []
         if num_ties[camera] <= FEW_PAIRS and len(piece.nodes) >= _SMALLEST_CHECKED:
             reasons.append("two pairs or fewer hold it")
-        if num_wrong[camera] > _CONTRADICTED_SHARE * num_pairs[camera]:
+        if num_wrong[camera] > _CONTRADICTED_SHARE * num_pairs[camera] and not confirmed[camera]:
             reasons.append(
                 f"{num_wrong[camera]} of its {num_pairs[camera]} pairs contradict their triangles: "
                 "its rotation may be wrong"
             )
-        if num_against[camera] > num_pairs[camera]:
+        if num_against[camera] > num_pairs[camera] and not confirmed[camera]:
             reasons.append(
                 f"the matches of {num_against[camera]} further pairs contradict the given rotations, more "
                 f"than its {num_pairs[camera]} usable ones: its rotation may be wrong, or the scene repeats"

@@ -226,6 +226,11 @@ class Agreement(TypedDict):
         "Of the keypoints matched in two or more of its other images, the share that sees a 3D point; null "
         "without a database.",
     ]
+    contradicting: Annotated[
+        float | None,
+        "Of the same, the share that sees none and most of whose matches miss the epipolar lines of the "
+        "cameras.",
+    ]
 
 
 class LoopOfVideo(TypedDict):

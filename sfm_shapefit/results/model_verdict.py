@@ -3,7 +3,8 @@
 Do not use, if any of these holds:
 
     the residuals of the pairs that agree have a level above 5 degrees
-    of the observations of two or more matches, fewer than half see a 3D point
+    of the observations of two or more matches, half or more contradict the cameras: they see no 3D point, and
+    most of their matches miss the epipolar lines
     of the pairs that say anything of a direction, fewer than a quarter agree
     of the cameras that were placed, fewer than half are in the output
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from sfm_shapefit.results.result import GraphResult, LocateResult
 
 _MOST_LEVEL_DEG = 5.0
-_LEAST_OBSERVATIONS, _FEW_OBSERVATIONS = 0.5, 0.75
+_MOST_CONTRADICTING, _FEW_OBSERVATIONS = 0.5, 0.75
 _LEAST_PAIRS = 0.25
 _LEAST_KEPT = 0.5
 _LOW_TRUST = 0.75
@@ -81,6 +82,7 @@ class _Shares(NamedTuple):
     """Of what there is, how much agrees or is in the output; NaN where that is not known."""
 
     observations: float
+    contradicting: float
     pairs: float
     kept: float
 
@@ -88,7 +90,9 @@ class _Shares(NamedTuple):
 def judge_model(found: "LocateResult") -> ModelVerdict:
     """Return the verdict on a placed model."""
     kept = float(np.mean(found.kept))
-    shares = _Shares(found.agreeing_observations, found.agreeing_pairs, kept)
+    shares = _Shares(
+        found.agreeing_observations, found.contradicting_observations, found.agreeing_pairs, kept
+    )
     outside = [found.model.names[c] for c in found.placement.cameras[~found.kept].tolist()]
     repeats = tuple(match_warnings(found.directions))[:1]
     lenses = tuple(
@@ -101,7 +105,7 @@ def judge_graph(found: "GraphResult") -> ModelVerdict:
     """Return the verdict on a placed graph, which has no observations."""
     placement = found.placement
     share = 1.0 - len(placement.rejected_pairs) / max(len(placement.pairs), 1)
-    return _judge(placement, _Shares(np.nan, share, 1.0), [], ())
+    return _judge(placement, _Shares(np.nan, np.nan, share, 1.0), [], ())
 
 
 def _judge(
@@ -132,8 +136,8 @@ def _reasons_against(placement: Placement, shares: _Shares) -> Iterator[str]:
     level = placement.assessment.level_deg
     if level > _MOST_LEVEL_DEG:
         yield f"the directions are {level:.0f} degrees off the cameras"
-    if shares.observations < _LEAST_OBSERVATIONS:
-        yield f"only {shares.observations:.0%} of the observations see a 3D point"
+    if shares.contradicting >= _MOST_CONTRADICTING:
+        yield f"{shares.contradicting:.0%} of the observations contradict the cameras"
     if shares.pairs < _LEAST_PAIRS:
         yield f"only {shares.pairs:.0%} of the pairs agree"
     if shares.kept < _LEAST_KEPT:

@@ -130,6 +130,8 @@ class LocateResult(Displayed):
     agreeing_observations: float = math.nan
     """Of the keypoints of images in the output that are matched in two or more of the others, the share that
     sees a 3D point; NaN where there is no database."""
+    contradicting_observations: float = math.nan
+    """Of the same, the share that sees none and most of whose matches miss the cameras' epipolar lines."""
     focal_doubts: tuple[FocalDoubt, ...] = ()
     """Cameras whose matches prefer another focal length than the given one, by their id."""
 

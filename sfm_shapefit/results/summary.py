@@ -65,6 +65,7 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
         "agreement": {
             "pairs": _number(found.agreeing_pairs),
             "observations": _number(found.agreeing_observations),
+            "contradicting": _number(found.contradicting_observations),
         },
         "num_points": model.num_points3D(),
         "mean_reprojection_error_px": model.compute_mean_reprojection_error(),

@@ -64,6 +64,22 @@ def test_the_standard_deviation_of_wrong_rotations_is_found(sigma_deg, seed):
     assert np.degrees(weight.sigma_rad) == pytest.approx(sigma_deg, rel=0.41)
 
 
+@pytest.mark.parametrize("sigma_deg", [0.0, 0.05])
+def test_a_frame_whose_rotation_is_clearly_worse_has_a_sigma_of_its_own(sigma_deg):
+    problem, _ = ring_problem(sigma_deg, 0.2)
+    turned = problem.rotations.copy()
+    turned[5] = Rotation.from_rotvec(np.radians([0.5, -0.4, 0.3])).as_matrix() @ turned[5]
+    weight = estimate_rotation_errors(
+        problem.with_values(turned, problem.centers, problem.points, problem.lenses), OPTIONS
+    ).weight()
+    own = np.degrees(weight.frame_sigmas_rad)
+    assert weight.hold == (sigma_deg == 0.0)
+    assert own[5] == pytest.approx(np.sqrt(0.5 / 3.0), rel=0.2)
+    assert np.delete(own, 5).max() < 0.25
+    pull = weight.apply(problem, problem.rotations).rotation_prior
+    assert pull is None or np.trace(pull.information[5]) < 0.5 * np.trace(pull.information[6])
+
+
 def test_a_common_turn_of_all_is_no_error():
     problem, _ = ring_problem(0.0, 0.2)
     turn = Rotation.from_rotvec([0.3, -0.2, 0.1]).as_matrix()

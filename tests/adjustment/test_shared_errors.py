@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.polynomial import Legendre
 from scipy.spatial.transform import Rotation
 
 from sfm_shapefit.adjustment import (
@@ -119,12 +120,48 @@ def test_noise_that_neighbors_share_is_in_it(monkeypatch):
 def test_a_lens_that_is_off_is_seen_and_one_that_is_right_is_not():
     rng = np.random.default_rng(0)
     truth = ring_problem(rng, 12, 800, share=0.5)
-    assert ratios(truth, OPTIONS)[1].calibration_px == 0.0
+    right = ratios(truth, OPTIONS)[1]
+    assert right.calibration_px == 0.0
+    assert right.lens_errors_px[0] == 0.0
     focal, cx, cy = truth.lenses[0].parameters
     bent = (replace(truth.lenses[0], model="SIMPLE_RADIAL", parameters=(focal, cx, cy, 0.03)),)
     errors, found = ratios(truth, OPTIONS, start=replace(truth, lenses=bent))
     assert found.calibration_px > 0.2
     assert rms(errors) < 1.5
+
+
+def test_what_the_images_of_a_lens_err_by_together_is_as_large_as_stated(monkeypatch):
+    """A field of each lens, drawn from the polynomials of the estimate with 0.3 px each."""
+    monkeypatch.setattr(shared_errors, "_CALIBRATION_OF_ERROR", 0.0)
+    found, sizes = [], []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        truth = ring_problem(rng, 12, 800, share=0.5, noise_px=0.1)
+        low, high = truth.pixels.min(axis=0), truth.pixels.max(axis=0)
+        x, y = ((2.0 * truth.pixels - low - high) / (high - low)).T
+        degrees = [(i, j) for i in range(4) for j in range(4 - i)]
+        basis = np.stack(
+            [
+                np.sqrt((2 * i + 1) * (2 * j + 1)) * Legendre.basis(i)(x) * Legendre.basis(j)(y)
+                for i, j in degrees
+            ]
+        )
+        bent = replace(truth, pixels=truth.pixels + (0.3 * rng.standard_normal((2, 10)) @ basis).T)
+        errors, estimate = ratios(truth, OPTIONS, start=bent)
+        found.append(errors)
+        sizes.append(estimate.lens_errors_px[0])
+    assert np.median(sizes) == pytest.approx(0.3, rel=0.3)
+    # What the frames leave of the fields counts as noise of the points, too: errors are stated too large.
+    assert 0.4 < rms(np.concatenate(found)) < 1.2
+
+
+def test_the_variance_of_measured_numbers_is_found_beside_their_noise():
+    rng = np.random.default_rng(0)
+    noise = rng.uniform(0.1, 5.0, 4000)
+    pure = np.sqrt(noise) * rng.standard_normal(4000)
+    assert shared_errors.likeliest_variance(pure, noise) < 0.03
+    measured = pure + np.sqrt(0.5) * rng.standard_normal(4000)
+    assert shared_errors.likeliest_variance(measured, noise) == pytest.approx(0.5, rel=0.1)
 
 
 def test_fixed_frames_have_no_error_and_unseen_ones_none_that_is_known():

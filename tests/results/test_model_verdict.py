@@ -54,10 +54,18 @@ def test_doubtful_and_left_out_cameras_are_named_the_left_out_first(found):
 
 
 @pytest.mark.parametrize(
-    ("share", "grade"), [(0.76, Grade.GOOD), (0.74, Grade.LOOK), (0.49, Grade.DO_NOT_USE)]
+    ("share", "contradicting", "grade"),
+    [
+        (0.76, 0.1, Grade.GOOD),
+        (0.74, 0.1, Grade.LOOK),
+        (0.1, 0.49, Grade.LOOK),
+        (0.4, 0.51, Grade.DO_NOT_USE),
+    ],
 )
-def test_the_share_of_observations_that_see_a_point_decides(found, share, grade):
-    verdict = altered(found, agreeing_observations=share).verdict
+def test_what_contradicts_makes_a_model_bad_and_what_sees_no_point_is_to_be_looked_at(
+    found, share, contradicting, grade
+):
+    verdict = altered(found, agreeing_observations=share, contradicting_observations=contradicting).verdict
     assert verdict.grade is grade
     assert bool(verdict.reasons) is (grade is not Grade.GOOD)
 

@@ -15,7 +15,7 @@ from sfm_shapefit.directions.matches import MatchBatch, RayMatches, join_rays
 from sfm_shapefit.directions.pair_directions import PairDirections
 from sfm_shapefit.judgement.doubted import believe_rotations, weigh_doubts
 from sfm_shapefit.judgement.focal_lengths import FocalDoubt, Lenses, doubt_focal_lengths
-from sfm_shapefit.judgement.turns import find_turned, fit_as_placed, weigh_pairs
+from sfm_shapefit.judgement.turns import Doubt, find_turned, fit_as_placed, weigh_pairs
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.placement.place import Placement
 from sfm_shapefit.rotations.relative_rotations import RelativeRotations
@@ -88,6 +88,23 @@ def doubt_cameras(
         _, labels = np.unique(placement.groups.group_of[placement.cameras], return_inverse=True)
     doubts = find_turned(pairs, labels)
     return replace(placement, assessment=weigh_doubts(placement.assessment, doubts))
+
+
+def confirm_rotations(source: MatchSource, directions: PairDirections, options: LocateOptions) -> BoolArray:
+    """Return which images (n,) have a rotation that the matches of their pairs confirm, none being placed.
+
+    As `doubt_cameras` judges them, but for the baselines, which are not known yet.
+    """
+    model = source.model
+    if options.rotations == "measured":
+        return np.ones(model.num_images, dtype=np.bool_)
+    relative = ask_pairs(source, directions, options)
+    if relative is None:
+        return np.zeros(model.num_images, dtype=np.bool_)
+    pairs = weigh_pairs(directions, np.full(len(directions.pairs), np.nan), relative, model.rotations)
+    _, labels = np.unique(model.frame_ids, return_inverse=True)
+    kinds = find_turned(pairs, labels.ravel().astype(np.int64)).kinds
+    return np.array([kind is Doubt.RIGHT for kind in kinds])
 
 
 def question_focal_lengths(

@@ -12,8 +12,9 @@ from sfm_shapefit.arrays import BoolArray, IntArray
 from sfm_shapefit.colmap.bundle_adjustment import Adjusted, GivenPoses, bundle_adjust
 from sfm_shapefit.colmap.model import PosedModel
 from sfm_shapefit.colmap.point_support import (
+    ObservationShares,
     deregister_of_few_points,
-    share_of_agreeing_observations,
+    judge_observations,
 )
 from sfm_shapefit.colmap.seed import build_seed, transform_model, turn_model
 from sfm_shapefit.colmap.structure import TrackSource, color_points, correspondence_graph, triangulate
@@ -66,8 +67,8 @@ class Seeded(NamedTuple):
     """How bundle adjustment went, if it was asked for."""
     poor: dict[int, int]
     """By the id of each image that was left out because it sees too few points, their number."""
-    agreeing_observations: float
-    """Share of the keypoints matched in two other images that see a point; NaN without a database."""
+    observations: ObservationShares
+    """What of the keypoints matched in two other images sees a point, and what contradicts the cameras."""
 
 
 def select_trusted(placement: Placement, min_trust: float) -> BoolArray:
@@ -110,9 +111,9 @@ def build_seeded_model(
             seeded = adjusted.reconstruction
     del tracks  # the graph of all matches is large
     poor = deregister_of_few_points(seeded, options.min_points_per_image, frames)
-    agreeing = math.nan
+    shares = ObservationShares(math.nan, math.nan)
     if source.database is not None:  # points of the model's own tracks have their colors already
-        agreeing = share_of_agreeing_observations(seeded, source.model.image_ids, source.batches())
+        shares = judge_observations(seeded, source.model, source.batches(), options.max_reprojection_error_px)
         with clock("colors"):
             seeded = color_points(seeded, source.model.reconstruction, in_place=True)
     if poor:
@@ -125,7 +126,7 @@ def build_seeded_model(
         seeded = turn_model(seeded, gauge.axes)
     if adjusted is not None:
         adjusted = replace(adjusted, reconstruction=seeded)
-    return Seeded(seeded, gauge, adjusted, poor, agreeing)
+    return Seeded(seeded, gauge, adjusted, poor, shares)
 
 
 def _set_gauge(
