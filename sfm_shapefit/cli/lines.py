@@ -65,7 +65,7 @@ def name_pictures(flags: OutputFlags) -> str:
 
 def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str]:
     """Return what to do next, a line each: look at the report, then the command that the report names."""
-    from sfm_shapefit.report.headline import next_step
+    from sfm_shapefit.report.first_screen import next_step
 
     _, command = next_step(facts["verdict"]["grade"], facts)
     filled = re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)

@@ -84,13 +84,13 @@ def locate_command(
 
 def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model
+    from sfm_shapefit.results.key_figures import figure_rows
 
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     return Told(
         figures=[
-            *headline_of_model(found).rows(),
+            *figure_rows(facts),
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
             *intrinsics_rows(facts),

@@ -65,7 +65,7 @@ def map_command(
 
 def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
     """Say what each model has, what was left out, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model
+    from sfm_shapefit.results.key_figures import figure_rows
 
     several = len(found.models) > 1
     figures: Rows = []
@@ -75,7 +75,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         title = [(f"model {number}", located.verdict.statement)] if several else []
         figures += [
             *title,
-            *headline_of_model(located).rows(),
+            *figure_rows(located.summary()),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
             *scene_rows(located.summary()),

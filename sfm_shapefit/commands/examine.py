@@ -26,6 +26,7 @@ from sfm_shapefit.geometry import SIGMA_PER_MEDIAN, angle_between_deg, normalize
 from sfm_shapefit.judgement.verdicts import Verdict
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.report.drawing import CameraColumn, Drawing, build_drawing, poses_of
+from sfm_shapefit.results.key_figures import key_figures
 from sfm_shapefit.results.result import Inputs
 from sfm_shapefit.results.tables import CameraRow, PairRow
 
@@ -69,12 +70,20 @@ def examine(
     poses = replace(poses, centers=np.full_like(poses.centers, np.nan))
     drawing = build_drawing(cameras, pairs, poses=poses, points=model.reconstruction)
     further = _columns(quality, len(cameras))
+    focal_length_px = float(np.median(model.focal_lengths_px))
+    error_deg = _median([pair.residual_deg for pair in pairs if pair.direction])
     facts = _facts(inputs, cameras, pairs, level_deg) | {
+        "figures": key_figures(cameras, error_deg, focal_length_px, "of the model's units"),
+        "sigma_of": "",
         "mean_reprojection_error_px": model.reconstruction.compute_mean_reprojection_error(),
         "median_track_length": quality.median_track_length,
         "timings_s": clock.seconds,
     }
     return replace(drawing, further=further), facts
+
+
+def _median(values: list[float]) -> float:
+    return float(np.median(values)) if values else np.nan
 
 
 def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[list[PairRow], float]:
@@ -182,6 +191,4 @@ def _facts(
         "scale": "input: those of the model",
         "versions": {"sfm_shapefit": __version__, "pycolmap": version("pycolmap")},
     }
-    if usable:
-        facts["residuals_deg"] = {"quantile_50": float(np.median([pair.residual_deg for pair in usable]))}
     return facts | {"options": {}, "pieces": [], "warnings": [], "loose_groups": []}

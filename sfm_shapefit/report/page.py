@@ -26,7 +26,7 @@ from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.locate_options import LocateOptions
 from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
-from sfm_shapefit.report.headline import banner, input_of, scene_name, tiles
+from sfm_shapefit.report.first_screen import banner, input_of, scene_name, tiles
 from sfm_shapefit.report.sentences import (
     Hint,
     expert_sentences,

@@ -8,7 +8,7 @@ from sfm_shapefit.colmap.image_quality import image_quality
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.examine import examine
 from sfm_shapefit.report.drawing import PairClass
-from sfm_shapefit.report.headline import banner
+from sfm_shapefit.report.first_screen import banner
 from tests.program import run, run_refused
 from tests.scenes import RING, fingerprint
 

@@ -14,7 +14,7 @@ from sfm_shapefit.errors import InputError
 from sfm_shapefit.report import thumbnails
 from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
 from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
-from sfm_shapefit.report.headline import banner, scene_name, tiles
+from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
@@ -170,10 +170,13 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     drawing, facts = make_drawing()
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
     assert shown["cameras placed"] == "24 of 25"
-    assert shown["typical error of a pair"] == "1.4 px, 0.08°"  # 1000 px * tan(0.08 deg)
+    assert shown["typical error of a pair"] == "1.4 px, 0.08°"
     assert shown["camera to check"] == "1"
-    sigma = next(value for label, value in shown.items() if label.startswith("typical uncertainty"))
-    assert sigma == f"± {np.median(drawing.cameras.sigmas[:24]):.2g} units"
+    assert shown["typical uncertainty, 0.07% of the scene"] == "± 0.015 units"
+    del facts["figures"]  # as in an output of an earlier version
+    assert not any(
+        "typical" in tile["label"] and "shift" not in tile["label"] for tile in tiles(drawing, facts)
+    )
 
 
 def test_agreeing_pairs_and_median_errors_are_counted_per_camera():
