@@ -25,6 +25,7 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
             degree=8,
             trust=float(np.clip(1.1 - rng.exponential(0.12), 0, 1)) if k != num_cameras - 1 else float("nan"),
             sigma=tuple(rng.uniform(0.001, 0.02, 3)),
+            correlation=(0.6, -0.3, 0.1),
         )
         for k in range(num_cameras)
     ]
@@ -43,6 +44,8 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
         positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
         colors=rng.integers(60, 220, (num_points, 3)),
         num_all=3 * num_points,
+        track_lengths=rng.integers(2, 12, num_points),
+        errors_px=rng.gamma(2.0, 0.3, num_points),
     )
     pairs = replace(drawing.pairs, input_deg=drawing.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))
     drawing = replace(

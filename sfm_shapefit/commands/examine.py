@@ -75,15 +75,23 @@ def examine(
     facts = _facts(inputs, cameras, pairs, level_deg) | {
         "figures": key_figures(cameras, error_deg, focal_length_px, "of the model's units"),
         "sigma_of": "",
-        "mean_reprojection_error_px": model.reconstruction.compute_mean_reprojection_error(),
-        "median_track_length": quality.median_track_length,
+        "mean_reprojection_error_px": _mean(quality.point_errors_px),
+        "median_track_length": _median(quality.point_track_lengths.tolist()),
         "timings_s": clock.seconds,
     }
-    return replace(drawing, further=further), facts
+    points = replace(
+        drawing.points, errors_px=quality.point_errors_px, track_lengths=quality.point_track_lengths
+    )
+    return replace(drawing, further=further, points=points), facts
 
 
 def _median(values: list[float]) -> float:
     return float(np.median(values)) if values else np.nan
+
+
+def _mean(values: FloatArray) -> float:
+    known = values[np.isfinite(values)]
+    return float(known.mean()) if len(known) else np.nan
 
 
 def _pair_rows(model: PosedModel, directions: PairDirections | None) -> tuple[list[PairRow], float]:

@@ -24,8 +24,15 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
+from sfm_shapefit.report.charts import (
+    MOST_CELLS,
+    Bars,
+    reprojection_error_bars,
+    residual_histogram,
+    track_length_bars,
+    view_graph_matrix,
+)
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, Points, input_centers
 from sfm_shapefit.report.first_screen import banner, input_of, scene_name, tiles
 from sfm_shapefit.report.sentences import (
     Hint,
@@ -125,6 +132,8 @@ def page_data(
             "edges": histogram.edges_deg.tolist(),
             "counts": {state: values.tolist() for state, values in histogram.counts.items()},
         },
+        "tracks": _bars(track_length_bars(drawing.points.track_lengths)),
+        "reprojection": _bars(reprojection_error_bars(drawing.points.errors_px)),
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
@@ -169,7 +178,7 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
         "placed": _pack(cameras.placed[order], "u1"),
         "trust": _pack(cameras.trust[order], "f4"),
         "sigma": _pack(cameras.sigmas[order], "f4"),
-        "sigmas": _pack(cameras.axis_sigmas[order], "f4"),
+        "ellipsoids": _pack(display.turn(cameras.ellipsoids[order]), "f4"),
         "degree": _pack(cameras.degrees[order], "i4"),
         "agreeing": _pack(agreeing[order], "i4"),
         "error": _pack(errors[order], "f4"),
@@ -246,6 +255,12 @@ def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
     }
 
 
+def _bars(bars: Bars | None) -> dict[str, Any] | None:
+    if bars is None:
+        return None
+    return {"counts": bars.counts.tolist(), "texts": list(bars.texts), "ticks": [list(t) for t in bars.ticks]}
+
+
 def _convergence(drawing: Drawing) -> dict[str, Any]:
     """Return the history; the axis leaves out the first iterations where those are far out of scale."""
     objectives = [objective for _, objective, _ in drawing.history]
@@ -312,6 +327,8 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
     return {
         "histogram": _histogram_note(medians_deg),
+        "tracks": _tracks_note(drawing.points),
+        "reprojection": _reprojection_note(drawing.points),
         "trust": _trust_note(drawing.cameras.trust),
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
@@ -340,6 +357,33 @@ def _histogram_note(medians_deg: dict[str, float]) -> str:
     }
     medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
     return f"Angle between what the matches of a pair say and where its cameras stand; medians: {medians}."
+
+
+def _tracks_note(points: Points) -> str:
+    if not len(points.track_lengths):
+        return ""
+    share = float(np.mean(points.track_lengths <= 2))
+    return (
+        f"By how many images a 3D point is seen; the median is {np.median(points.track_lengths):.3g}. "
+        f"{share:.0%} are seen by two only: nothing checks these.{_sample(points)}"
+    )
+
+
+def _reprojection_note(points: Points) -> str:
+    known = points.errors_px[np.isfinite(points.errors_px)]
+    if not len(known):
+        return ""
+    median, high = np.quantile(known, [0.5, 0.9])
+    return (
+        f"Mean error of a 3D point over the images that see it: {median:.2g} px in the median, "
+        f"{high:.2g} px or less for nine of ten.{_sample(points)}"
+    )
+
+
+def _sample(points: Points) -> str:
+    if len(points.track_lengths) >= points.num_all:
+        return ""
+    return f" Counted over {len(points.track_lengths):,} points, evenly picked."
 
 
 def _matrix_note(cameras_per_cell: int) -> str:

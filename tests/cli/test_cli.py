@@ -70,6 +70,13 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     assert f"{figures['pair_error_deg']:.2g} deg ({figures['pair_error_px']:.2g} px)" in result.stdout
 
 
+def test_a_graph_has_no_images_to_show(tmp_path):
+    assert "--images" in run("locate", "--help").stdout
+    assert "--images" not in run("place", "--help").stdout
+    graph = BUNDLED / "graph40.txt"
+    assert "No such option" in run("place", graph, tmp_path / "out", "--images", tmp_path, code=2).output
+
+
 def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_names(tmp_path):
     out = tmp_path / "out"
     names = ("--input_path", RING_MODEL, "--output_path", out, "--database_path", RING / "database.db")

@@ -81,7 +81,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
     drawn = driver.execute_script(
         "return [...document.querySelectorAll('.chart svg')].map((e) => e.parentNode.id)"
     )
-    assert drawn == ["trust", "histogram", "matrix", "support", "convergence"]
+    assert drawn == ["trust", "histogram", "tracks", "reprojection", "matrix", "support", "convergence"]
     assert driver.execute_script(COLORS)["count"] > 50
     assert "mkdir -p" in driver.find_element("id", "command").text
     assert str(report.parent) in driver.find_element("id", "command").text

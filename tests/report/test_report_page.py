@@ -12,12 +12,18 @@ import pytest
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.report import thumbnails
-from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
+from sfm_shapefit.report.charts import (
+    reprojection_error_bars,
+    residual_histogram,
+    track_length_bars,
+    view_graph_matrix,
+)
+from sfm_shapefit.report.drawing import PairClass, build_drawing, frustum_corners, view_axes
 from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
+from sfm_shapefit.results.tables import CameraRow
 from tests.drawings import make_drawing
 
 HOSTILE = [
@@ -174,9 +180,47 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     assert shown["camera to check"] == "1"
     assert shown["typical uncertainty, 0.07% of the scene"] == "± 0.015 units"
     del facts["figures"]  # as in an output of an earlier version
-    assert not any(
-        "typical" in tile["label"] and "shift" not in tile["label"] for tile in tiles(drawing, facts)
+    labels = [tile["label"] for tile in tiles(drawing, facts)]
+    assert not any(label.startswith(("typical error", "typical uncertainty")) for label in labels)
+
+
+def test_an_ellipsoid_lies_along_the_axes_of_the_covariance_and_survives_the_way_into_the_page(page):
+    drawing, _ = make_drawing()
+    data = data_of(page)
+    order = [drawing.cameras.names.index(name) for name in data["cameras"]["names"]]
+    halves = unpacked(data["cameras"]["ellipsoids"]).reshape(-1, 3, 3)[0]
+    covariance = drawing.cameras.covariances[order[0]]
+    np.testing.assert_allclose(halves.T @ halves, drawing.axes @ covariance @ drawing.axes.T, atol=1e-9)
+    products = halves @ halves.T  # they are orthogonal
+    np.testing.assert_allclose(products - np.diag(np.diag(products)), 0.0, atol=1e-9)
+    row = CameraRow(name="a", placed=True, center=(0, 0, 0), sigma=(3.0, 4.0, 1.0), correlation=(1.0, 0, 0))
+    long = build_drawing([row], []).cameras.ellipsoids[0, 2]  # errors along x and y are one and the same
+    np.testing.assert_allclose(np.abs(long), [3.0, 4.0, 0.0], atol=1e-9)
+    plane = CameraRow(name="a", placed=True, center=(0, 0), sigma=(3.0, 4.0), correlation=(1.0,))
+    np.testing.assert_allclose(
+        np.abs(build_drawing([plane], []).cameras.ellipsoids[0, 2]), [3, 4, 0], atol=1e-9
     )
+
+
+def test_every_point_is_in_a_bar_of_the_track_lengths_and_of_the_errors():
+    lengths = np.array([2, 2, 3, 10, 11, 12, 40])
+    bars = track_length_bars(lengths)
+    named = dict(zip(bars.texts, bars.counts.tolist(), strict=True))
+    assert named["seen by 2 images"] == 2
+    assert named["seen by 10-11 images"] == 2
+    assert named["seen by 30-40 images"] == 1
+    assert bars.counts.sum() == len(lengths)
+    assert [place for place, _ in bars.ticks] == [k + 0.5 for k in range(len(bars.counts))]
+
+    errors = np.append(np.linspace(0.0, 1.0, 100), [50.0, np.nan])
+    bars = reprojection_error_bars(errors)
+    assert bars.counts.sum() == 101
+    assert bars.counts[-1] == np.sum(errors >= float(bars.texts[-1].split()[0]))
+    assert bars.texts[0] == "0 to 0.05 px"
+    assert bars.counts[0] == np.sum(errors < 0.05)
+    assert track_length_bars(lengths[:0]) is None
+    assert reprojection_error_bars(np.array([np.nan])) is None
+    assert reprojection_error_bars(np.zeros(3)).counts.sum() == 3
 
 
 def test_agreeing_pairs_and_median_errors_are_counted_per_camera():
@@ -243,7 +287,7 @@ def test_the_title_is_the_name_of_the_scene(inputs, title):
 def test_nothing_known_nothing_claimed():
     drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
     facts |= {"warnings": [], "loose_groups": []}
-    for key in ("verdict", "delivered", "residuals_deg", "sigma_of", "scale", "mean_reprojection_error_px"):
+    for key in ("verdict", "delivered", "figures", "sigma_of", "scale", "mean_reprojection_error_px"):
         del facts[key]
     data = page_data(drawing, facts)
     assert data["banner"]["grade"] == ""

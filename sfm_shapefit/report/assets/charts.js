@@ -102,6 +102,25 @@ const drawHistogram = () => {
   return svg;
 };
 
+const drawBars = (name, title, label) => {
+  if (!data[name]) return null;
+  const { counts, texts, ticks } = data[name];
+  const [svg, box] = [chart(220, title), { left: 56, right: WIDTH - 16, top: 10, bottom: 176 }];
+  const width = (box.right - box.left) / counts.length;
+  const x = { place: (value) => box.left + value * width, ticks };
+  const y = linear(0, Math.max(...counts), box.bottom, box.top);
+  drawAxes(svg, box, x, y, [label, "3D points"]);
+  counts.forEach((value, k) => {
+    const top = y.place(value);
+    svg.append(shape("rect", { x: x.place(k) + 1, y: top, width: width - 2, height: box.bottom - top, fill: "var(--agrees)" }));
+  });
+  listen(svg, (u) => {
+    const k = Math.floor((u - box.left) / width);
+    return k in counts ? ["text", texts[k], [["3D points", count(counts[k])]]] : null;
+  });
+  return svg;
+};
+
 const LEAST_TRUSTED = 12;
 const drawTrust = (onChoice) => {
   const shown = [];
@@ -242,7 +261,10 @@ const drawConvergence = () => {
 const drawCharts = (onChoice) => {
   WIDTH = Math.max(Math.min($("cameras").clientWidth, 760), 280);
   const made = {
-    trust: drawTrust, histogram: drawHistogram, matrix: drawMatrix, support: drawSupport, convergence: drawConvergence,
+    trust: drawTrust, histogram: drawHistogram,
+    tracks: () => drawBars("tracks", "Track lengths", "images that see a point"),
+    reprojection: () => drawBars("reprojection", "Reprojection errors", "mean error of a point, px"),
+    matrix: drawMatrix, support: drawSupport, convergence: drawConvergence,
   };
   for (const [id, draw] of Object.entries(made)) {
     $(`${id}-note`).textContent = data.notes[id];

@@ -37,14 +37,17 @@ const makeScene = (onChoice) => {
     chosen.forEach((k, row) => found.set(values.subarray(width * k, width * (k + 1)), width * row));
     return found;
   };
-  const frustumColumns = (chosen) => {
-    const vectors = [0, 3, 6].map((first) => {
+  // Three vectors per camera, nine numbers, as u, v and w.
+  const vectorsOf = (chosen, values) => {
+    const [u, v, w] = [0, 3, 6].map((first) => {
       const found = new Float32Array(3 * chosen.length);
-      chosen.forEach((k, row) => found.set(cameras.frusta.subarray(9 * k + first, 9 * k + first + 3), 3 * row));
+      chosen.forEach((k, row) => found.set(values.subarray(9 * k + first, 9 * k + first + 3), 3 * row));
       return found;
     });
-    const center = new Float32Array(chosen.flatMap(positionOf));
-    return { center, u: vectors[0], v: vectors[1], w: vectors[2] };
+    return { u, v, w };
+  };
+  const frustumColumns = (chosen) => {
+    return { center: new Float32Array(chosen.flatMap(positionOf)), ...vectorsOf(chosen, cameras.frusta) };
   };
   const cameraColors = (chosen) => {
     const gray = rgbOf("--nodirection").map((part) => Math.round(255 * part));
@@ -66,14 +69,7 @@ const makeScene = (onChoice) => {
     const [center, u] = [gather(chosen, cameras.center, 3), gather(chosen, cameras.inputCenter, 3)];
     return { center, u: u.map((part, k) => part - center[k]) };
   };
-  const ellipsoidColumns = (chosen) => {
-    const found = { center: gather(chosen, cameras.center, 3) };
-    ["u", "v", "w"].forEach((name, axis) => {
-      const along = at(data.axes, axis);
-      found[name] = new Float32Array(chosen.flatMap((k) => along.map((part) => part * cameras.sigmas[3 * k + axis])));
-    });
-    return found;
-  };
+  const ellipsoidColumns = (chosen) => ({ center: gather(chosen, cameras.center, 3), ...vectorsOf(chosen, cameras.ellipsoids) });
   // Dark points would vanish on a dark page and light ones on a light page; points without colors are gray.
   const pointColors = () => {
     const { colors } = points;
@@ -538,7 +534,7 @@ const makeScene = (onChoice) => {
   const leastPixels = LEAST_FRUSTUM_PX * Math.min(Math.sqrt(400 / Math.max(placed.length, 1)), 1);
   sizes.frustum = Math.max(data.frustum, leastPixels / eye.pixelsPerUnit());
   if (certain.length) {
-    const size = quantile(certain.map((k) => Math.hypot(...at(cameras.sigmas, k))), 0.5);
+    const size = quantile(certain.map((k) => Math.hypot(...cameras.ellipsoids.subarray(9 * k, 9 * k + 9))), 0.5);
     const power = 10 ** Math.floor(Math.log10(sizes.frustum / size));
     sizes.ellipsoid = Math.max(Math.floor(sizes.frustum / size / power) * power, 1);
   }
