@@ -55,7 +55,9 @@ _STARTING_ITERATIONS = 2
 # So many loops are listed.
 _MAX_LOOPS = 50
 _AXES = "xyz"
-_TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
+_TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
+# What stands in the matrix of pairs where there is no pair.
+_NO_PAIR = 255
 
 
 # In the order in which they are one script.
@@ -114,7 +116,8 @@ def page_data(
         "dimension": drawing.dimension,
         "shownAxes": min(drawing.dimension, len(_AXES)),
         "frustum": drawing.frustum_depth,
-        "axes": _pack(drawing.axes.T, "f4"),
+        "axes": drawing.axes.T.ravel().tolist(),
+        "middle": display.middle.tolist(),
         "cameras": _cameras(drawing, cameras, display, reasons),
         "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
         "pairs": _pairs(drawing, pairs, rank, reasons),
@@ -154,11 +157,11 @@ class _Display:
     def __init__(self, drawing: Drawing) -> None:
         self._axes = drawing.axes
         centers = drawing.cameras.centers[drawing.cameras.placed]
-        self._middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
+        self.middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Return points (..., 3) in the page's axes."""
-        return self.turn(points - self._middle)
+        return self.turn(points - self.middle)
 
     def turn(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (..., 3) in the page's axes."""
@@ -184,7 +187,6 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
         "error": _pack(errors[order], "f4"),
         "piece": _pack(cameras.pieces[order], "i4"),
         "reason": _encode([cameras.reasons[k] for k in order.tolist()], reasons),
-        "world": _pack(cameras.centers[order], "f8"),
         "center": _pack(display(cameras.centers[order]), "f4"),
         "frusta": _pack(_frusta(drawing, order, display), "f4"),
         "ghost": _pack(display(_ghosts(drawing)[order]), "f4"),
@@ -246,13 +248,13 @@ def _pack(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
 
 def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
     matrix = view_graph_matrix(drawing.pairs, len(rank))
-    return {
-        "side": len(matrix.cells),
-        "perCell": matrix.cameras_per_cell,
-        "cells": _pack(matrix.cells, "f4"),
-        "counts": _pack(matrix.counts, "i4"),
-        "rowOf": _pack(rank, "i4"),
-    }
+    known = {"side": len(matrix.cells), "perCell": matrix.cameras_per_cell, "rowOf": _pack(rank, "i4")}
+    if matrix.cameras_per_cell == 1:
+        return known | {"cells": _pack(np.nan_to_num(matrix.cells, nan=_NO_PAIR), "u1")}
+    against = np.rint(np.nan_to_num(matrix.cells) * matrix.counts)
+    largest = np.iinfo(np.uint16).max
+    counts = {"against": against, "counts": matrix.counts}
+    return known | {name: _pack(np.minimum(values, largest), "u2") for name, values in counts.items()}
 
 
 def _bars(bars: Bars | None) -> dict[str, Any] | None:

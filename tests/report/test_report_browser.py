@@ -240,6 +240,58 @@ def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_ou
     assert complaints(driver) == []
 
 
+# Turns the scene for ten frames; returns the calls of WebGL, the largest array that is handed over, and how
+# often a style was looked up.
+TURNING = """
+    const scene = document.getElementById('scene').scene, own = getComputedStyle, calls = {};
+    const prototype = WebGL2RenderingContext.prototype, kept = {};
+    let [styles, largest] = [0, 0];
+    for (const name of Object.getOwnPropertyNames(prototype)) {
+        const {value} = Object.getOwnPropertyDescriptor(prototype, name);
+        if (typeof value !== 'function') continue;
+        kept[name] = value;
+        prototype[name] = (...given) => {
+            calls[name] = (calls[name] || 0) + 1;
+            for (const one of given) if (one && one.length > largest) largest = one.length;
+        };
+    }
+    getComputedStyle = (...given) => { styles += 1; return own(...given); };
+    for (let k = 0; k < 10; k++) { scene.view.yaw += 0.01; scene.draw(); }
+    Object.assign(prototype, kept);
+    getComputedStyle = own;
+    return {calls, largest, styles};
+"""
+
+
+def test_a_frame_of_ten_thousand_cameras_is_a_dozen_calls_and_hands_nothing_over(driver, tmp_path):
+    write_report(*make_drawing(10_000, 10_000, 10_000), tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    found = driver.execute_script(TURNING)
+    drawn = found["calls"]["drawArrays"] + found["calls"]["drawArraysInstanced"]
+    assert 4 * 10 <= drawn <= 12 * 10
+    assert sum(found["calls"].values()) < 120 * 10
+    assert not {name for name in found["calls"] if name.startswith(("buffer", "create", "tex"))}
+    assert found["largest"] == 16  # the matrix
+    assert found["styles"] == 0
+
+
+def test_the_scene_is_coarse_while_it_turns_slowly_and_whole_again_when_it_rests(driver, report):
+    opened(driver, report)
+    slow = (
+        SCENE + "const end = performance.now() + 120; scene.moved();"
+        "requestAnimationFrame(() => { while (performance.now() < end); });"
+    )
+    for _ in range(2):
+        driver.execute_script(slow)
+    levels = wait_for(
+        driver,
+        SCENE + "scene.moved(); const now = performance.now(); while (performance.now() < now + 60);"
+        "return scene.detail();",
+    )
+    assert 1 <= levels <= 3
+    wait_for(driver, SCENE + "return scene.detail() === 0")
+
+
 def test_a_thousand_cameras_are_there_in_two_seconds(driver, tmp_path):
     write_report(*make_drawing(1000, 20_000, 20_000), tmp_path / "report.html")
     start = time.perf_counter()

@@ -151,7 +151,8 @@ const drawTrust = (onChoice) => {
 
 const CELL_CLASSES = ["", "--agrees", "--undetermined", "--nodirection", "--contradicts"];
 const drawMatrix = (onChoice) => {
-  const { side, perCell, cells, counts, rowOf } = data.matrix;
+  const { side, perCell, cells, against, counts, rowOf } = data.matrix;
+  const isEmpty = (k) => (perCell === 1 ? cells[k] === 255 : counts[k] === 0);
   if (!numPairs) return null;
   const [left, top] = [104, 8];
   const size = Math.min((WIDTH - left - 8) / side, 40);
@@ -164,9 +165,9 @@ const drawMatrix = (onChoice) => {
   const paths = Array.from({ length: levels }, () => []);
   for (let r = 0; r < side; r++) {
     for (let c = 0; c < side; c++) {
-      const value = cells[r * side + c];
-      if (Number.isNaN(value)) continue;
-      const level = perCell === 1 ? value : Math.min(Math.ceil(5 * value), 5);
+      const k = r * side + c;
+      if (isEmpty(k)) continue;
+      const level = perCell === 1 ? cells[k] : Math.ceil((5 * against[k]) / counts[k]);
       const d = size - gap;
       paths[level].push(`M${(left + c * size).toFixed(2)} ${(top + r * size).toFixed(2)}h${d.toFixed(2)}v${d.toFixed(2)}h-${d.toFixed(2)}z`);
     }
@@ -192,14 +193,14 @@ const drawMatrix = (onChoice) => {
   if (perCell === 1) for (let p = 0; p < numPairs; p++) pairOf.set(key(pairs.first[p], pairs.second[p]), p);
   listen(svg, (u, v) => {
     const [r, c] = [Math.floor((v - top) / size), Math.floor((u - left) / size)];
-    if (!(r >= 0 && r < side && c >= 0 && c < side) || Number.isNaN(cells[r * side + c])) return null;
+    if (!(r >= 0 && r < side && c >= 0 && c < side) || isEmpty(r * side + c)) return null;
     if (perCell === 1) {
       const [a, b] = [rowOf[r], rowOf[c]];
       const p = pairOf.get(key(a, b));
       return p === undefined ? ["text", `${cameras.names[a]} – ${cameras.names[b]}`, [["pair", "see pairs.csv"]]] : ["pair", p];
     }
     const range = (k) => `${cameras.names[rowOf[k * perCell]]} to ${cameras.names[rowOf[Math.min((k + 1) * perCell, numCameras) - 1]]}`;
-    const share = ["contradict", `${number(100 * cells[r * side + c], 2)} %`];
+    const share = ["contradict", `${number((100 * against[r * side + c]) / counts[r * side + c], 2)} %`];
     return ["text", `${range(r)}\nwith ${range(c)}`, [["pairs", count(counts[r * side + c])], share]];
   }, onChoice);
   return svg;

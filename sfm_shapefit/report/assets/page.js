@@ -177,7 +177,10 @@ const select = (kind, k, isInScene = false) => {
   if (scene) scene.flyTo(ends);
 };
 
-const recolor = () => scene && scene.recolor();
+const recolor = () => {
+  shades.clear();
+  if (scene) scene.recolor();
+};
 $("theme").onclick = () => {
   document.documentElement.dataset.theme = isDark() ? "light" : "dark";
   recolor();
