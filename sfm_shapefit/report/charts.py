@@ -75,7 +75,7 @@ def track_length_bars(lengths: IntArray) -> Bars | None:
     return Bars(
         counts=np.bincount(bar_of, minlength=len(edges)),
         texts=tuple(f"seen by {name} images" for name in names),
-        ticks=tuple((k + 0.5, name) for k, name in enumerate(names)),
+        ticks=tuple((k + 0.5, str(low)) for k, low in enumerate(edges.tolist())),
     )
 
 

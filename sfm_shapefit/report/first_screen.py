@@ -111,9 +111,12 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     reasons = "; ".join(verdict.get("reasons", []))
     reasons = shorten(reasons[:1].upper() + reasons[1:], 4 * MAX_TEXT)
     if grade == "good":
-        agree, pairs = int(np.sum(drawing.pairs.classes == PairClass.AGREES)), len(drawing.pairs.classes)
+        agree = int(np.sum(drawing.pairs.classes == PairClass.AGREES))
+        against = int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS))
+        others = f"{against:,} that contradict them are set aside" if against else "none contradicts them"
+        others = f"{against:,} contradict them" if against and facts.get("examined") else others
         return (
-            f"{placed_sentence(drawing)[:-1]}, {agree:,} of {pairs:,} pairs agree with them, and no "
+            f"{placed_sentence(drawing)[:-1]}, {agree:,} pairs agree with them and {others}, and no "
             f"{drawing.noun} stands out."
         )
     cameras = [shorten(name, 60) for name in verdict.get("cameras", [])]

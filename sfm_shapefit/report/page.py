@@ -48,6 +48,8 @@ MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
 # Only cameras of less trust are in the chart of trust.
 _HIGH_TRUST = 0.95
+# Fewer points that are seen by two images only are not worth a word.
+_NOTED_SHARE = 0.05
 # So many hinges are named per piece.
 _MAX_HINGES = 20
 # The objectives of the first iterations may be far out of scale.
@@ -113,6 +115,7 @@ def page_data(
         "summary": summary_sentences(drawing, facts),
         "expertFacts": expert_sentences(facts),
         "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
+        "noun": drawing.noun,
         "dimension": drawing.dimension,
         "shownAxes": min(drawing.dimension, len(_AXES)),
         "frustum": drawing.frustum_depth,
@@ -331,7 +334,7 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
         "histogram": _histogram_note(medians_deg),
         "tracks": _tracks_note(drawing.points),
         "reprojection": _reprojection_note(drawing.points),
-        "trust": _trust_note(drawing.cameras.trust),
+        "trust": _trust_note(drawing),
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
@@ -340,12 +343,14 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     }
 
 
-def _trust_note(trust: FloatArray) -> str:
+def _trust_note(drawing: Drawing) -> str:
+    trust = drawing.cameras.trust
     known = int(np.isfinite(trust).sum())
     high = int(np.sum(trust >= _HIGH_TRUST))
     if not known:
         return ""
-    said = f"{high:,} of {known:,} cameras have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
+    who = f"{high:,} of {known:,} {drawing.noun}s"
+    said = f"{who} have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
     return f"{said}; the least trusted others are shown." if high < known else f"{said}."
 
 
@@ -365,10 +370,10 @@ def _tracks_note(points: Points) -> str:
     if not len(points.track_lengths):
         return ""
     share = float(np.mean(points.track_lengths <= 2))
-    return (
-        f"By how many images a 3D point is seen; the median is {np.median(points.track_lengths):.3g}. "
-        f"{share:.0%} are seen by two only: nothing checks these.{_sample(points)}"
-    )
+    median = float(np.median(points.track_lengths))
+    said = f"Number of images that see a 3D point; a bar reaches to the next. The median is {median:.3g}."
+    weak = f" {share:.0%} are seen by two only: nothing checks these." if share >= _NOTED_SHARE else ""
+    return f"{said}{weak}{_sample(points)}"
 
 
 def _reprojection_note(points: Points) -> str:

@@ -10,7 +10,7 @@ from sfm_shapefit.commands.examine import examine
 from sfm_shapefit.report.drawing import PairClass
 from sfm_shapefit.report.first_screen import banner
 from tests.program import run, run_refused
-from tests.scenes import RING, fingerprint
+from tests.scenes import COURTYARD, RING, fingerprint
 
 
 def test_quality_is_that_of_the_models_own_observations():
@@ -60,3 +60,15 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     assert "exists already" in run_refused("report", RING / "sparse" / "0", "--write-to", page)
     run("report", RING / "sparse" / "0", "--write-to", page, "--overwrite", code=0)
     assert fingerprint(RING) == before
+
+
+def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_path):
+    _, facts = examine(COURTYARD / "truth", COURTYARD / "database.db")  # a quarter of its pairs is wrong
+    assert len(facts["verdict"]["cameras"]) <= 1
+    moved = pycolmap.Reconstruction(COURTYARD / "truth")
+    image = moved.image(sorted(moved.reg_image_ids())[7])
+    pose = image.frame.rig_from_world
+    away = pose.translation + 0.002 * 25.0 * np.array([0.6, 0.0, 0.8])  # 0.2 % of the yard
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, away)
+    moved.write(tmp_path)
+    assert image.name in examine(tmp_path, COURTYARD / "database.db")[1]["verdict"]["cameras"]

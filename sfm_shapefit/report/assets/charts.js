@@ -16,7 +16,9 @@ const linear = (low, high, from, to) => {
   return { place, ticks };
 };
 const logarithmic = (low, high, from, to, unit = "") => {
-  const [first, last] = [Math.floor(Math.log10(low) + 1e-9), Math.ceil(Math.log10(high) - 1e-9)];
+  const first = Math.floor(Math.log10(low) + 1e-9);
+  const powers = Math.ceil(Math.log10(high) - 1e-9);
+  const last = unit === "°" ? Math.min(powers, Math.log10(180)) : powers; // no angle is larger
   const place = (value) => from + ((Math.log10(value) - first) / (last - first || 1)) * (to - from);
   const value = (where) => 10 ** (first + ((where - from) / (to - from)) * (last - first || 1));
   const every = last - first > 7 ? 2 : 1;

@@ -50,6 +50,7 @@ const number = (value, digits = 3) => {
   return Number(value.toPrecision(digits)).toString();
 };
 const count = (value) => value.toLocaleString("en");
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const counted = (value, noun) => `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
 const reason = (code) => data.reasons[code];
 // Where a camera stands in the output's axes.

@@ -5,6 +5,8 @@ const drawHead = () => {
   $("title").textContent = data.title;
   $("subtitle").textContent = data.subtitle;
   $("banner").dataset.grade = banner.grade;
+  $("h-cameras").textContent = `${capital(data.noun)}s`;
+  $("h-matrix").textContent = `Which ${data.noun}s are paired`;
   $("mark").textContent = { good: "✓", look: "!", "do not use": "✕" }[banner.grade] ?? "";
   $("verdict").textContent = banner.headline;
   $("why").textContent = banner.sentence;

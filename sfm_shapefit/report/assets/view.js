@@ -2,7 +2,7 @@
 
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
 const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
-const MANY_IN_GOOD = 50; // contradicting pairs of a good model
+const MANY_IN_GOOD = 20; // contradicting pairs of a good model
 const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
@@ -413,7 +413,7 @@ const makeScene = (onChoice) => {
   const whole = () => {
     Object.assign(view, { yaw: Math.atan2(-0.84, 0.35), pitch: 0.43 });
     if (data.dimension === 2) Object.assign(view, { yaw: -Math.PI / 2, pitch: 1.57 });
-    const distance = Math.max(eye.fitting(middle, nearCameras, 0.96) || 0, eye.fitting(middle, nearPoints, 0.93) || 0);
+    const distance = Math.max(eye.fitting(middle, nearCameras, 0.9) || 0, eye.fitting(middle, nearPoints, 0.93) || 0);
     return [middle, 1.08 * distance || 4 * radius];
   };
   const show = (choice) => {
