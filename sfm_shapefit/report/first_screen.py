@@ -113,10 +113,13 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     if grade == "good":
         agree = int(np.sum(drawing.pairs.classes == PairClass.AGREES))
         against = int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS))
-        others = f"{against:,} that contradict them are set aside" if against else "none contradicts them"
-        others = f"{against:,} contradict them" if against and facts.get("examined") else others
+        others = "none contradicts them"
+        if against:
+            verb = "contradicts" if against == 1 else "contradict"
+            set_aside = "" if facts.get("examined") else f" and {'is' if against == 1 else 'are'} set aside"
+            others = f"{against:,} {verb} them{set_aside}"
         return (
-            f"{placed_sentence(drawing)[:-1]}, {agree:,} pairs agree with them and {others}, and no "
+            f"{placed_sentence(drawing)[:-1]}; {agree:,} pairs agree with them, {others}, and no "
             f"{drawing.noun} stands out."
         )
     cameras = [shorten(name, 60) for name in verdict.get("cameras", [])]

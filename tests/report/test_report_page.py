@@ -166,7 +166,7 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
     assert (found["grade"], found["headline"]) == (grade, headline)
     assert command in found["command"]
     said = {
-        "good": "24 of 25 cameras are placed; 1 is not in this model, 95 pairs agree with them and ",
+        "good": "24 of 25 cameras are placed; 1 is not in this model; 95 pairs agree with them, ",
         "look": "IMG_00000.jpg, images/IMG_00001.jpg may be wrong",
         "do not use": "Only 30% of the pairs agree.",
     }
