@@ -413,7 +413,7 @@ const makeScene = (onChoice) => {
   const whole = () => {
     Object.assign(view, { yaw: Math.atan2(-0.84, 0.35), pitch: 0.43 });
     if (data.dimension === 2) Object.assign(view, { yaw: -Math.PI / 2, pitch: 1.57 });
-    const distance = Math.max(eye.fitting(middle, nearCameras, 0.9) || 0, eye.fitting(middle, nearPoints, 0.93) || 0);
+    const distance = Math.max(eye.fitting(middle, nearCameras, 0.96) || 0, eye.fitting(middle, nearPoints, 0.93) || 0);
     return [middle, 1.08 * distance || 4 * radius];
   };
   const show = (choice) => {
