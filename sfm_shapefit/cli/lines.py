@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -56,6 +57,14 @@ def describe_adjustment(adjusted: "Adjusted") -> str:
     state = "converged" if adjusted.converged else "stopped at its limit"
     before, after = adjusted.initial_error_px, adjusted.final_error_px
     return f"{state} after {adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
+
+
+def picture_rows(flags: OutputFlags, names: Iterable[str]) -> Rows:
+    """Return a warning if pictures were asked for, and the folder has none of the images."""
+    folder = Path(flags.images)
+    if not flags.images or not flags.report or any((folder / name).is_file() for name in names):
+        return []
+    return [("warning", f"{folder} has none of the images, so the report has no pictures")]
 
 
 def name_pictures(flags: OutputFlags) -> str:

@@ -27,6 +27,7 @@ from sfm_shapefit.cli.lines import (
     intrinsics_rows,
     name_pictures,
     next_steps,
+    picture_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import LocateOptions
@@ -96,6 +97,7 @@ def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
             *intrinsics_rows(facts),
             *scene_rows(facts),
             *[("warning", warning) for warning in found.warnings],
+            *picture_rows(flags, found.model.names),
         ],
         details=[
             ("directions", found.inputs.statement),

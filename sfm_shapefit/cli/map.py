@@ -22,6 +22,7 @@ from sfm_shapefit.cli.lines import (
     describe_points,
     intrinsics_rows,
     next_steps,
+    picture_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import MapOptions
@@ -95,6 +96,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *figures,
             *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
             *[("warning", warning) for warning in found.warnings],
+            *picture_rows(flags, [name for model in found.models for name in model.located.model.names]),
         ],
         details=details,
         verdict=found.models[0].located.verdict,

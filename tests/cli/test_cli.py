@@ -70,7 +70,9 @@ def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     assert f"{figures['pair_error_deg']:.2g} deg ({figures['pair_error_px']:.2g} px)" in result.stdout
 
 
-def test_a_graph_has_no_images_to_show(tmp_path):
+def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--images", tmp_path, code=0).stdout
+    assert "has none of the images" in " ".join(said.replace("│", " ").split())
     assert "--images" in run("locate", "--help").stdout
     assert "--images" not in run("place", "--help").stdout
     graph = BUNDLED / "graph40.txt"
