@@ -98,9 +98,12 @@ def merge_options(given: S | None, settings: type[S], overrides: dict[str, Any])
     """Return the settings of a call: those given, or the defaults, with single options set by keyword.
 
     Raises:
-        TypeError: if a keyword is no option; the message names a near one.
+        TypeError: if what is given are no such settings, or a keyword is no option; the message says what is.
         ValueError: if a value is refused.
     """
+    if given is not None and not isinstance(given, settings):
+        kind, wanted = type(given).__name__, settings.__name__
+        raise TypeError(f"options must be {wanted}(...), got a {kind}; or give single options by keyword")
     known = [item.name for item in fields(settings)]
     for name in overrides:
         if name not in known:

@@ -25,6 +25,7 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
             degree=8,
             trust=float(np.clip(1.1 - rng.exponential(0.12), 0, 1)) if k != num_cameras - 1 else float("nan"),
             sigma=tuple(rng.uniform(0.001, 0.02, 3)),
+            correlation=(0.6, -0.3, 0.1),
         )
         for k in range(num_cameras)
     ]
@@ -43,6 +44,8 @@ def make_drawing(num_cameras=25, num_pairs=120, num_points=500, names=None, seed
         positions=rng.normal(0, 2.0, (num_points, 3)) * [1, 0.6, 1],
         colors=rng.integers(60, 220, (num_points, 3)),
         num_all=3 * num_points,
+        track_lengths=rng.integers(2, 12, num_points),
+        errors_px=rng.gamma(2.0, 0.3, num_points),
     )
     pairs = replace(drawing.pairs, input_deg=drawing.pairs.residuals_deg * rng.lognormal(1.0, 0.5, num_pairs))
     drawing = replace(
@@ -99,7 +102,15 @@ def _facts(names):
         },
         "options": {"solver": "auto", "refine": True, "scale": "input", "min_trust": 0.25},
         "residual_level_deg": 0.07,
-        "residuals_deg": {"quantile_50": 0.08},
+        "num_placed": len(names) - 1,
+        "num_images": len(names),
+        "figures": {
+            "pair_error_deg": 0.08,
+            "pair_error_px": 1.4,
+            "sigma": 0.015,
+            "sigma_of_extent": 0.0007,
+            "sigma_unit": "of the input's units",
+        },
         "sigma_of": "adjusted: noise, rotations, calibration; relative to the model's mean position",
         "mean_reprojection_error_px": 0.62,
         "scale": "input: scale and origin of the input's centers",

@@ -13,7 +13,7 @@ from sfm_shapefit.colmap.structure_options import StructureOptions
 from sfm_shapefit.directions.options import DirectionOptions
 from sfm_shapefit.locate_options import LocateOptions, MapOptions
 from sfm_shapefit.refinement.options import PlacementOptions, Scale
-from sfm_shapefit.results import headline
+from sfm_shapefit.results import key_figures
 from sfm_shapefit.results.columns import columns_of
 from sfm_shapefit.results.tables import CameraRow
 from sfm_shapefit.settings import _fits, groups_of, merge_options
@@ -118,6 +118,10 @@ def test_options_by_name_win_over_those_given_and_a_near_name_is_suggested():
     merged = merge_options(given, LocateOptions, {"min_trust": 0.0})
     assert (merged.min_trust, merged.points) == (0.0, "never")
     assert merge_options(None, LocateOptions, {}) == LocateOptions()
+    with pytest.raises(
+        TypeError, match=r"options must be LocateOptions\(\.\.\.\), got a dict; or give single"
+    ):
+        merge_options({"min_trust": 0.0}, LocateOptions, {})
     with pytest.raises(TypeError, match="'min_trus' is no option of LocateOptions; did you mean min_trust"):
         merge_options(given, LocateOptions, {"min_trus": 0.0})
     with pytest.raises(TypeError, match="known are"):
@@ -174,7 +178,7 @@ def test_results_say_what_they_are_in_a_line_and_in_a_table_of_escaped_text(loca
 
 
 def test_every_scale_has_its_unit():
-    assert set(headline._UNITS) == {*get_args(Scale), "fixed"} - {"auto"}
+    assert set(key_figures.UNITS) == {*get_args(Scale), "fixed"} - {"auto"}
 
 
 def test_tables_are_columns_by_their_names_in_the_csv_with_nan_where_nothing_is_known(located, tmp_path):

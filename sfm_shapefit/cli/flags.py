@@ -128,16 +128,23 @@ class GroupedCommand(TyperCommand):
         return super().parse_args(ctx, _gather_values(renamed))
 
 
-def takes(*settings: type[Settings], only: Sequence[str] = ()) -> Callable[[Command], Command]:
+def takes(
+    *settings: type[Settings], only: Sequence[str] = (), without: Sequence[str] = ()
+) -> Callable[[Command], Command]:
     """Give a command one flag per field of some settings classes, None where the user says nothing.
 
-    `only` names the fields that matter to the command, if not all do.
+    `only` names the fields that matter to the command, if not all do, or `without` those that do not.
     """
 
     def decorate(command: Command) -> Command:
         signature = inspect.signature(command, eval_str=True)
         own = [p for p in signature.parameters.values() if p.kind is not p.VAR_KEYWORD]
-        flags = [flag for one in settings for flag in _flags(one) if not only or flag.name in only]
+        flags = [
+            flag
+            for one in settings
+            for flag in _flags(one)
+            if (not only or flag.name in only) and flag.name not in without
+        ]
         parameters = own + flags
         command.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters} | {"return": None}

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,6 +59,14 @@ def describe_adjustment(adjusted: "Adjusted") -> str:
     return f"{state} after {adjusted.iterations} steps, mean error {before:.2f} -> {after:.2f} px"
 
 
+def picture_rows(flags: OutputFlags, names: Iterable[str]) -> Rows:
+    """Return a warning if pictures were asked for, and the folder has none of the images."""
+    folder = Path(flags.images)
+    if not flags.images or not flags.report or any((folder / name).is_file() for name in names):
+        return []
+    return [("warning", f"{folder} has none of the images, so the report has no pictures")]
+
+
 def name_pictures(flags: OutputFlags) -> str:
     """Name the pictures that were written, to follow the names of other files."""
     return ", report.html" * flags.report + ", scene.glb, scene.ply" * flags.scene
@@ -65,7 +74,7 @@ def name_pictures(flags: OutputFlags) -> str:
 
 def next_steps(facts: dict[str, Any], out: Path, flags: OutputFlags) -> list[str]:
     """Return what to do next, a line each: look at the report, then the command that the report names."""
-    from sfm_shapefit.report.headline import next_step
+    from sfm_shapefit.report.first_screen import next_step
 
     _, command = next_step(facts["verdict"]["grade"], facts)
     filled = re.sub(r"\{out(\w*)\}", lambda found: shlex.quote(f"{out}{found[1]}"), command)

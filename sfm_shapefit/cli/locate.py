@@ -27,6 +27,7 @@ from sfm_shapefit.cli.lines import (
     intrinsics_rows,
     name_pictures,
     next_steps,
+    picture_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import LocateOptions
@@ -84,18 +85,19 @@ def locate_command(
 
 def _tell(found: "LocateResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, how certain it is, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model
+    from sfm_shapefit.results.key_figures import figure_rows
 
     facts = found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
     return Told(
         figures=[
-            *headline_of_model(found).rows(),
+            *figure_rows(facts),
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
             *intrinsics_rows(facts),
             *scene_rows(facts),
             *[("warning", warning) for warning in found.warnings],
+            *picture_rows(flags, found.model.names),
         ],
         details=[
             ("directions", found.inputs.statement),

@@ -22,6 +22,7 @@ from sfm_shapefit.cli.lines import (
     describe_points,
     intrinsics_rows,
     next_steps,
+    picture_rows,
     scene_rows,
 )
 from sfm_shapefit.locate_options import MapOptions
@@ -65,7 +66,7 @@ def map_command(
 
 def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
     """Say what each model has, what was left out, and where it is."""
-    from sfm_shapefit.results.headline import headline_of_model
+    from sfm_shapefit.results.key_figures import figure_rows
 
     several = len(found.models) > 1
     figures: Rows = []
@@ -75,7 +76,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
         title = [(f"model {number}", located.verdict.statement)] if several else []
         figures += [
             *title,
-            *headline_of_model(located).rows(),
+            *figure_rows(located.summary()),
             ("points", describe_points(located.summary())),
             *intrinsics_rows(located.summary()),
             *scene_rows(located.summary()),
@@ -97,6 +98,7 @@ def _tell(found: "MapResult", out: Path, flags: OutputFlags) -> Told:
             *[("joined" if join.join else "not joined", join.statement) for join in found.joins],
             *([("in no model", shorten(left_out, "see map.json"))] if left_out else []),
             *[("warning", warning) for warning in found.warnings],
+            *picture_rows(flags, [name for model in found.models for name in model.located.model.names]),
         ],
         details=details,
         verdict=found.models[0].located.verdict,

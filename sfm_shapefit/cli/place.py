@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     short_help="Place the nodes of a bare view graph, or of relative poses.",
     epilog="Example: sfm-shapefit place graph.txt out",
 )
-@takes(PlacementOptions, OutputFlags)
+@takes(PlacementOptions, OutputFlags, without=("images",))  # nodes have none
 def place_command(
     graph: Annotated[
         Path | None,
@@ -89,7 +89,7 @@ def place_command(
 
 def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     """Say what was placed, what was not and why, and how certain it is."""
-    from sfm_shapefit.results.headline import headline_of_graph
+    from sfm_shapefit.results.key_figures import figure_rows
 
     placement, facts = found.placement, found.summary()
     left_out = [f"{row.name}: {row.reason}" for row in found.cameras if not row.placed]
@@ -97,7 +97,7 @@ def _tell(found: "GraphResult", out: Path, flags: OutputFlags) -> Told:
     filtered = f", {len(placement.dropped)} were left out by the filter" if len(placement.dropped) else ""
     return Told(
         figures=[
-            *headline_of_graph(found).rows(),
+            *figure_rows(facts),
             *([("not placed", shorten(left_out))] if left_out else []),
             *further_piece_rows(facts),
             *[("warning", warning) for warning in facts["warnings"]],

@@ -95,7 +95,7 @@ def _report_model(
     from sfm_shapefit.colmap.quiet import hear_pycolmap
     from sfm_shapefit.commands.examine import examine
     from sfm_shapefit.errors import InputError
-    from sfm_shapefit.report.headline import banner
+    from sfm_shapefit.report.first_screen import banner
     from sfm_shapefit.report.page import write_report
 
     if page.exists() and not overwrite:

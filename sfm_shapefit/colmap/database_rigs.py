@@ -39,7 +39,7 @@ class DatabaseRigs:
     """By id."""
     place_of_image: Mapping[int, InFrame]
     """By image id; images of no such rig are not in it."""
-    uncalibrated: tuple[int, ...]
+    incomplete: tuple[int, ...]
     """Ids of the rigs that do not count, because a sensor has no pose in them or an image no frame."""
 
     def camera_ids(self, rig_id: int) -> list[int]:
@@ -80,10 +80,10 @@ def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
     rig_of_frame = dict(_rows(path, "frames", ("frame_id", "rig_id")))
     data = _rows(path, "frame_data", ("frame_id", "data_id", "sensor_id"), "sensor_type")
     rigs: dict[int, pycolmap.Rig] = {}
-    uncalibrated = {rig_id for rig_id, _, pose in sensors if pose is None}
+    incomplete = {rig_id for rig_id, _, pose in sensors if pose is None}
     for rig_id, camera_id, pose in sensors:
         _refuse_unknown_camera(path, images, rig_id, references.get(rig_id), camera_id)
-        if rig_id in uncalibrated:
+        if rig_id in incomplete:
             continue
         if rig_id not in rigs:
             rigs[rig_id] = pycolmap.Rig(rig_id=rig_id)
@@ -96,11 +96,11 @@ def read_rigs(path: Path, images: pycolmap.Reconstruction) -> DatabaseRigs:
         place = places.get(image_id)
         for rig_id, rig in rigs.items():
             if rig.has_sensor(_sensor(image.camera_id)) and (place is None or place.rig_id != rig_id):
-                uncalibrated.add(rig_id)
+                incomplete.add(rig_id)
     return DatabaseRigs(
-        rigs={rig_id: rig for rig_id, rig in rigs.items() if rig_id not in uncalibrated},
-        place_of_image={i: p for i, p in places.items() if p.rig_id in rigs and p.rig_id not in uncalibrated},
-        uncalibrated=tuple(sorted(uncalibrated)),
+        rigs={rig_id: rig for rig_id, rig in rigs.items() if rig_id not in incomplete},
+        place_of_image={i: p for i, p in places.items() if p.rig_id in rigs and p.rig_id not in incomplete},
+        incomplete=tuple(sorted(incomplete)),
     )
 
 

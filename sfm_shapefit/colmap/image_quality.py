@@ -1,4 +1,8 @@
-"""How well the images of a model are held by its 3D points: their number, errors, tracks, and coverage."""
+"""How well the images of a model are held by its 3D points: their number, errors, tracks, and coverage.
+
+Errors are those of COLMAP's own projection, through any of its camera models. `adjustment` measures its
+errors in ideal views of a fisheye, where they are up to a tenth larger or smaller.
+"""
 
 from dataclasses import dataclass
 
@@ -23,8 +27,10 @@ class ImageQuality:
     """(n,) median number of images that observe its points."""
     coverage: FloatArray
     """(n,) share of the cells of an 8 x 8 grid over the picture that hold an observation of a point."""
-    median_track_length: float
-    """Of all points of the model; NaN without points."""
+    point_errors_px: FloatArray
+    """(k,) mean reprojection error of each point of the model; NaN of one that no posed image observes."""
+    point_track_lengths: IntArray
+    """(k,) number of images that observe each point."""
 
 
 def image_quality(model: PosedModel) -> ImageQuality:
@@ -32,7 +38,8 @@ def image_quality(model: PosedModel) -> ImageQuality:
     points = model.reconstruction.points3D
     ids = np.array(sorted(points.keys()), dtype=np.uint64)
     positions = np.array([points[k].xyz for k in ids.tolist()]).reshape(-1, 3)
-    lengths = np.array([points[k].track.length() for k in ids.tolist()], dtype=np.float64)
+    lengths = np.array([points[k].track.length() for k in ids.tolist()], dtype=np.int64)
+    sums, times = np.zeros(len(ids)), np.zeros(len(ids))
     n = model.num_images
     counts, errors = np.zeros(n, dtype=np.int64), np.full(n, np.nan)
     tracks, coverage = np.full(n, np.nan), np.zeros(n)
@@ -46,7 +53,10 @@ def image_quality(model: PosedModel) -> ImageQuality:
         in_camera = (positions[rows] - model.centers[k]) @ model.rotations[k].T
         camera = model.camera(k)
         projected = np.asarray(camera.img_from_cam(in_camera, check_cheirality=False))
-        errors[k] = float(np.linalg.norm(projected - pixels, axis=1).mean())
+        misses = np.linalg.norm(projected - pixels, axis=1)
+        np.add.at(sums, rows, misses)
+        np.add.at(times, rows, 1.0)
+        errors[k] = float(misses.mean())
         tracks[k] = float(np.median(lengths[rows]))
         cells = np.clip(_CELLS * pixels / [camera.width, camera.height], 0, _CELLS - 1).astype(np.int64)
         coverage[k] = len(np.unique(cells, axis=0)) / _CELLS**2
@@ -55,5 +65,6 @@ def image_quality(model: PosedModel) -> ImageQuality:
         errors_px=errors,
         track_lengths=tracks,
         coverage=coverage,
-        median_track_length=float(np.median(lengths)) if len(lengths) else np.nan,
+        point_errors_px=np.where(times > 0.0, sums / np.maximum(times, 1.0), np.nan),
+        point_track_lengths=lengths,
     )

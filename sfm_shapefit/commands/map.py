@@ -406,10 +406,10 @@ def _explain_failure(path: Path, relative: RelativeRotations, reasons: dict[int,
 
 def _warnings(images: UnposedImages, models: list[MappedModel], left_out: dict[str, str]) -> Iterator[str]:
     """Yield what the user should know, a sentence each."""
-    if images.rigs.uncalibrated:
+    if images.rigs.incomplete:
         yield (
-            f"{len(images.rigs.uncalibrated)} rigs of the database are not used, rig "
-            f"{images.rigs.uncalibrated[0]} for one, because a sensor has no pose in them or an image no "
+            f"{len(images.rigs.incomplete)} rigs of the database are not used, rig "
+            f"{images.rigs.incomplete[0]} for one, because a sensor has no pose in them or an image no "
             "frame: their cameras are placed one by one"
         )
     for number, model in enumerate(models):

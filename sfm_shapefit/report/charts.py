@@ -1,5 +1,7 @@
-"""The numbers behind the charts that look at all pairs: residual histograms and the view-graph matrix."""
+"""The numbers behind the charts that look at everything: histograms, and the view-graph matrix."""
 
+import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,6 +12,11 @@ from sfm_shapefit.report.drawing import PairClass, Pairs
 # Smaller residuals count in the first bin.
 _RANGE_DEG = (1e-3, 180.0)
 _BINS = 42
+# A bar of the track lengths holds those from here to below the next.
+_TRACK_LENGTHS = np.array([2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 15, 20, 30, 50, 100])
+# Bars of the reprojection errors, the last for all that are larger than this quantile.
+_ERROR_BARS = 24
+_ERROR_QUANTILE = 0.98
 MOST_CELLS = 200
 """Cells per side of the matrix; with more cameras, several share a cell."""
 # Rank of each PairClass; a cell shows the worst of its pairs.
@@ -37,6 +44,63 @@ class Matrix:
     counts: IntArray
     """(k, k) pairs in each cell."""
     cameras_per_cell: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Bars:
+    """A histogram of bars of one width, whatever they hold."""
+
+    counts: IntArray
+    """(k,)"""
+    texts: tuple[str, ...]
+    """What each bar holds."""
+    ticks: tuple[tuple[float, str], ...]
+    """Places, in bars from the left, and their text."""
+
+
+def track_length_bars(lengths: IntArray) -> Bars | None:
+    """Return how many points are seen by so many images; None if there are none.
+
+    Args:
+        lengths: (s,) number of images that see each point.
+    """
+    if not len(lengths):
+        return None
+    edges = _TRACK_LENGTHS[: int(np.searchsorted(_TRACK_LENGTHS, lengths.max(), side="right"))]
+    bar_of = np.maximum(np.searchsorted(edges, lengths, side="right") - 1, 0)
+    ends = [*(edges[1:] - 1).tolist(), int(lengths.max())]
+    names = [
+        str(low) if low == high else f"{low}-{high}" for low, high in zip(edges.tolist(), ends, strict=True)
+    ]
+    return Bars(
+        counts=np.bincount(bar_of, minlength=len(edges)),
+        texts=tuple(f"seen by {name} images" for name in names),
+        ticks=tuple((k + 0.5, str(low)) for k, low in enumerate(edges.tolist())),
+    )
+
+
+def reprojection_error_bars(errors_px: FloatArray) -> Bars | None:
+    """Return how many points have errors of so many pixels; None if none is known.
+
+    Args:
+        errors_px: (s,) mean reprojection error of each point; NaN where it is not known.
+    """
+    known = errors_px[np.isfinite(errors_px)]
+    if not len(known):
+        return None
+    largest = max(float(np.quantile(known, _ERROR_QUANTILE)), 1e-6)
+    power = 10.0 ** math.floor(math.log10(largest / _ERROR_BARS))
+    width = next(part * power for part in (1, 2, 2.5, 5, 10) if part * power * _ERROR_BARS >= largest)
+    bars = max(math.ceil(largest / width - 1e-9), 1)
+    bar_of = np.minimum((known / width).astype(np.int64), bars)
+    every = max(bars // 6, 1)
+    edges = [f"{k * width:.3g}" for k in range(bars + 1)]
+    texts = [f"{low} to {high} px" for low, high in itertools.pairwise(edges)]
+    return Bars(
+        counts=np.bincount(bar_of, minlength=bars + 1),
+        texts=(*texts, f"{edges[-1]} px or more"),
+        ticks=tuple((float(k), edges[k]) for k in range(0, bars + 1, every)),
+    )
 
 
 def residual_histogram(pairs: Pairs) -> Histogram:

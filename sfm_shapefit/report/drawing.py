@@ -8,7 +8,7 @@ first three are drawn.
 
 import enum
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -77,16 +77,26 @@ class Cameras:
     trust: FloatArray
     centers: FloatArray
     """(n, 3)"""
-    axis_sigmas: FloatArray
-    """(n, 3) standard deviations along the axes, in the output's units; NaN where they are not known."""
+    covariances: FloatArray
+    """(n, 3, 3) of the centers, in squared units of the output; NaN where they are not known."""
     poses: Poses
     """Rotations in the output's axes, pictures; `poses.centers` are the input's, in its own."""
 
     @property
     def sigmas(self) -> FloatArray:
         """(n,) largest standard deviation over the axes; NaN where it is not known."""
-        largest = np.where(np.isnan(self.axis_sigmas), -np.inf, self.axis_sigmas).max(axis=1)
-        return np.where(np.isfinite(largest), largest, np.nan)
+        found: FloatArray = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2).max(axis=1))
+        return found
+
+    @property
+    def ellipsoids(self) -> FloatArray:
+        """(n, 3, 3) rows: half axes of the ellipsoids of one standard deviation, the longest last; or NaN."""
+        found = np.full(self.covariances.shape, np.nan)
+        known = np.isfinite(self.covariances).all(axis=(1, 2))
+        variances, vectors = np.linalg.eigh(self.covariances[known])
+        lengths = np.sqrt(np.maximum(variances, 0.0))
+        found[known] = lengths[:, :, None] * vectors.transpose(0, 2, 1)
+        return found
 
 
 class CameraColumn(NamedTuple):
@@ -153,6 +163,10 @@ class Points:
     """(k, 3) in 0..255."""
     num_all: int
     """How many the model has."""
+    track_lengths: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """(s,) by how many images points are seen: of all, or of evenly picked ones."""
+    errors_px: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """(s,) mean reprojection errors of the same points; NaN where it is not known."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -309,12 +323,12 @@ def _unknown_poses(n: int) -> Poses:
 
 
 def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
-    centers, sigmas = np.full((len(rows), 3), np.nan), np.full((len(rows), 3), np.nan)
+    centers, covariances = np.full((len(rows), 3), np.nan), np.full((len(rows), 3, 3), np.nan)
     for k, row in enumerate(rows):
         if row.center:
             centers[k] = [*row.center, 0.0, 0.0][:3]
         if row.sigma:
-            sigmas[k] = [*row.sigma, 0.0, 0.0][:3]
+            covariances[k] = _covariance(row)
     return Cameras(
         names=tuple(row.name for row in rows),
         placed=np.array([row.placed for row in rows], dtype=np.bool_),
@@ -323,9 +337,22 @@ def _cameras(rows: Sequence[CameraRow], poses: Poses) -> Cameras:
         degrees=np.array([row.degree for row in rows], dtype=np.int64),
         trust=np.array([row.trust for row in rows], dtype=np.float64),
         centers=centers,
-        axis_sigmas=sigmas,
+        covariances=covariances,
         poses=poses,
     )
+
+
+def _covariance(row: CameraRow) -> FloatArray:
+    """Return the covariance (3, 3) of a center, NaN where nothing holds it; of the first three axes."""
+    d = len(row.sigma)
+    correlations = np.eye(d)
+    if row.correlation:  # which earlier outputs lack
+        i, j = np.triu_indices(d, k=1)
+        correlations[i, j] = correlations[j, i] = row.correlation
+    sigmas = np.array(row.sigma)
+    found = np.zeros((max(d, 3), max(d, 3)))
+    found[:d, :d] = correlations * np.outer(sigmas, sigmas) if np.isfinite(sigmas).all() else np.nan
+    return found[:3, :3]
 
 
 def _pairs(rows: Sequence[PairRow], cameras: Cameras, certified: FloatArray | None) -> Pairs:
@@ -386,7 +413,13 @@ def _points(reconstruction: "pycolmap.Reconstruction | None", cameras: FloatArra
     middle = np.median(both, axis=0)
     limit = _FAR_POINT * np.quantile(np.linalg.norm(both - middle, axis=1), 0.9)
     near = np.linalg.norm(positions - middle, axis=1) <= limit
-    return Points(positions=positions[near], colors=colors[near], num_all=len(ids))
+    return Points(
+        positions=positions[near],
+        colors=colors[near],
+        num_all=len(ids),
+        track_lengths=np.array([point.track.length() for point in chosen], dtype=np.int64),
+        errors_px=np.array([point.error if point.error >= 0.0 else np.nan for point in chosen]),
+    )
 
 
 def _frustum_depth(positions: FloatArray) -> float:

@@ -24,9 +24,16 @@ import numpy.typing as npt
 
 from sfm_shapefit.arrays import FloatArray, IntArray
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.report.charts import MOST_CELLS, residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, input_centers
-from sfm_shapefit.report.headline import banner, input_of, scene_name, tiles
+from sfm_shapefit.report.charts import (
+    MOST_CELLS,
+    Bars,
+    reprojection_error_bars,
+    residual_histogram,
+    track_length_bars,
+    view_graph_matrix,
+)
+from sfm_shapefit.report.drawing import MAX_POINTS, Drawing, Points, input_centers
+from sfm_shapefit.report.first_screen import banner, input_of, scene_name, tiles
 from sfm_shapefit.report.sentences import (
     Hint,
     expert_sentences,
@@ -41,6 +48,8 @@ MAX_PAIRS = 20_000
 """Pairs that the page lists and draws."""
 # Only cameras of less trust are in the chart of trust.
 _HIGH_TRUST = 0.95
+# Fewer points that are seen by two images only are not worth a word.
+_NOTED_SHARE = 0.05
 # So many hinges are named per piece.
 _MAX_HINGES = 20
 # The objectives of the first iterations may be far out of scale.
@@ -48,7 +57,9 @@ _STARTING_ITERATIONS = 2
 # So many loops are listed.
 _MAX_LOOPS = 50
 _AXES = "xyz"
-_TYPES = {"f8": np.float64, "f4": np.float32, "i4": np.int32, "u1": np.uint8}
+_TYPES = {"f4": np.float32, "i4": np.int32, "u2": np.uint16, "u1": np.uint8}
+# What stands in the matrix of pairs where there is no pair.
+_NO_PAIR = 255
 
 
 # In the order in which they are one script.
@@ -104,10 +115,12 @@ def page_data(
         "summary": summary_sentences(drawing, facts),
         "expertFacts": expert_sentences(facts),
         "looks": [_look(hint, rank, pairs) for hint in first_looks(drawing, facts)],
+        "noun": drawing.noun,
         "dimension": drawing.dimension,
         "shownAxes": min(drawing.dimension, len(_AXES)),
         "frustum": drawing.frustum_depth,
-        "axes": _pack(drawing.axes.T, "f4"),
+        "axes": drawing.axes.T.ravel().tolist(),
+        "middle": display.middle.tolist(),
         "cameras": _cameras(drawing, cameras, display, reasons),
         "pictures": None if not thumbnails else [thumbnails.get(k) for k in cameras.tolist()],
         "pairs": _pairs(drawing, pairs, rank, reasons),
@@ -125,6 +138,8 @@ def page_data(
             "edges": histogram.edges_deg.tolist(),
             "counts": {state: values.tolist() for state, values in histogram.counts.items()},
         },
+        "tracks": _bars(track_length_bars(drawing.points.track_lengths)),
+        "reprojection": _bars(reprojection_error_bars(drawing.points.errors_px)),
         "matrix": _matrix(drawing, rank),
         "convergence": _convergence(drawing),
         "notes": _notes(drawing, histogram.medians_deg),
@@ -145,11 +160,11 @@ class _Display:
     def __init__(self, drawing: Drawing) -> None:
         self._axes = drawing.axes
         centers = drawing.cameras.centers[drawing.cameras.placed]
-        self._middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
+        self.middle = np.median(centers, axis=0) if len(centers) else np.zeros(3)
 
     def __call__(self, points: FloatArray) -> FloatArray:
         """Return points (..., 3) in the page's axes."""
-        return self.turn(points - self._middle)
+        return self.turn(points - self.middle)
 
     def turn(self, vectors: FloatArray) -> FloatArray:
         """Return vectors (..., 3) in the page's axes."""
@@ -169,13 +184,12 @@ def _cameras(drawing: Drawing, order: IntArray, display: _Display, reasons: dict
         "placed": _pack(cameras.placed[order], "u1"),
         "trust": _pack(cameras.trust[order], "f4"),
         "sigma": _pack(cameras.sigmas[order], "f4"),
-        "sigmas": _pack(cameras.axis_sigmas[order], "f4"),
+        "ellipsoids": _pack(display.turn(cameras.ellipsoids[order]), "f4"),
         "degree": _pack(cameras.degrees[order], "i4"),
         "agreeing": _pack(agreeing[order], "i4"),
         "error": _pack(errors[order], "f4"),
         "piece": _pack(cameras.pieces[order], "i4"),
         "reason": _encode([cameras.reasons[k] for k in order.tolist()], reasons),
-        "world": _pack(cameras.centers[order], "f8"),
         "center": _pack(display(cameras.centers[order]), "f4"),
         "frusta": _pack(_frusta(drawing, order, display), "f4"),
         "ghost": _pack(display(_ghosts(drawing)[order]), "f4"),
@@ -237,13 +251,19 @@ def _pack(values: npt.NDArray[Any], kind: str) -> dict[str, str]:
 
 def _matrix(drawing: Drawing, rank: IntArray) -> dict[str, Any]:
     matrix = view_graph_matrix(drawing.pairs, len(rank))
-    return {
-        "side": len(matrix.cells),
-        "perCell": matrix.cameras_per_cell,
-        "cells": _pack(matrix.cells, "f4"),
-        "counts": _pack(matrix.counts, "i4"),
-        "rowOf": _pack(rank, "i4"),
-    }
+    known = {"side": len(matrix.cells), "perCell": matrix.cameras_per_cell, "rowOf": _pack(rank, "i4")}
+    if matrix.cameras_per_cell == 1:
+        return known | {"cells": _pack(np.nan_to_num(matrix.cells, nan=_NO_PAIR), "u1")}
+    against = np.rint(np.nan_to_num(matrix.cells) * matrix.counts)
+    largest = np.iinfo(np.uint16).max
+    counts = {"against": against, "counts": matrix.counts}
+    return known | {name: _pack(np.minimum(values, largest), "u2") for name, values in counts.items()}
+
+
+def _bars(bars: Bars | None) -> dict[str, Any] | None:
+    if bars is None:
+        return None
+    return {"counts": bars.counts.tolist(), "texts": list(bars.texts), "ticks": [list(t) for t in bars.ticks]}
 
 
 def _convergence(drawing: Drawing) -> dict[str, Any]:
@@ -312,7 +332,9 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     """Return what stands under each chart."""
     return {
         "histogram": _histogram_note(medians_deg),
-        "trust": _trust_note(drawing.cameras.trust),
+        "tracks": _tracks_note(drawing.points),
+        "reprojection": _reprojection_note(drawing.points),
+        "trust": _trust_note(drawing),
         "matrix": _matrix_note(-(-len(drawing.cameras.names) // MOST_CELLS)),
         "support": _support_note(drawing),
         "convergence": _convergence_note(drawing),
@@ -321,12 +343,14 @@ def _notes(drawing: Drawing, medians_deg: dict[str, float]) -> dict[str, str]:
     }
 
 
-def _trust_note(trust: FloatArray) -> str:
+def _trust_note(drawing: Drawing) -> str:
+    trust = drawing.cameras.trust
     known = int(np.isfinite(trust).sum())
     high = int(np.sum(trust >= _HIGH_TRUST))
     if not known:
         return ""
-    said = f"{high:,} of {known:,} cameras have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
+    who = f"{high:,} of {known:,} {drawing.noun}s"
+    said = f"{who} have a trust of {_HIGH_TRUST} or more (1 is as good as it gets)"
     return f"{said}; the least trusted others are shown." if high < known else f"{said}."
 
 
@@ -340,6 +364,33 @@ def _histogram_note(medians_deg: dict[str, float]) -> str:
     }
     medians = ", ".join(f"{value:.3g}° {where[state]}" for state, value in medians_deg.items())
     return f"Angle between what the matches of a pair say and where its cameras stand; medians: {medians}."
+
+
+def _tracks_note(points: Points) -> str:
+    if not len(points.track_lengths):
+        return ""
+    share = float(np.mean(points.track_lengths <= 2))
+    median = float(np.median(points.track_lengths))
+    said = f"Number of images that see a 3D point; a bar reaches to the next. The median is {median:.3g}."
+    weak = f" {share:.0%} are seen by two only: nothing checks these." if share >= _NOTED_SHARE else ""
+    return f"{said}{weak}{_sample(points)}"
+
+
+def _reprojection_note(points: Points) -> str:
+    known = points.errors_px[np.isfinite(points.errors_px)]
+    if not len(known):
+        return ""
+    median, high = np.quantile(known, [0.5, 0.9])
+    return (
+        f"Mean error of a 3D point over the images that see it: {median:.2g} px in the median, "
+        f"{high:.2g} px or less for nine of ten.{_sample(points)}"
+    )
+
+
+def _sample(points: Points) -> str:
+    if len(points.track_lengths) >= points.num_all:
+        return ""
+    return f" Counted over {len(points.track_lengths):,} points, evenly picked."
 
 
 def _matrix_note(cameras_per_cell: int) -> str:

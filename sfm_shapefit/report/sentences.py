@@ -1,6 +1,6 @@
 """The report in words: what was placed, how certain it is, and what to look at first.
 
-What comes before all of it, the verdict and the key figures, is in `headline`.
+What comes before all of it, the verdict and the key figures, is in `first_screen`.
 
 Sentences are plain text. Names in them come from strangers: whoever shows a sentence shows it as text, and
 `shorten` keeps a name of any length readable.

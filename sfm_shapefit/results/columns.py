@@ -47,7 +47,7 @@ def columns_of(
     Args:
         rows: n rows of one type.
         row_type: their type, also if there are none.
-        dimension: of the locations; a vector has so many columns.
+        dimension: of the locations; a vector has so many columns, correlations one per two axes.
 
     Returns:
         n values each: numbers are float64, or int64 and bool where none can be missing, NaN where there is
@@ -58,8 +58,9 @@ def columns_of(
         values = [getattr(row, item.name) for row in rows]
         names = columns_of_field(item.name, dimension)
         if names != [item.name]:
-            nothing = (math.nan,) * dimension
-            whole = np.array([value or nothing for value in values], dtype=np.float64).reshape(-1, dimension)
+            nothing = (math.nan,) * len(names)
+            whole = np.array([value or nothing for value in values], dtype=np.float64)
+            whole = whole.reshape(-1, len(names))
             found |= {name: whole[:, k] for k, name in enumerate(names)}
         else:
             found[item.name] = _column(values, item.type)

@@ -38,6 +38,23 @@ class EarthDatum(TypedDict):
     altitude_m: Annotated[float, "Height above the ellipsoid, or what the priors give for it."]
 
 
+class KeyFigures(TypedDict):
+    """The figures that terminal and report begin with, beside the number of placed cameras."""
+
+    pair_error_deg: Annotated[
+        float | None, "Median angle between the direction of a pair and the line between its cameras."
+    ]
+    pair_error_px: Annotated[
+        float | None, "The same in pixels, at the cameras' median focal length; null for a bare graph."
+    ]
+    sigma: Annotated[
+        float | None,
+        "Median over the placed cameras of the largest standard deviation along the axes; null if not known.",
+    ]
+    sigma_of_extent: Annotated[float | None, "The same as a share of the extent of the placed cameras."]
+    sigma_unit: Annotated[str, "What sigma is given in, to follow the number."]
+
+
 class LooseGroup(TypedDict):
     """Cameras that are rigid by the graph but loose by the geometry."""
 
@@ -192,6 +209,7 @@ class PlacementSummary(TypedDict):
     options: Options
     num_images: Annotated[int, "Images of the input, posed or not; nodes of a bare graph."]
     num_placed: Annotated[int, "Of these, how many are in the output."]
+    figures: Annotated[KeyFigures, "The figures that matter."]
     num_pairs: Annotated[int, "Pairs that were looked at."]
     num_pairs_rejected: Annotated[
         int, "Pairs without a usable direction, and those that contradict the solution."

@@ -25,9 +25,9 @@ from sfm_shapefit.placement.prior_pairs import PriorAngles
 from sfm_shapefit.refinement.options import PlacementOptions
 from sfm_shapefit.results.certified import Departure, compare_with_certified
 from sfm_shapefit.results.columns import Column, TableName, table_of
-from sfm_shapefit.results.headline import headline_of_graph, headline_of_model
 from sfm_shapefit.results.intrinsics import Intrinsics
 from sfm_shapefit.results.json_types import GraphSummary, Join, LocateSummary
+from sfm_shapefit.results.key_figures import figure_rows
 from sfm_shapefit.results.model_verdict import ModelVerdict, judge_graph, judge_model
 from sfm_shapefit.results.notebook import notebook_html
 from sfm_shapefit.results.rows import camera_rows, own_camera_rows, pair_rows, without_direction
@@ -155,7 +155,7 @@ class LocateResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.warnings]
-        return notebook_html(self, [*headline_of_model(self).rows(), *warnings])
+        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""
@@ -354,7 +354,7 @@ class GraphResult(Displayed):
     def _repr_html_(self) -> str:
         """Return verdict, figures and warnings, and the report with its scene."""
         warnings = [("warning", warning) for warning in self.summary()["warnings"]]
-        return notebook_html(self, [*headline_of_graph(self).rows(), *warnings])
+        return notebook_html(self, [*figure_rows(self.summary()), *warnings])
 
     def table(self, name: TableName) -> dict[str, Column]:
         """Return "cameras" or "pairs" as columns, arrays by their names in the CSV; pandas takes them."""

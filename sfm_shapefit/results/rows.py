@@ -77,8 +77,8 @@ def own_camera_rows(
     graph, assessment = placement.graph, placement.assessment
     inside = graph.edges[placement.edges[placement.pairs]]
     degrees = np.bincount(inside.ravel(), minlength=graph.num_nodes)
-    covariances = placement.covariances
-    sigmas = scale * (standard_deviations(covariances) if axes is None else _turn_sigmas(covariances, axes))
+    covariances = placement.covariances if axes is None else _turned(placement.covariances, axes)
+    sigmas, correlations = scale * standard_deviations(covariances), _correlations(covariances)
     rows = []
     for k, camera in enumerate(placement.cameras.tolist()):
         kept = bool(np.isfinite(centers[k]).all())
@@ -93,18 +93,28 @@ def own_camera_rows(
                 degree=int(degrees[camera]),
                 trust=trust,
                 sigma=tuple(sigmas[k].tolist()),
+                correlation=tuple(correlations[k].tolist()),
             )
         )
     return rows
 
 
-def _turn_sigmas(covariances: FloatArray, axes: FloatArray) -> FloatArray:
-    """Return standard deviations (n, d) along other axes, infinite where nothing holds a node."""
+def _turned(covariances: FloatArray, axes: FloatArray) -> FloatArray:
+    """Return covariances (n, d, d) in other axes, infinite where nothing holds a node."""
     held = ~np.isinf(covariances).any(axis=(1, 2))
-    sigmas = np.full(covariances.shape[:2], np.inf)
-    turned = axes @ covariances[held] @ axes.T
-    sigmas[held] = np.sqrt(np.diagonal(turned, axis1=1, axis2=2))
-    return sigmas
+    turned = np.full(covariances.shape, np.inf)
+    turned[held] = axes @ covariances[held] @ axes.T
+    return turned
+
+
+def _correlations(covariances: FloatArray) -> FloatArray:
+    """Return the correlations of each two axes, (n, d (d - 1) / 2): 0 if exact, NaN if nothing holds it."""
+    sigmas = standard_deviations(covariances)
+    i, j = np.triu_indices(covariances.shape[1], k=1)
+    products = sigmas[:, i] * sigmas[:, j]
+    with np.errstate(invalid="ignore"):
+        found = covariances[:, i, j] / np.where(products > 0.0, products, 1.0)
+    return np.asarray(np.clip(found, -1.0, 1.0))
 
 
 def pair_rows(placement: Placement, support: IntArray, further: Sequence[Placement] = ()) -> list[PairRow]:

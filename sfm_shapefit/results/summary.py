@@ -25,6 +25,7 @@ from sfm_shapefit.results.json_types import (
     RotationRefinement,
     Solve,
 )
+from sfm_shapefit.results.key_figures import NOISE_ONLY, SOLVER_UNITS, UNITS, key_figures
 from sfm_shapefit.results.rows import piece_rows
 from sfm_shapefit.results.tables import IN_MEMORY, SCHEMA_VERSION
 from sfm_shapefit.results.warnings import graph_warnings
@@ -43,8 +44,10 @@ def summarize_model(found: "LocateResult") -> LocateSummary:
     solved = [(0, found.gauge.statement, int(np.sum(found.kept)))]
     solved += [(p.placement.piece, p.gauge.statement, int(np.sum(p.kept))) for p in found.further]
     num_unusable = len(found.directions.pairs) - placement.num_pairs
+    cameras = found.model.reconstruction.cameras.values()
+    focal_length_px = float(np.median([camera.mean_focal_length() for camera in cameras]))
     return {
-        **_summarize(found, solved, found.warnings),
+        **_summarize(found, solved, found.warnings, (focal_length_px, UNITS[found.gauge.scale])),
         "num_images": len(found.image_names),
         "num_placed": model.num_reg_images(),
         "num_pairs": len(found.directions.pairs),
@@ -110,17 +113,24 @@ def summarize_graph(found: "GraphResult") -> GraphSummary:
     placement = found.placement
     solved = [(p.piece, _SOLVER_SCALE, len(p.cameras)) for p in (placement, *found.further)]
     return {
-        **_summarize(found, solved, graph_warnings(placement)),
+        **_summarize(found, solved, graph_warnings(placement), (math.nan, SOLVER_UNITS)),
         "inputs": {"graph": str(found.path), "directions": found.statement},
         "dimension": placement.graph.dimension,
     }
 
 
 def _summarize(
-    found: "LocateResult | GraphResult", solved: list[tuple[int, str, int]], warnings: Iterable[str]
+    found: "LocateResult | GraphResult",
+    solved: list[tuple[int, str, int]],
+    warnings: Iterable[str],
+    measures: tuple[float, str],
 ) -> PlacementSummary:
-    """Return what can be said of any placement, nodes counted as images; `solved` as of `piece_rows`."""
+    """Return what can be said of any placement, nodes counted as images.
+
+    `solved` is as of `piece_rows`; `measures` are the focal length in pixels and the unit of positions.
+    """
     placement, refined = found.placement, found.placement.refined
+    residuals = residuals_deg(placement)
     others = ("pycolmap", "numpy", "scipy", "clarabel")
     return {
         "schema_version": SCHEMA_VERSION,
@@ -133,12 +143,13 @@ def _summarize(
         "options": asdict(found.options),
         "num_images": placement.graph.num_nodes,
         "num_placed": len(placement.cameras),
+        "figures": key_figures(found.cameras, residuals["quantile_50"], *measures),
         "num_pairs": placement.num_pairs,
         "num_pairs_rejected": len(placement.rejected_pairs),
         "num_pairs_filtered": len(placement.dropped),
         "sigma_of": sigma_of(placement),
         "residual_level_deg": placement.assessment.level_deg,
-        "residuals_deg": residuals_deg(placement),
+        "residuals_deg": residuals,
         "loose_groups": [
             {
                 "cameras": [placement.graph.name_of(c) for c in placement.cameras[group.cameras].tolist()],
@@ -175,7 +186,7 @@ def _summarize(
 def sigma_of(placement: Placement) -> str:
     """Say what the standard deviations of the cameras know of, and what they are relative to."""
     if placement.adjusted_covariances is None:
-        return "matching noise only; relative to the centroid and scale of the cameras that are held"
+        return f"{NOISE_ONLY}; relative to the centroid and scale of the cameras that are held"
     held = ~placement.adjusted_covariances.any(axis=(1, 2))
     relative = f"{int(held.sum())} fixed cameras" if held.any() else "the model's mean position and scale"
     return f"adjusted: noise, rotations, calibration; relative to {relative}"

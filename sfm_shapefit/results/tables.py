@@ -5,6 +5,7 @@ columns and keys may be added, never renamed.
 """
 
 import csv
+import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -45,6 +46,9 @@ class CameraRow:
     """Standard deviation of the center that is delivered, in the output's units, relative to the centroid and
     scale of the model or to fixed cameras; `sigma_of` in locate.json says which, and what errors it knows of.
     Columns sigma_x, sigma_y, sigma_z, empty also where the agreeing pairs do not hold the camera."""
+    correlation: tuple[float, ...] = ()
+    """Correlations of the errors along two axes each, d (d - 1) / 2 numbers in [-1, 1], which with `sigma`
+    make the covariance of the center. Columns rho_xy, rho_xz, rho_yz, empty where `sigma` is."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,8 +87,8 @@ class PairRow:
 
 
 Row = TypeVar("Row", CameraRow, PairRow)
-_PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v"}
-"""Of the columns of a vector, one per axis."""
+_PREFIXES = {"center": "", "sigma": "sigma_", "direction": "v", "correlation": "rho_"}
+"""Of the columns of a vector, one per axis, or per two axes."""
 _PARSERS: dict[Any, Callable[[str], Any]] = {
     str: str.__str__,
     bool: "true".__eq__,
@@ -93,7 +97,7 @@ _PARSERS: dict[Any, Callable[[str], Any]] = {
     int | None: lambda cell: int(cell) if cell else None,
 }
 """How a cell is read, by the type of its field; one that a short line lacks is None, and refused."""
-_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score", "prior_angle_deg"}
+_ADDED_COLUMNS = {"triplet_score", "matched_share", "pair_score", "prior_angle_deg", "correlation"}
 """What earlier outputs lack."""
 
 
@@ -102,14 +106,14 @@ def write_rows(
 ) -> None:
     """Write rows of one type as CSV; a column of d numbers becomes d columns, one per axis."""
     names = [field.name for field in fields(row_type)]
-    values_of, nothing = attrgetter(*names), ("",) * dimension
-    is_vector = [name in _PREFIXES for name in names]
+    values_of = attrgetter(*names)
+    widths = [len(columns_of_field(name, dimension)) if name in _PREFIXES else 0 for name in names]
 
     def cells(row: CameraRow | PairRow) -> list[object]:
         found: list[object] = []
-        for value, vector in zip(values_of(row), is_vector, strict=True):
-            if vector:
-                found.extend(map(_cell, value) if value else nothing)
+        for value, width in zip(values_of(row), widths, strict=True):
+            if width:
+                found.extend(map(_cell, value) if value else ("",) * width)
             else:
                 found.append(_cell(value))
         return found
@@ -126,12 +130,13 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
         OSError, ValueError, KeyError, TypeError: if it cannot be read, or a cell is not as it should be.
     """
     refuse_irregular_file(path)
-    axes = axis_names(dimension)
+
+    columns = {item.name: columns_of_field(item.name, dimension) for item in fields(row_type)}
 
     def value(cells: dict[str, str], name: str, kind: Any) -> Any:
         if name not in _PREFIXES:
             return _PARSERS[kind](cells[name])
-        numbers = [cells[_PREFIXES[name] + axis] for axis in axes]
+        numbers = [cells[column] for column in columns[name]]
         return tuple(map(float, numbers)) if all(numbers) else ()
 
     with path.open(newline="", encoding="utf-8") as stream:
@@ -140,7 +145,7 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
                 **{
                     item.name: value(cells, item.name, item.type)
                     for item in fields(row_type)
-                    if item.name in cells or item.name not in _ADDED_COLUMNS
+                    if item.name not in _ADDED_COLUMNS or columns[item.name][0] in cells
                 }
             )
             for cells in csv.DictReader(stream)
@@ -148,8 +153,13 @@ def read_rows(row_type: type[Row], dimension: int, path: Path) -> list[Row]:
 
 
 def columns_of_field(name: str, dimension: int) -> list[str]:
-    """Return the columns of a row's field: one, or one per axis of a vector."""
-    return [_PREFIXES[name] + axis for axis in axis_names(dimension)] if name in _PREFIXES else [name]
+    """Return the columns of a row's field: one, or one per axis of a vector, or per two axes."""
+    if name not in _PREFIXES:
+        return [name]
+    axes = axis_names(dimension)
+    if name == "correlation":
+        axes = [first + second for first, second in itertools.combinations(axes, 2)]
+    return [_PREFIXES[name] + axis for axis in axes]
 
 
 def axis_names(dimension: int) -> list[str]:

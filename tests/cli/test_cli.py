@@ -19,8 +19,9 @@ from sfm_shapefit.cli import app
 from sfm_shapefit.commands.map import database_in
 from sfm_shapefit.formats.graph_text import graph_text
 from sfm_shapefit.locate_options import LocateOptions
-from sfm_shapefit.report.headline import tiles
+from sfm_shapefit.report.first_screen import tiles
 from sfm_shapefit.report.read_back import read_output
+from sfm_shapefit.results.key_figures import figure_rows
 from sfm_shapefit.viewgraph import ViewGraph
 from tests.problems import all_pairs, exact_graph
 from tests.program import run, run_python, run_refused
@@ -53,14 +54,29 @@ def test_locate_writes_the_model_and_its_tables_and_says_what_was_placed_and_whe
     assert result.stderr == ""
 
 
-def test_the_terminal_and_the_report_give_the_same_figures(ring_run):
+def test_terminal_and_report_show_the_figures_of_locate_json(ring_run):
     result, out = ring_run
-    shown = {tile["label"]: tile["value"] for tile in tiles(*read_output(out))}
-    error_px, error_deg = re.match(r"(\S+) px, (\S+)°", shown["typical error of a pair"]).groups()
-    (uncertainty,) = (value for label, value in shown.items() if label.startswith("typical uncertainty"))
-    assert re.search(rf"typical error of a pair +│ {error_deg} deg \({error_px} px\)", result.stdout)
-    assert f"│ {uncertainty.removeprefix('± ').removesuffix(' units')} " in result.stdout
-    assert "8 of 8" in shown.values()
+    drawing, facts = read_output(out)
+    facts["figures"] |= {"pair_error_deg": 0.25, "pair_error_px": 7.0, "sigma": 0.5, "sigma_of_extent": 0.125}
+    shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
+    assert shown["typical error of a pair"] == "7 px, 0.25°"
+    assert shown["typical uncertainty, 12% of the scene"] == "± 0.5 units"
+    rows = dict(figure_rows(facts))
+    assert rows["typical error of a pair"] == "0.25 deg (7 px)"
+    assert rows["typical uncertainty"] == "0.5 of the input's units, 12% of the scene (standard deviation)"
+    assert rows["placed"] == "8 of 8 images"
+    figures = read_output(out)[1]["figures"]
+    assert figures["sigma"] == pytest.approx(np.median(drawing.cameras.sigmas[drawing.cameras.placed]))
+    assert f"{figures['pair_error_deg']:.2g} deg ({figures['pair_error_px']:.2g} px)" in result.stdout
+
+
+def test_a_folder_without_the_images_is_told_and_a_graph_has_no_images_to_show(tmp_path):
+    said = run("locate", RING_MODEL, tmp_path / "out", "--images", tmp_path, code=0).stdout
+    assert "has none of the images" in " ".join(said.replace("│", " ").split())
+    assert "--images" in run("locate", "--help").stdout
+    assert "--images" not in run("place", "--help").stdout
+    graph = BUNDLED / "graph40.txt"
+    assert "No such option" in run("place", graph, tmp_path / "out", "--images", tmp_path, code=2).output
 
 
 def test_json_is_the_only_thing_on_stdout_and_equals_the_file_under_colmaps_own_names(tmp_path):

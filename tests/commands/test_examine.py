@@ -8,9 +8,9 @@ from sfm_shapefit.colmap.image_quality import image_quality
 from sfm_shapefit.colmap.model import read_model
 from sfm_shapefit.commands.examine import examine
 from sfm_shapefit.report.drawing import PairClass
-from sfm_shapefit.report.headline import banner
+from sfm_shapefit.report.first_screen import banner
 from tests.program import run, run_refused
-from tests.scenes import RING, fingerprint
+from tests.scenes import COURTYARD, RING, fingerprint
 
 
 def test_quality_is_that_of_the_models_own_observations():
@@ -60,3 +60,17 @@ def test_the_page_is_written_beside_and_nothing_is_replaced_unasked(tmp_path):
     assert "exists already" in run_refused("report", RING / "sparse" / "0", "--write-to", page)
     run("report", RING / "sparse" / "0", "--write-to", page, "--overwrite", code=0)
     assert fingerprint(RING) == before
+
+
+def test_where_many_pairs_are_wrong_a_camera_is_weak_only_beside_the_others(tmp_path):
+    _, facts = examine(COURTYARD / "truth", COURTYARD / "database.db")  # a quarter of its pairs is wrong
+    assert len(facts["verdict"]["cameras"]) <= 1
+    moved = pycolmap.Reconstruction(COURTYARD / "truth")
+    image = moved.image(sorted(moved.reg_image_ids())[7])
+    pose = image.frame.rig_from_world
+    away = pose.translation + 0.002 * 15.5 * np.array([0.6, 0.0, 0.8])  # 0.2 % of the extent
+    image.frame.rig_from_world = pycolmap.Rigid3d(pose.rotation, away)
+    moved.write(tmp_path)
+    drawing, facts = examine(tmp_path, COURTYARD / "database.db")
+    assert image.name in facts["verdict"]["cameras"]
+    assert "its reprojection error is" in drawing.cameras.reasons[drawing.cameras.names.index(image.name)]

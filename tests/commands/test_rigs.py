@@ -321,13 +321,13 @@ def test_map_averages_over_frames_and_has_the_scale_of_the_rigs(mapped, workspac
             )
 
 
-def test_a_rig_with_an_uncalibrated_sensor_is_left_aside_and_named(workspace, tmp_path):
+def test_a_rig_whose_sensor_has_no_pose_is_left_aside_and_named(workspace, tmp_path):
     path = edit_database(
         copied(workspace, tmp_path) / "database.db",
         "UPDATE rig_sensors SET sensor_from_rig = NULL WHERE sensor_id = 2",
     )
     images = read_images(path)
-    assert images.rigs.uncalibrated == (1,)
+    assert images.rigs.incomplete == (1,)
     assert list(images.rigs.rigs) == [2]
     of_second = {i for i, image in images.reconstruction.images.items() if image.camera_id > 3}
     assert set(images.rigs.place_of_image) == of_second

@@ -325,6 +325,8 @@ def test_locate_turns_the_whole_model_with_its_directions_and_deviations_onto_pr
         x, y, z = before.sigma
         # The ring is exact, so that the turn is a quarter to 1e-6 or so, and so are the variances' shares.
         np.testing.assert_allclose(after.sigma, ratio * np.array([y, x, z]), rtol=1e-4)
+        xy, xz, yz = before.correlation
+        np.testing.assert_allclose(after.correlation, [-xy, -yz, xz], atol=1e-3)
     for before, after in zip(plain.pairs, found.pairs, strict=True):
         np.testing.assert_allclose(after.direction, quarter @ before.direction, atol=1e-5)
 

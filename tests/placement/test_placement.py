@@ -58,6 +58,13 @@ def test_rows_speak_of_the_whole_graph():
     assert [row.piece for row in rows] == [0] * 5 + [1, 1]
     assert rows[5].reason == "another rigid piece, hinged at image4"
     assert rows[0].sigma == pytest.approx(tuple(2.0 * placement.assessment.sigmas[0]))
+    (x, y, z), (xy, xz, yz) = rows[0].sigma, rows[0].correlation
+    covariance = [
+        [x * x, xy * x * y, xz * x * z],
+        [xy * x * y, y * y, yz * y * z],
+        [xz * x * z, yz * y * z, z * z],
+    ]
+    np.testing.assert_allclose(covariance, 4.0 * placement.covariances[0], rtol=1e-9)
     pairs = pair_rows(placement, np.arange(len(edges)))
     assert [row.verdict for row in pairs] == ["undetermined"] * 3 + ["inlier"] * 10
     assert [row.support for row in pairs] == list(range(13))

@@ -81,7 +81,7 @@ def test_the_report_opens_without_errors_and_without_the_network(driver, report)
     drawn = driver.execute_script(
         "return [...document.querySelectorAll('.chart svg')].map((e) => e.parentNode.id)"
     )
-    assert drawn == ["trust", "histogram", "matrix", "support", "convergence"]
+    assert drawn == ["trust", "histogram", "tracks", "reprojection", "matrix", "support", "convergence"]
     assert driver.execute_script(COLORS)["count"] > 50
     assert "mkdir -p" in driver.find_element("id", "command").text
     assert str(report.parent) in driver.find_element("id", "command").text
@@ -238,6 +238,58 @@ def test_thumbnails_stand_in_the_frusta_and_beside_the_facts_and_what_is_left_ou
     middle = np.median(drawing.cameras.centers[drawing.cameras.placed], axis=0)
     np.testing.assert_allclose(target, drawing.axes @ (drawing.cameras.poses.centers[24] - middle), atol=1e-5)
     assert complaints(driver) == []
+
+
+# Turns the scene for ten frames; returns the calls of WebGL, the largest array that is handed over, and how
+# often a style was looked up.
+TURNING = """
+    const scene = document.getElementById('scene').scene, own = getComputedStyle, calls = {};
+    const prototype = WebGL2RenderingContext.prototype, kept = {};
+    let [styles, largest] = [0, 0];
+    for (const name of Object.getOwnPropertyNames(prototype)) {
+        const {value} = Object.getOwnPropertyDescriptor(prototype, name);
+        if (typeof value !== 'function') continue;
+        kept[name] = value;
+        prototype[name] = (...given) => {
+            calls[name] = (calls[name] || 0) + 1;
+            for (const one of given) if (one && one.length > largest) largest = one.length;
+        };
+    }
+    getComputedStyle = (...given) => { styles += 1; return own(...given); };
+    for (let k = 0; k < 10; k++) { scene.view.yaw += 0.01; scene.draw(); }
+    Object.assign(prototype, kept);
+    getComputedStyle = own;
+    return {calls, largest, styles};
+"""
+
+
+def test_a_frame_of_ten_thousand_cameras_is_a_dozen_calls_and_hands_nothing_over(driver, tmp_path):
+    write_report(*make_drawing(10_000, 10_000, 10_000), tmp_path / "report.html")
+    opened(driver, tmp_path / "report.html")
+    found = driver.execute_script(TURNING)
+    drawn = found["calls"]["drawArrays"] + found["calls"]["drawArraysInstanced"]
+    assert 4 * 10 <= drawn <= 12 * 10
+    assert sum(found["calls"].values()) < 120 * 10
+    assert not {name for name in found["calls"] if name.startswith(("buffer", "create", "tex"))}
+    assert found["largest"] == 16  # the matrix
+    assert found["styles"] == 0
+
+
+def test_the_scene_is_coarse_while_it_turns_slowly_and_whole_again_when_it_rests(driver, report):
+    opened(driver, report)
+    slow = (
+        SCENE + "const end = performance.now() + 120; scene.moved();"
+        "requestAnimationFrame(() => { while (performance.now() < end); });"
+    )
+    for _ in range(2):
+        driver.execute_script(slow)
+    levels = wait_for(
+        driver,
+        SCENE + "scene.moved(); const now = performance.now(); while (performance.now() < now + 60);"
+        "return scene.detail();",
+    )
+    assert 1 <= levels <= 3
+    wait_for(driver, SCENE + "return scene.detail() === 0")
 
 
 def test_a_thousand_cameras_are_there_in_two_seconds(driver, tmp_path):

@@ -12,12 +12,18 @@ import pytest
 
 from sfm_shapefit.errors import InputError
 from sfm_shapefit.report import thumbnails
-from sfm_shapefit.report.charts import residual_histogram, view_graph_matrix
-from sfm_shapefit.report.drawing import PairClass, frustum_corners, view_axes
-from sfm_shapefit.report.headline import banner, scene_name, tiles
+from sfm_shapefit.report.charts import (
+    reprojection_error_bars,
+    residual_histogram,
+    track_length_bars,
+    view_graph_matrix,
+)
+from sfm_shapefit.report.drawing import PairClass, build_drawing, frustum_corners, view_axes
+from sfm_shapefit.report.first_screen import banner, scene_name, tiles
 from sfm_shapefit.report.page import MAX_PAIRS, page_data, report_html
 from sfm_shapefit.report.sentences import expert_sentences, first_looks, shorten, summary_sentences
 from sfm_shapefit.report.thumbnails import read_thumbnails
+from sfm_shapefit.results.tables import CameraRow
 from tests.drawings import make_drawing
 
 HOSTILE = [
@@ -38,7 +44,7 @@ def data_of(page):
 
 
 def unpacked(column):
-    kinds = {"f8": "<f8", "f4": "<f4", "i4": "<i4", "u1": "u1"}
+    kinds = {"f4": "<f4", "i4": "<i4", "u1": "u1"}
     return np.frombuffer(base64.b64decode(column["bytes"]), kinds[column["type"]])
 
 
@@ -51,8 +57,9 @@ def test_columns_survive_the_way_into_the_page_by_trust_and_contradicting_pairs_
     drawing, _ = make_drawing()
     data = data_of(page)
     order = [drawing.cameras.names.index(name) for name in data["cameras"]["names"]]
-    world = unpacked(data["cameras"]["world"]).reshape(-1, 3)
-    np.testing.assert_array_equal(world, drawing.cameras.centers[order])
+    centers = unpacked(data["cameras"]["center"]).reshape(-1, 3)
+    world = data["middle"] + centers @ np.reshape(data["axes"], (3, 3)).T
+    np.testing.assert_allclose(world, drawing.cameras.centers[order], atol=1e-5)
     ends = np.stack([unpacked(data["pairs"][end]) for end in ("first", "second")], axis=1)
     rows = drawing.pairs.worst_first()
     np.testing.assert_array_equal(np.array(order)[ends], drawing.pairs.cameras[rows])
@@ -159,7 +166,7 @@ def test_the_banner_says_whether_it_is_good_and_what_is_next(grade, adjusted, he
     assert (found["grade"], found["headline"]) == (grade, headline)
     assert command in found["command"]
     said = {
-        "good": "24 of 25 cameras are placed; 1 is not in this model, 95 of 120 pairs agree",
+        "good": "24 of 25 cameras are placed; 1 is not in this model; 95 pairs agree with them, ",
         "look": "IMG_00000.jpg, images/IMG_00001.jpg may be wrong",
         "do not use": "Only 30% of the pairs agree.",
     }
@@ -170,10 +177,51 @@ def test_tiles_tell_errors_in_pixels_and_degrees_and_how_uncertain_positions_are
     drawing, facts = make_drawing()
     shown = {tile["label"]: tile["value"] for tile in tiles(drawing, facts)}
     assert shown["cameras placed"] == "24 of 25"
-    assert shown["typical error of a pair"] == "1.4 px, 0.08°"  # 1000 px * tan(0.08 deg)
+    assert shown["typical error of a pair"] == "1.4 px, 0.08°"
     assert shown["camera to check"] == "1"
-    sigma = next(value for label, value in shown.items() if label.startswith("typical uncertainty"))
-    assert sigma == f"± {np.median(drawing.cameras.sigmas[:24]):.2g} units"
+    assert shown["typical uncertainty, 0.07% of the scene"] == "± 0.015 units"
+    del facts["figures"]  # as in an output of an earlier version
+    labels = [tile["label"] for tile in tiles(drawing, facts)]
+    assert not any(label.startswith(("typical error", "typical uncertainty")) for label in labels)
+
+
+def test_an_ellipsoid_lies_along_the_axes_of_the_covariance_and_survives_the_way_into_the_page(page):
+    drawing, _ = make_drawing()
+    data = data_of(page)
+    order = [drawing.cameras.names.index(name) for name in data["cameras"]["names"]]
+    halves = unpacked(data["cameras"]["ellipsoids"]).reshape(-1, 3, 3)[0]
+    covariance = drawing.cameras.covariances[order[0]]
+    np.testing.assert_allclose(halves.T @ halves, drawing.axes @ covariance @ drawing.axes.T, atol=1e-9)
+    products = halves @ halves.T  # they are orthogonal
+    np.testing.assert_allclose(products - np.diag(np.diag(products)), 0.0, atol=1e-9)
+    row = CameraRow(name="a", placed=True, center=(0, 0, 0), sigma=(3.0, 4.0, 1.0), correlation=(1.0, 0, 0))
+    long = build_drawing([row], []).cameras.ellipsoids[0, 2]  # errors along x and y are one and the same
+    np.testing.assert_allclose(np.abs(long), [3.0, 4.0, 0.0], atol=1e-9)
+    plane = CameraRow(name="a", placed=True, center=(0, 0), sigma=(3.0, 4.0), correlation=(1.0,))
+    np.testing.assert_allclose(
+        np.abs(build_drawing([plane], []).cameras.ellipsoids[0, 2]), [3, 4, 0], atol=1e-9
+    )
+
+
+def test_every_point_is_in_a_bar_of_the_track_lengths_and_of_the_errors():
+    lengths = np.array([2, 2, 3, 10, 11, 12, 40])
+    bars = track_length_bars(lengths)
+    named = dict(zip(bars.texts, bars.counts.tolist(), strict=True))
+    assert named["seen by 2 images"] == 2
+    assert named["seen by 10-11 images"] == 2
+    assert named["seen by 30-40 images"] == 1
+    assert bars.counts.sum() == len(lengths)
+    assert [place for place, _ in bars.ticks] == [k + 0.5 for k in range(len(bars.counts))]
+
+    errors = np.append(np.linspace(0.0, 1.0, 100), [50.0, np.nan])
+    bars = reprojection_error_bars(errors)
+    assert bars.counts.sum() == 101
+    assert bars.counts[-1] == np.sum(errors >= float(bars.texts[-1].split()[0]))
+    assert bars.texts[0] == "0 to 0.05 px"
+    assert bars.counts[0] == np.sum(errors < 0.05)
+    assert track_length_bars(lengths[:0]) is None
+    assert reprojection_error_bars(np.array([np.nan])) is None
+    assert reprojection_error_bars(np.zeros(3)).counts.sum() == 3
 
 
 def test_agreeing_pairs_and_median_errors_are_counted_per_camera():
@@ -240,7 +288,7 @@ def test_the_title_is_the_name_of_the_scene(inputs, title):
 def test_nothing_known_nothing_claimed():
     drawing, facts = make_drawing(num_cameras=3, num_pairs=2, num_points=0)
     facts |= {"warnings": [], "loose_groups": []}
-    for key in ("verdict", "delivered", "residuals_deg", "sigma_of", "scale", "mean_reprojection_error_px"):
+    for key in ("verdict", "delivered", "figures", "sigma_of", "scale", "mean_reprojection_error_px"):
         del facts[key]
     data = page_data(drawing, facts)
     assert data["banner"]["grade"] == ""

@@ -16,7 +16,9 @@ const linear = (low, high, from, to) => {
   return { place, ticks };
 };
 const logarithmic = (low, high, from, to, unit = "") => {
-  const [first, last] = [Math.floor(Math.log10(low) + 1e-9), Math.ceil(Math.log10(high) - 1e-9)];
+  const first = Math.floor(Math.log10(low) + 1e-9);
+  const powers = Math.ceil(Math.log10(high) - 1e-9);
+  const last = unit === "°" ? Math.min(powers, Math.log10(180)) : powers; // no angle is larger
   const place = (value) => from + ((Math.log10(value) - first) / (last - first || 1)) * (to - from);
   const value = (where) => 10 ** (first + ((where - from) / (to - from)) * (last - first || 1));
   const every = last - first > 7 ? 2 : 1;
@@ -102,6 +104,25 @@ const drawHistogram = () => {
   return svg;
 };
 
+const drawBars = (name, title, label) => {
+  if (!data[name]) return null;
+  const { counts, texts, ticks } = data[name];
+  const [svg, box] = [chart(220, title), { left: 56, right: WIDTH - 16, top: 10, bottom: 176 }];
+  const width = (box.right - box.left) / counts.length;
+  const x = { place: (value) => box.left + value * width, ticks };
+  const y = linear(0, Math.max(...counts), box.bottom, box.top);
+  drawAxes(svg, box, x, y, [label, "3D points"]);
+  counts.forEach((value, k) => {
+    const top = y.place(value);
+    svg.append(shape("rect", { x: x.place(k) + 1, y: top, width: width - 2, height: box.bottom - top, fill: "var(--agrees)" }));
+  });
+  listen(svg, (u) => {
+    const k = Math.floor((u - box.left) / width);
+    return k in counts ? ["text", texts[k], [["3D points", count(counts[k])]]] : null;
+  });
+  return svg;
+};
+
 const LEAST_TRUSTED = 12;
 const drawTrust = (onChoice) => {
   const shown = [];
@@ -132,7 +153,8 @@ const drawTrust = (onChoice) => {
 
 const CELL_CLASSES = ["", "--agrees", "--undetermined", "--nodirection", "--contradicts"];
 const drawMatrix = (onChoice) => {
-  const { side, perCell, cells, counts, rowOf } = data.matrix;
+  const { side, perCell, cells, against, counts, rowOf } = data.matrix;
+  const isEmpty = (k) => (perCell === 1 ? cells[k] === 255 : counts[k] === 0);
   if (!numPairs) return null;
   const [left, top] = [104, 8];
   const size = Math.min((WIDTH - left - 8) / side, 40);
@@ -145,9 +167,9 @@ const drawMatrix = (onChoice) => {
   const paths = Array.from({ length: levels }, () => []);
   for (let r = 0; r < side; r++) {
     for (let c = 0; c < side; c++) {
-      const value = cells[r * side + c];
-      if (Number.isNaN(value)) continue;
-      const level = perCell === 1 ? value : Math.min(Math.ceil(5 * value), 5);
+      const k = r * side + c;
+      if (isEmpty(k)) continue;
+      const level = perCell === 1 ? cells[k] : Math.ceil((5 * against[k]) / counts[k]);
       const d = size - gap;
       paths[level].push(`M${(left + c * size).toFixed(2)} ${(top + r * size).toFixed(2)}h${d.toFixed(2)}v${d.toFixed(2)}h-${d.toFixed(2)}z`);
     }
@@ -173,14 +195,14 @@ const drawMatrix = (onChoice) => {
   if (perCell === 1) for (let p = 0; p < numPairs; p++) pairOf.set(key(pairs.first[p], pairs.second[p]), p);
   listen(svg, (u, v) => {
     const [r, c] = [Math.floor((v - top) / size), Math.floor((u - left) / size)];
-    if (!(r >= 0 && r < side && c >= 0 && c < side) || Number.isNaN(cells[r * side + c])) return null;
+    if (!(r >= 0 && r < side && c >= 0 && c < side) || isEmpty(r * side + c)) return null;
     if (perCell === 1) {
       const [a, b] = [rowOf[r], rowOf[c]];
       const p = pairOf.get(key(a, b));
       return p === undefined ? ["text", `${cameras.names[a]} – ${cameras.names[b]}`, [["pair", "see pairs.csv"]]] : ["pair", p];
     }
     const range = (k) => `${cameras.names[rowOf[k * perCell]]} to ${cameras.names[rowOf[Math.min((k + 1) * perCell, numCameras) - 1]]}`;
-    const share = ["contradict", `${number(100 * cells[r * side + c], 2)} %`];
+    const share = ["contradict", `${number((100 * against[r * side + c]) / counts[r * side + c], 2)} %`];
     return ["text", `${range(r)}\nwith ${range(c)}`, [["pairs", count(counts[r * side + c])], share]];
   }, onChoice);
   return svg;
@@ -242,7 +264,10 @@ const drawConvergence = () => {
 const drawCharts = (onChoice) => {
   WIDTH = Math.max(Math.min($("cameras").clientWidth, 760), 280);
   const made = {
-    trust: drawTrust, histogram: drawHistogram, matrix: drawMatrix, support: drawSupport, convergence: drawConvergence,
+    trust: drawTrust, histogram: drawHistogram,
+    tracks: () => drawBars("tracks", "Track lengths", "images that see a point"),
+    reprojection: () => drawBars("reprojection", "Reprojection errors", "mean error of a point, px"),
+    matrix: drawMatrix, support: drawSupport, convergence: drawConvergence,
   };
   for (const [id, draw] of Object.entries(made)) {
     $(`${id}-note`).textContent = data.notes[id];

@@ -1,6 +1,6 @@
 // What all parts of the page share: its data, and small helpers. Names come from strangers: they reach the
 // page through textContent only.
-const TYPES = { f8: Float64Array, f4: Float32Array, i4: Int32Array, u1: Uint8Array };
+const TYPES = { f4: Float32Array, i4: Int32Array, u2: Uint16Array, u1: Uint8Array };
 const VERDICTS = ["agrees", "contradicts", "cannot be judged", "no direction"];
 const LAYER_OF = ["agrees", "contradicts", "undetermined", "nodirection"];
 const VARIABLES = LAYER_OF.map((name) => `--${name}`);
@@ -50,8 +50,14 @@ const number = (value, digits = 3) => {
   return Number(value.toPrecision(digits)).toString();
 };
 const count = (value) => value.toLocaleString("en");
+const capital = (text) => text[0].toUpperCase() + text.slice(1);
 const counted = (value, noun) => `${count(value)} ${noun}${value === 1 ? "" : "s"}`;
 const reason = (code) => data.reasons[code];
+// Where a camera stands in the output's axes.
+const worldOf = (k) => {
+  const own = at(cameras.center, k);
+  return data.middle.map((from, c) => from + own.reduce((sum, part, axis) => sum + part * data.axes[3 * c + axis], 0));
+};
 const at = (positions, k) => [positions[3 * k], positions[3 * k + 1], positions[3 * k + 2]];
 const isPlaced = (k) => cameras.placed[k] === 1;
 const isDrawn = (p) => isPlaced(pairs.first[p]) && isPlaced(pairs.second[p]);
@@ -74,10 +80,14 @@ const isDark = () => {
 };
 const probe = document.body.appendChild(element("i"));
 probe.hidden = true;
-// [red, green, blue] in 0..1 of a color of the style sheet.
+// [red, green, blue] in 0..1 of a color of the style sheet, looked up once per theme.
+const shades = new Map();
 const rgbOf = (variable) => {
-  probe.style.color = `var(${variable})`;
-  return getComputedStyle(probe).color.match(/[\d.]+/g).slice(0, 3).map((part) => part / 255);
+  if (!shades.has(variable)) {
+    probe.style.color = `var(${variable})`;
+    shades.set(variable, getComputedStyle(probe).color.match(/[\d.]+/g).slice(0, 3).map((part) => part / 255));
+  }
+  return shades.get(variable);
 };
 
 // --- what is said of a camera or a pair ------------------------------------------------------------
@@ -100,7 +110,7 @@ const pairFacts = (p) => [
   ["why", reason(pairs.reason[p])],
 ];
 const cameraExpertFacts = (k) => [
-  ["center", isPlaced(k) ? at(cameras.world, k).slice(0, data.shownAxes).map((x) => number(x, 5)).join(", ") : ""],
+  ["center", isPlaced(k) ? worldOf(k).slice(0, data.shownAxes).map((x) => number(x, 5)).join(", ") : ""],
   ["rigid piece", cameras.piece[k] < 0 ? "none" : String(cameras.piece[k])],
 ];
 const pairExpertFacts = (p) => [

@@ -5,6 +5,8 @@ const drawHead = () => {
   $("title").textContent = data.title;
   $("subtitle").textContent = data.subtitle;
   $("banner").dataset.grade = banner.grade;
+  $("h-cameras").textContent = `${capital(data.noun)}s`;
+  $("h-matrix").textContent = `Which ${data.noun}s are paired`;
   $("mark").textContent = { good: "✓", look: "!", "do not use": "✕" }[banner.grade] ?? "";
   $("verdict").textContent = banner.headline;
   $("why").textContent = banner.sentence;
@@ -177,7 +179,10 @@ const select = (kind, k, isInScene = false) => {
   if (scene) scene.flyTo(ends);
 };
 
-const recolor = () => scene && scene.recolor();
+const recolor = () => {
+  shades.clear();
+  if (scene) scene.recolor();
+};
 $("theme").onclick = () => {
   document.documentElement.dataset.theme = isDark() ? "light" : "dark";
   recolor();

@@ -180,11 +180,12 @@ const makePainter = (canvas) => {
     gl.bindBuffer(gl.ARRAY_BUFFER, thing.buffers.color);
     gl.bufferData(gl.ARRAY_BUFFER, colors, gl.STATIC_DRAW);
   };
-  const paint = (thing, values) => {
+  // Of a thing a share of its instances or points may be drawn, the first ones.
+  const paint = (thing, values, share = 1) => {
     if (thing.texture) gl.bindTexture(gl.TEXTURE_2D, thing.texture);
     use(programs[thing.kind], thing.array, { tint: [-1, 0, 0, 1], ...values });
-    if (thing.instances === undefined) gl.drawArrays(gl.POINTS, 0, thing.vertices);
-    else gl.drawArraysInstanced(thing.mode, 0, thing.vertices, thing.instances);
+    if (thing.instances === undefined) gl.drawArrays(gl.POINTS, 0, Math.ceil(share * thing.vertices));
+    else gl.drawArraysInstanced(thing.mode, 0, thing.vertices, Math.ceil(share * thing.instances));
   };
   const drop = (thing) => {
     for (const buffer of Object.values(thing.buffers)) gl.deleteBuffer(buffer);

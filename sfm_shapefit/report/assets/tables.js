@@ -126,7 +126,7 @@ const drawTables = (onChoice) => {
   const shift = cameras.shift ? [numeric("Shift", (k) => cameras.shift[k], 2, "How far it is from where the input has it, in units")] : [];
   return {
     camera: makeTable("cameras", "camera", numCameras, [
-      named("Camera", (k) => cameras.names[k], why),
+      named(capital(data.noun), (k) => cameras.names[k], why),
       ...(isKnown(cameras.trust) ? [numeric("Trust", (k) => cameras.trust[k], 2, "1: its matches fit as well as usual; below 0.6 it is left out unless you say otherwise")] : []),
       ...(isKnown(cameras.sigma) ? [numeric("±", (k) => (isPlaced(k) ? cameras.sigma[k] : NaN), 2, "Uncertainty of its position: one standard deviation along the worst axis, in units")] : []),
       numeric("Error °", (k) => cameras.error[k], 2, "Median error of its pairs, in degrees"),
@@ -138,8 +138,8 @@ const drawTables = (onChoice) => {
       ...cameras.further.map(({ title, hint, values }) => numeric(title, (k) => values[k], 3, hint)),
     ], (k) => cameras.names[k], onChoice),
     pair: makeTable("pairs", "pair", numPairs, [
-      named("Camera 1", (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),
-      named("Camera 2", (p) => cameras.names[pairs.second[p]], () => ""),
+      named(`${capital(data.noun)} 1`, (p) => cameras.names[pairs.first[p]], (p) => reason(pairs.reason[p])),
+      named(`${capital(data.noun)} 2`, (p) => cameras.names[pairs.second[p]], () => ""),
       { title: "Verdict", value: (p) => VERDICTS[pairs.verdict[p]], cell: verdictCell },
       numeric("Off by °", (p) => pairs.residual[p], 3, "Angle between the direction that its matches say and the placed cameras"),
       ...(data.hasSupport ? [numeric("Matches", (p) => pairs.support[p], 9)] : []),

@@ -2,12 +2,15 @@
 
 const MANY_PAIRS = 200; // with more, agreeing pairs are not drawn until asked for
 const MANY_WITHOUT_POINTS = 1000; // where they hide nothing
-const MANY_IN_GOOD = 50; // contradicting pairs of a good model
+const MANY_IN_GOOD = 20; // contradicting pairs of a good model
 const MOST_PAIRS = 4000;
 const FAR_DEG = 1; // pairs that contradict by less are not drawn either
 const PICK_CAMERA_PX = 11;
 const PICK_PAIR_PX = 5;
-const SLOW_FRAME_MS = 90;
+const SLOW_FRAME_MS = 50;
+const REST_MS = 200; // the scene rests so long after the last move, and the time of two frames
+const COARSEST = 3; // levels of detail while the scene moves
+const SHARES = [1, 1, 0.25, 0.06]; // of points and pairs, by level
 const LEAST_FRUSTUM_PX = 12; // at first sight, frusta are at least so deep
 
 const makeScene = (onChoice) => {
@@ -32,19 +35,29 @@ const makeScene = (onChoice) => {
 
   // --- things to be drawn ---
 
+  // An order in which any first part is spread evenly over the whole.
+  const spread = (total) => {
+    let step = Math.max(Math.round(0.618 * total), 1);
+    const common = (a, b) => (b ? common(b, a % b) : a);
+    while (common(step, total) > 1) step += 1;
+    return Array.from({ length: total }, (_, k) => (k * step) % total);
+  };
   const gather = (chosen, values, width) => {
-    const found = new Float32Array(width * chosen.length);
+    const found = new values.constructor(width * chosen.length);
     chosen.forEach((k, row) => found.set(values.subarray(width * k, width * (k + 1)), width * row));
     return found;
   };
-  const frustumColumns = (chosen) => {
-    const vectors = [0, 3, 6].map((first) => {
+  // Three vectors per camera, nine numbers, as u, v and w.
+  const vectorsOf = (chosen, values) => {
+    const [u, v, w] = [0, 3, 6].map((first) => {
       const found = new Float32Array(3 * chosen.length);
-      chosen.forEach((k, row) => found.set(cameras.frusta.subarray(9 * k + first, 9 * k + first + 3), 3 * row));
+      chosen.forEach((k, row) => found.set(values.subarray(9 * k + first, 9 * k + first + 3), 3 * row));
       return found;
     });
-    const center = new Float32Array(chosen.flatMap(positionOf));
-    return { center, u: vectors[0], v: vectors[1], w: vectors[2] };
+    return { u, v, w };
+  };
+  const frustumColumns = (chosen) => {
+    return { center: new Float32Array(chosen.flatMap(positionOf)), ...vectorsOf(chosen, cameras.frusta) };
   };
   const cameraColors = (chosen) => {
     const gray = rgbOf("--nodirection").map((part) => Math.round(255 * part));
@@ -66,17 +79,11 @@ const makeScene = (onChoice) => {
     const [center, u] = [gather(chosen, cameras.center, 3), gather(chosen, cameras.inputCenter, 3)];
     return { center, u: u.map((part, k) => part - center[k]) };
   };
-  const ellipsoidColumns = (chosen) => {
-    const found = { center: gather(chosen, cameras.center, 3) };
-    ["u", "v", "w"].forEach((name, axis) => {
-      const along = at(data.axes, axis);
-      found[name] = new Float32Array(chosen.flatMap((k) => along.map((part) => part * cameras.sigmas[3 * k + axis])));
-    });
-    return found;
-  };
+  const ellipsoidColumns = (chosen) => ({ center: gather(chosen, cameras.center, 3), ...vectorsOf(chosen, cameras.ellipsoids) });
   // Dark points would vanish on a dark page and light ones on a light page; points without colors are gray.
+  const pointOrder = spread(points.positions.length / 3);
   const pointColors = () => {
-    const { colors } = points;
+    const colors = gather(pointOrder, points.colors, 3);
     const gray = rgbOf("--soft").map((part) => 255 * part);
     const isGray = colors.every((part) => part === 0);
     const dark = isDark();
@@ -154,7 +161,7 @@ const makeScene = (onChoice) => {
   });
   if (points.positions.length) {
     addLayer("points", `Points (${count(points.positions.length / 3)})`, true, {
-      cloud: painter.cloud({ center: points.positions, color: pointColors() }),
+      cloud: painter.cloud({ center: gather(pointOrder, points.positions, 3), color: pointColors() }),
     });
   }
   LAYER_OF.forEach((name, verdict) => {
@@ -171,8 +178,9 @@ const makeScene = (onChoice) => {
     const limit = verdict === 0 ? (points.positions.length ? MANY_PAIRS : MANY_WITHOUT_POINTS)
       : verdict === 1 && data.banner.grade === "good" ? MANY_IN_GOOD : MOST_PAIRS;
     const shown = drawn.length <= limit && verdict !== 3 && (verdict !== 1 || drawn.some((p) => pairs.residual[p] >= FAR_DEG));
+    const order = spread(drawn.length).map((k) => drawn[k]);
     addLayer(name, `${said} (${amount})`, shown, {
-      variable: VARIABLES[verdict], pairs: drawn, segments: painter.shapes(SEGMENT, pairColumns(drawn)),
+      variable: VARIABLES[verdict], pairs: order, segments: painter.shapes(SEGMENT, pairColumns(order)),
       alpha: verdict === 0 ? Math.max(Math.min(6 / Math.sqrt(drawn.length + 1), 0.6), 0.15) : 0.6,
     });
   });
@@ -203,7 +211,8 @@ const makeScene = (onChoice) => {
 
   // --- drawing ---
 
-  const pixelRatio = () => devicePixelRatio * (isMoving && isSlow ? 0.5 : 1);
+  const detail = () => (isMoving ? coarse : 0);
+  const pixelRatio = () => devicePixelRatio * (detail() ? 0.5 : 1);
   const cameraSize = () => (hasFrusta ? 5 : 9) * pixelRatio() * (placed.length > 2000 ? 0.7 : 1);
   const dots = (thing, common, size, tint) => painter.paint(thing, {
     ...common, size: 0, least: size, most: size, ...(tint ? { tint } : {}),
@@ -223,15 +232,16 @@ const makeScene = (onChoice) => {
     const ratio = pixelRatio();
     if (one.cloud) {
       const size = 0.003 * radius * sizes.point * eye.pixelsPerUnit() * view.distance * ratio;
-      painter.paint(one.cloud, { ...common, size, least: 1.8 * ratio * Math.min(sizes.point, 2), most: 6 * ratio * sizes.point });
+      const limits = { least: 1.8 * ratio * Math.min(sizes.point, 2), most: 6 * ratio * sizes.point };
+      painter.paint(one.cloud, { ...common, size, ...limits }, SHARES[detail()]);
     }
-    if (one.lines && !(isMoving && isSlow)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
+    if (one.lines && (!detail() || placed.length < 300)) painter.paint(one.lines, { ...common, scale: sizes.frustum, width: 1.6 * ratio });
     if (one.ghosts) painter.paint(one.ghosts, { ...common, scale: sizes.frustum, width: 1.2 * ratio, tint: [...tint, 0.55] });
     if (one.dots) dots(one.dots, common, cameraSize(), one.lines ? null : [...tint, 0.8]);
     if (one.ellipsoids) painter.paint(one.ellipsoids, { ...common, scale: sizes.ellipsoid, width: 1.2 * ratio });
     if (one.segments) {
       painter.seeThrough();
-      painter.paint(one.segments, { ...common, scale: 1, width: (one.isGrid ? 1 : 1.5) * ratio, tint: [...tint, one.alpha] });
+      painter.paint(one.segments, { ...common, scale: 1, width: (one.isGrid ? 1 : 1.5) * ratio, tint: [...tint, one.alpha] }, one.pairs ? SHARES[detail()] : 1);
     }
   };
   const ORDER = ["grid", "points", "cameras", "ghosts", "ellipsoids", "input", "agrees", "nodirection", "undetermined", "contradicts"];
@@ -265,10 +275,12 @@ const makeScene = (onChoice) => {
       draw();
     });
   };
-  // Where frames take long, the picture is coarse and cameras are dots while the scene moves, and frusta again when it rests.
-  let [isMoving, isSlow, lastFrame, rest] = [false, false, 0, 0];
+  // Where frames take long while the scene moves, it is drawn more coarsely: at half the resolution and many
+  // cameras as dots, then with part of the points and pairs only. When it rests, all is drawn again.
+  let [isMoving, coarse, lastFrame, frameTime, rest] = [false, 0, 0, 0, 0];
   const clockFrame = (now) => {
-    if (isMoving && lastFrame && now - lastFrame > SLOW_FRAME_MS) isSlow = placed.length > 300;
+    frameTime = isMoving && lastFrame ? now - lastFrame : 0;
+    if (frameTime > SLOW_FRAME_MS) coarse = Math.min(coarse + 1, COARSEST);
     lastFrame = isMoving ? now : 0;
   };
   const moved = () => {
@@ -277,7 +289,7 @@ const makeScene = (onChoice) => {
     rest = setTimeout(() => {
       isMoving = false;
       redraw();
-    }, 200);
+    }, REST_MS + 2 * frameTime);
     redraw();
   };
 
@@ -538,7 +550,7 @@ const makeScene = (onChoice) => {
   const leastPixels = LEAST_FRUSTUM_PX * Math.min(Math.sqrt(400 / Math.max(placed.length, 1)), 1);
   sizes.frustum = Math.max(data.frustum, leastPixels / eye.pixelsPerUnit());
   if (certain.length) {
-    const size = quantile(certain.map((k) => Math.hypot(...at(cameras.sigmas, k))), 0.5);
+    const size = quantile(certain.map((k) => Math.hypot(...cameras.ellipsoids.subarray(9 * k, 9 * k + 9))), 0.5);
     const power = 10 ** Math.floor(Math.log10(sizes.frustum / size));
     sizes.ellipsoid = Math.max(Math.floor(sizes.frustum / size / power) * power, 1);
   }
@@ -552,5 +564,5 @@ const makeScene = (onChoice) => {
   draw();
   if (data.pictures) showPictures();
   const project = (k) => eye.projection()(...positionOf(k));
-  return { show, flyTo, recolor, redraw, draw, layers, sizes, view, project, endsOf: (p) => endsOf(["pair", p]) };
+  return { show, flyTo, recolor, redraw, draw, moved, detail, layers, sizes, view, project, endsOf: (p) => endsOf(["pair", p]) };
 };

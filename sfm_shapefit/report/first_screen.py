@@ -9,7 +9,9 @@ import numpy as np
 
 from sfm_shapefit.report.drawing import Drawing, PairClass
 from sfm_shapefit.report.sentences import MAX_TEXT, placed_sentence, shorten
+from sfm_shapefit.results.key_figures import NOISE_ONLY
 from sfm_shapefit.results.tables import IN_MEMORY
+from sfm_shapefit.wording import rounded
 
 # Folders of these names say nothing of the scene.
 _NAMELESS = {"sparse", "dense", "model", "models", "colmap", "text", "triangulated", "database", "."}
@@ -58,8 +60,7 @@ def tiles(drawing: Drawing, facts: dict[str, Any]) -> list[dict[str, str]]:
     """Return the key figures: value, label, what it means, and whether it is good."""
     return [
         _placed_tile(drawing),
-        *_error_tile(drawing, facts),
-        *_uncertainty_tile(drawing, facts),
+        *_figure_tiles(facts),
         _doubtful_tile(drawing, facts),
         *_points_tile(drawing, facts),
         *_shift_tile(drawing),
@@ -110,9 +111,15 @@ def _sentence(grade: str, drawing: Drawing, facts: dict[str, Any]) -> str:
     reasons = "; ".join(verdict.get("reasons", []))
     reasons = shorten(reasons[:1].upper() + reasons[1:], 4 * MAX_TEXT)
     if grade == "good":
-        agree, pairs = int(np.sum(drawing.pairs.classes == PairClass.AGREES)), len(drawing.pairs.classes)
+        agree = int(np.sum(drawing.pairs.classes == PairClass.AGREES))
+        against = int(np.sum(drawing.pairs.classes == PairClass.CONTRADICTS))
+        others = "none contradicts them"
+        if against:
+            verb = "contradicts" if against == 1 else "contradict"
+            set_aside = "" if facts.get("examined") else f" and {'is' if against == 1 else 'are'} set aside"
+            others = f"{against:,} {verb} them{set_aside}"
         return (
-            f"{placed_sentence(drawing)[:-1]}, {agree:,} of {pairs:,} pairs agree with them, and no "
+            f"{placed_sentence(drawing)[:-1]}; {agree:,} pairs agree with them, {others}, and no "
             f"{drawing.noun} stands out."
         )
     cameras = [shorten(name, 60) for name in verdict.get("cameras", [])]
@@ -154,31 +161,24 @@ def _placed_tile(drawing: Drawing) -> dict[str, str]:
     return _tile(f"{placed:,} of {total:,}", f"{drawing.noun}s placed", hint, mood)
 
 
-def _error_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:
-    error = facts.get("residuals_deg", {}).get("quantile_50")
-    if error is None:
-        return
-    focal = drawing.cameras.poses.focal_lengths_px
-    value = f"{error:.2g}°"
-    if np.isfinite(focal).any():
-        pixels = np.nanmedian(focal) * np.tan(np.radians(min(error, 89.0)))
-        value = f"{pixels:.2g} px, {error:.2g}°"
-    hint = (
-        "Median angle between what the matches of a pair say and where its cameras stand; in pixels at the "
-    )
-    yield _tile(value, "typical error of a pair", f"{hint}middle of a picture.")
-
-
-def _uncertainty_tile(drawing: Drawing, facts: dict[str, Any]) -> Iterator[dict[str, str]]:
-    sigmas = drawing.cameras.sigmas[drawing.cameras.placed]
-    known = sigmas[np.isfinite(sigmas)]
-    if not len(known) or drawing.extent <= 0.0:
-        return
-    median = float(np.median(known))
-    hint = f"Median standard deviation of a position. {facts.get('sigma_of', '')}".strip()
-    share = f"{100.0 * median / drawing.extent:.2g}% of the scene"
-    scope = ", matching noise only" if "noise only" in hint else ""
-    yield _tile(f"± {median:.2g} units", f"typical uncertainty, {share}{scope}", hint)
+def _figure_tiles(facts: dict[str, Any]) -> Iterator[dict[str, str]]:
+    """Yield the tiles of `figures` in locate.json, which earlier outputs lack."""
+    figures = facts.get("figures", {})
+    error_deg, error_px = figures.get("pair_error_deg"), figures.get("pair_error_px")
+    if error_deg is not None:
+        angle = f"{rounded(error_deg, digits=2)}°"
+        yield _tile(
+            angle if error_px is None else f"{error_px:.2g} px, {angle}",
+            "typical error of a pair",
+            "Median angle between what the matches of a pair say and where its cameras stand; in pixels at "
+            "the middle of a picture.",
+        )
+    sigma, share = figures.get("sigma"), figures.get("sigma_of_extent")
+    if sigma is not None and share is not None:
+        scope = f", {NOISE_ONLY}" if facts["sigma_of"].startswith(NOISE_ONLY) else ""
+        label = f"typical uncertainty, {100.0 * share:.2g}% of the scene{scope}"
+        hint = f"Median standard deviation of a position, {figures['sigma_unit']}. {facts['sigma_of']}"
+        yield _tile(f"± {sigma:.2g} units", label, hint)
 
 
 def _doubtful_tile(drawing: Drawing, facts: dict[str, Any]) -> dict[str, str]:
